@@ -21,6 +21,7 @@ import numpy.typing as npt
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
 from scroll_tactile.errors import DescriptionError, EmbeddingMismatchError, InputError, RangeWarning
+from scroll_tactile.memory.buffer import exemplar_candidates, ranked_exemplars
 from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
@@ -28,9 +29,11 @@ from scroll_tactile.memory.gate import open_store
 from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exemplars, usual_recall
 from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
-from scroll_tactile.memory.merge import Choice
+from scroll_tactile.memory.merge import Choice, MergeRules
 from scroll_tactile.memory.observations import observations
+from scroll_tactile.memory.packing import pack_memory
 from scroll_tactile.memory.reembed import finish_interrupted
+from scroll_tactile.memory.replaying import load
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
@@ -124,9 +127,9 @@ class TactileLearner:
         self._current = CurrentModel(self._settings, self._extractor)
         self._tuned_reader: TunedReader | None = None
 
-    def _empty_memory(self) -> Memory:
+    def _empty_memory(self, encode: Callable[[npt.NDArray[np.float32]], Codes] | None = None) -> Memory:
         keeping = Keeping(self._sensor, self._settings.recall or 0)
-        return Memory(self._embedding.dimension, self._plan, self._settings.exemplars or 0, keeping=keeping)
+        return Memory(self._embedding.dimension, self._plan, self._settings.exemplars or 0, encode, keeping)
 
     @classmethod
     def open(
@@ -166,14 +169,13 @@ class TactileLearner:
                 found = embedding
                 identity.require_embedding(store.path, found)
             store.read_with(window_plan(identity.sensor, found))
-            exemplars, keeping = identity.exemplars, Keeping(identity.sensor, identity.recall)
             learner = cls.__new__(cls)
-            learner._set_up(identity.sensor, found, identity.augmentation, chosen, exemplars, identity.recall)
+            kept = identity.exemplars, identity.recall
+            learner._set_up(identity.sensor, found, identity.augmentation, chosen, *kept)
             learner._unverified = (identity, store.path) if embedding is None else None
             bare = identity.embedding.bare
-            plan, encode = learner._plan, learner._codes_of if bare or capabilities_of(found).exact else None
-            load = partial(Memory.load, store, found.dimension, plan, exemplars, encode, keeping)
-            learner._ledger = Ledger(load, store, bare)
+            empty = learner._empty_memory(learner._codes_of if bare or capabilities_of(found).exact else None)
+            learner._ledger = Ledger(partial(load, empty, store), store, bare)
         except BaseException:
             store.close()
             raise
@@ -197,7 +199,8 @@ class TactileLearner:
 
     def __getstate__(self) -> dict[str, Any]:
         with self._locked() as ledger:
-            arrays, attributes = ledger.snapshot()
+            candidates = exemplar_candidates(ledger.memory, ledger.store)
+            arrays, attributes = ledger.memory.to_arrays(candidates=candidates)
             name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
             made_with = self._sensor, self._embedding, self._augmentation, self._settings
             held = arrays, attributes, ledger.memory.sequence
@@ -208,7 +211,7 @@ class TactileLearner:
         sensor, embedding, augmentation, settings = state["made_with"]
         self._set_up(sensor, embedding, augmentation, settings, settings.exemplars, settings.recall)
         self._unverified, self._snapshot_of = state["unverified"], state["of"]
-        self._ledger = Ledger(lambda: self._empty_memory().filled(*state["held"]), contents=state["contents"])
+        self._ledger = Ledger(lambda: self._empty_memory().fill(*state["held"]), contents=state["contents"])
         logger.info("a snapshot of %s, in memory only", state["of"])
 
     def __repr__(self) -> str:
@@ -397,7 +400,8 @@ class TactileLearner:
         """
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
         require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
-        return self._ledger.merge(path, shared, descriptions, progress or _silent)
+        rules = MergeRules(once=shared == "once", descriptions=descriptions)
+        return self._ledger.merge(path, rules, progress or _silent)[0]
 
     def backup(
         self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
@@ -426,7 +430,10 @@ class TactileLearner:
         Raises InputError in a memory without a path, and for a source that is none; StoreError.
         """
         require_arguments({"path": path})
-        self._ledger.pack(path, rows, readings, None if source is None else require_source(source))
+        said = None if source is None else require_source(source)
+        with self._locked() as ledger:
+            store = ledger.require_store("be packed")
+            pack_memory(store, ledger.memory, Path(path), rows=rows, readings=readings, source=said)
 
     def compact(self, *, keep: int = 0) -> Compacted:
         """Give up the features and readings of old observations, for space; what was learned from them stays.
@@ -716,7 +723,7 @@ class TactileLearner:
         Raises StoreError; CompactedError in a memory opened to read that was compacted since: `refresh` it first.
         """
         with self._locked() as ledger:
-            return ledger.ranked_exemplars()
+            return ranked_exemplars(ledger.memory, ledger.store)
 
     def fine_tune(
         self,
@@ -745,7 +752,7 @@ class TactileLearner:
         with self._locked() as ledger:
             ledger.require_writing()
             model, ranked, memory = self.model(), self.ranked_exemplars(), ledger.memory
-            upto, retractions = memory.sequence, memory.retractions
+            last_sequence, retractions = memory.sequence, memory.retractions
             statistics = copy.deepcopy(memory.statistics)
         tuned, report = fine_tune(
             self._embedding,
@@ -758,7 +765,7 @@ class TactileLearner:
             device=device,
             progress=progress or _silent,
         )
-        ledger.keep_tuned(tuned, memory, upto, retractions)
+        ledger.keep_tuned(tuned, memory, last_sequence, retractions)
         return report
 
     def tuned_digest(self) -> str | None:

@@ -80,10 +80,11 @@ class Merged:
 class Compacted:
     """What a compaction did.
 
-    upto: the last row of the journal without its features. bytes_before, bytes_after: size of the memory on disk.
+    last_sequence: the last row of the journal without its features. bytes_before, bytes_after: size of the memory on
+    disk.
     """
 
-    upto: int
+    last_sequence: int
     bytes_before: int
     bytes_after: int
 

@@ -6,7 +6,7 @@ FORMAT.md beside this file describes every byte of it.
 
     with Store.open(path, identity={"made for": "this"}) as store:
         head = store.append("add", "a label", key, arrays={"codes": codes})
-        store.commit({"sums": sums}, upto=head.sequence)
+        store.commit({"sums": sums}, last_sequence=head.sequence)
 
 `Store.backup` copies a store while it is in use; `check_store` verifies a whole one; `repair_store` keeps what
 verifies of a damaged one.

@@ -40,7 +40,7 @@ class Draft:
     """Checked arrays that are to become a checkpoint; `attributes` is JSON, `level` how hard to compress."""
 
     arrays: Mapping[str, np.ndarray]
-    upto: int
+    last_sequence: int
     attributes: str
     level: int = QUICK
 
@@ -48,15 +48,15 @@ class Draft:
 def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> str:
     """Write a draft as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
 
-    That is its number, `upto`, attributes, the store's identity, the format and, for each array, dtype, shape and
-    sha256. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError or StoreError.
+    That is its number, `last_sequence`, attributes, the store's identity, the format and, for each array, dtype, shape
+    and sha256. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError or StoreError.
     """
     described = {
         name: ArrayContent(array.dtype, array.shape, array_digest(array)) for name, array in draft.arrays.items()
     }
     known: dict[str, Any] = {
         "number": number,
-        "upto": draft.upto,
+        "last_sequence": draft.last_sequence,
         "attributes": from_json(draft.attributes),
         "identity": identity,
     }
@@ -135,7 +135,7 @@ class CheckpointReader:
     def __init__(self, path: Path, files: Files) -> None:
         self._path, self._files, self._known = path, files, _read_description(path, files)
         self.number: int = self._known["number"]
-        self.upto: int = self._known["upto"]
+        self.last_sequence: int = self._known["last_sequence"]
         self.sha256: str = self._known["sha256"]
         self.attributes: Mapping[str, JSON] = self._known["attributes"]
         self.identity: Mapping[str, JSON] = self._known["identity"]
@@ -248,8 +248,8 @@ def _read_description(path: Path, files: Files) -> dict[str, Any]:
 
 def _require_described(known: Mapping[str, Any]) -> None:
     """Raise ValueError where a group of a known format does not say whose it is."""
-    for name, kind in {"number": int, "upto": int, "attributes": dict, "identity": dict}.items():
+    for name, kind in {"number": int, "last_sequence": int, "attributes": dict, "identity": dict}.items():
         if type(known.get(name)) is not kind:
             raise ValueError(f"its {name} is {str(known.get(name))[:80]!r}")
-    if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["upto"] <= LARGEST_NUMBER):
-        raise ValueError(f"its number is {known['number']}, its upto {known['upto']}")
+    if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["last_sequence"] <= LARGEST_NUMBER):
+        raise ValueError(f"its number is {known['number']}, its last_sequence {known['last_sequence']}")

@@ -84,7 +84,7 @@ class Checkpoints:
     ) -> Checkpoint:
         reader = self._verified(named)
         arrays = reader.arrays(only, but=late)
-        return Checkpoint(named.number, named.upto, reader.attributes, arrays, reader.late(late))
+        return Checkpoint(named.number, named.last_sequence, reader.attributes, arrays, reader.late(late))
 
     def derived(self, name: str) -> Checkpoint | None:
         """Return what was kept of the newest checkpoint under a name; None where there is nothing of it."""
@@ -92,20 +92,20 @@ class Checkpoints:
         if newest is None or self._files.is_packed:
             return None
         found = read_derived(self._folder, name, newest.sha256)
-        return None if found is None else Checkpoint(newest.number, newest.upto, *found)
+        return None if found is None else Checkpoint(newest.number, newest.last_sequence, *found)
 
     def keep_derived(self, name: str, draft: Draft) -> None:
         """Keep what follows from the newest checkpoint, which is up to the same row, under a name."""
         with self._committing, reported(self._folder, f"keeping {name!r}"):
             newest = self._journal.current().newest
-            if newest is not None and newest.upto == draft.upto:
+            if newest is not None and newest.last_sequence == draft.last_sequence:
                 write_derived(self._folder, name, newest.sha256, draft.attributes, draft.arrays)
 
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)
         reader = CheckpointReader(path, self._files)
-        known = (reader.number, reader.upto, reader.sha256, dict(reader.identity))
-        if known != (named.number, named.upto, named.sha256, self._journal.identity):
+        known = (reader.number, reader.last_sequence, reader.sha256, dict(reader.identity))
+        if known != (named.number, named.last_sequence, named.sha256, self._journal.identity):
             raise DamageError(
                 f"{path} is another checkpoint, or another store's, than the one that is named", path=path
             )
@@ -115,8 +115,8 @@ class Checkpoints:
         """Write a draft as a checkpoint, have `CURRENT` name it, and return its number."""
         with self._committing:
             current = self._journal.current()
-            named = self._write(draft, self._journal.place(draft.upto))
-            if current.newest is None or named.upto >= current.newest.upto:
+            named = self._write(draft, self._journal.place(draft.last_sequence))
+            if current.newest is None or named.last_sequence >= current.newest.last_sequence:
                 # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
                 # be on the disk all the same, and count after a crash.
                 self._journal.commit(replace(current, newest=named, last=self._journal.last()))
@@ -128,7 +128,7 @@ class Checkpoints:
     def _write(self, draft: Draft, place: Place) -> NamedCheckpoint:
         number = self._next(numbers(self._folder, unfinished=True))
         sha256 = write_checkpoint(self._folder, number, draft, self._journal.identity)
-        return NamedCheckpoint(number, draft.upto, sha256, place)
+        return NamedCheckpoint(number, draft.last_sequence, sha256, place)
 
     def _next(self, numbers: list[int]) -> int:
         number = 1 + max(numbers, default=0)
@@ -144,9 +144,11 @@ class Checkpoints:
                 path = log_path(self._folder, number)
                 header = to_json("identity", self._journal.identity).encode()
                 try:
-                    identity = create_log(path, header, ((ROW, data) for data in self._journal.payloads(draft.upto)))
+                    identity = create_log(
+                        path, header, ((ROW, data) for data in self._journal.payloads(draft.last_sequence))
+                    )
                     drafts = [draft] if newest is None else [draft, newest]
-                    places = read_back(path, [each.upto for each in drafts])
+                    places = read_back(path, [each.last_sequence for each in drafts])
                     named = [self._write(each, place) for each, place in zip(drafts, places, strict=True)]
                     for damage in (damage for one in named for damage in self._verified(one).damage()):
                         raise damage
@@ -209,16 +211,19 @@ class Checkpoints:
             logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
 
 
-def read_back(path: Path, uptos: Sequence[int]) -> list[Place]:
+def read_back(path: Path, last_sequences: Sequence[int]) -> list[Place]:
     """Read a log that was just written; return for each of these rows a place.
 
     All rows behind that row are behind the place. Raises DamageError where the log does not read back whole.
     """
     with LogReader(path) as log:
-        found = [log.place] * len(uptos)
+        found = [log.place] * len(last_sequences)
         for batch in log.refresh():
             last = row_sequence(log.peek(batch[-1].offset, HEAD_BYTES))
-            found = [log.place if last <= upto else place for upto, place in zip(uptos, found, strict=True)]
+            found = [
+                log.place if last <= last_sequence else place
+                for last_sequence, place in zip(last_sequences, found, strict=True)
+            ]
         if log.place.offset != path.stat().st_size:
             raise DamageError(
                 f"{path} does not read back as it was just written: its disk cannot be trusted", path=path

@@ -151,7 +151,7 @@ class FoundLog:
     def has_place(self, named: NamedCheckpoint) -> bool:
         """Whether a checkpoint's place is in the log, and no row that it does not contain is before it."""
         assert self._reader is not None
-        if any(at < named.place.offset for row, (at, _) in self._offsets.items() if row > named.upto):
+        if any(at < named.place.offset for row, (at, _) in self._offsets.items() if row > named.last_sequence):
             return False
         return self._reader.has_place(named.place)
 

@@ -219,10 +219,10 @@ class Journal:
         at.rows.cut(bisect_left(at.rows.offsets, writer.place.offset))
         at.note_place(writer.place)
 
-    def place(self, upto: int) -> Place:
-        """Return a place in the log that all rows behind `upto` are behind."""
+    def place(self, last_sequence: int) -> Place:
+        """Return a place in the log that all rows behind `last_sequence` are behind."""
         with self._using("looking for a place") as at:
-            found = bisect_right(at.places, upto, key=lambda noted: noted[0])
+            found = bisect_right(at.places, last_sequence, key=lambda noted: noted[0])
             return at.places[max(found - 1, 0)][1]
 
     def rows(
@@ -329,18 +329,18 @@ class Journal:
 
     @staticmethod
     def _damage(at: OpenLog, what: str, sequence: int) -> DamageError:
-        named = next((named for named in at.current.checkpoints if named.upto >= sequence), None)
+        named = next((named for named in at.current.checkpoints if named.last_sequence >= sequence), None)
         still = "no checkpoint contains it"
         if named is not None:
-            still = f"checkpoint {named.number} (up to row {named.upto}) still contains it"
+            still = f"checkpoint {named.number} (up to row {named.last_sequence}) still contains it"
         return DamageError(
             f"{what} {at.path}; {still}; records(after={sequence}) continues behind it",
             path=at.path,
             sequence=sequence,
         )
 
-    def payloads(self, upto: int) -> Iterator[bytes]:
-        """Yield the bytes of each row, in order, those up to `upto` without their arrays, which are not read.
+    def payloads(self, last_sequence: int) -> Iterator[bytes]:
+        """Yield the bytes of each row, in order, those up to `last_sequence` without their arrays, which are not read.
 
         Raises DamageError. Nothing can be appended meanwhile.
         """
@@ -351,7 +351,7 @@ class Journal:
             for index, sequence in enumerate(at.rows.sequences):
                 head = self._head(at, index)
                 try:
-                    yield head_without_arrays(head) if sequence <= upto else at.data(index)
+                    yield head_without_arrays(head) if sequence <= last_sequence else at.data(index)
                 except DamageError as error:
                     raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
 

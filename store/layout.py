@@ -60,26 +60,26 @@ HEX = re.compile(r"[0-9a-f]*")
 class NamedCheckpoint:
     """A checkpoint as `CURRENT` names it.
 
-    upto: the last row that it contains. sha256: what its own description has, so that no other can take its place.
-    place: in the log, behind all rows up to `upto`, so that reading can go on from there.
+    last_sequence: the last row that it contains. sha256: what its own description has, so that no other can take its
+    place. place: in the log, behind all rows up to `last_sequence`, so that reading can go on from there.
     """
 
     number: int
-    upto: int
+    last_sequence: int
     sha256: str
     place: Place
 
     def to_json(self) -> dict[str, Any]:
         """Return what is written."""
         place = [self.place.offset, self.place.number, self.place.previous.hex()]
-        return {"number": self.number, "upto": self.upto, "sha256": self.sha256, "place": place}
+        return {"number": self.number, "last_sequence": self.last_sequence, "sha256": self.sha256, "place": place}
 
     @classmethod
     def from_json(cls, found: Any) -> Self:
         """Return what `to_json` wrote; raise ValueError, TypeError or KeyError for anything else."""
         offset, number, previous = found["place"]
         place = Place(_count(offset), _count(number), _count(number), _hex(previous, 16))
-        return cls(_count(found["number"]), _count(found["upto"]), _hex(found["sha256"], 32).hex(), place)
+        return cls(_count(found["number"]), _count(found["last_sequence"]), _hex(found["sha256"], 32).hex(), place)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Current:
     @property
     def compacted(self) -> int:
         """The last row that gave up its arrays for the base, 0 without one."""
-        return 0 if self.base is None else self.base.upto
+        return 0 if self.base is None else self.base.last_sequence
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the file."""
@@ -135,7 +135,9 @@ class Current:
             newest, base = (None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES)
             last = _count(known.get("last", 0))
             current = cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, base, last)
-            if current.base is not None and (current.newest is None or current.newest.upto < current.base.upto):
+            if current.base is not None and (
+                current.newest is None or current.newest.last_sequence < current.base.last_sequence
+            ):
                 raise ValueError("its base is newer than its newest checkpoint")
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error

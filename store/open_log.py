@@ -40,7 +40,7 @@ class OpenLog:
             self.identity = self._read_identity()
             self.index = Index(files.folder, current.log_identity, self.log.beginning)
             if named is not None and self.log.place == named.place:
-                self.first = named.upto
+                self.first = named.last_sequence
             self.read_all = self.first == 0
             self.places = [(self.first, self.log.place)]
             self.catch_up()
@@ -105,7 +105,7 @@ class OpenLog:
     def last(self) -> int:
         """The last row, or the last that a checkpoint contains or `CURRENT` names, if later."""
         # These count only when rows were lost: then their numbers must not be given out again.
-        return max([self.last_row, self.current.last, *(named.upto for named in self.current.checkpoints)])
+        return max([self.last_row, self.current.last, *(named.last_sequence for named in self.current.checkpoints)])
 
     def find(self, after: int) -> int:
         """Return the index of the first row behind `after`, once all rows from there on are known."""

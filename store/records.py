@@ -68,13 +68,13 @@ class Record(Head):
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Committed arrays: it contains the journal's rows up to and including sequence `upto`.
+    """Committed arrays: it contains the journal's rows up to and including sequence `last_sequence`.
 
     late: those that are read when they are needed.
     """
 
     number: int
-    upto: int
+    last_sequence: int
     attributes: Mapping[str, JSON]
     arrays: Mapping[str, np.ndarray]
     late: Mapping[str, LateArray] = field(default_factory=dict)

@@ -106,7 +106,7 @@ class _Plan:
     @classmethod
     def of(cls, survey: Survey) -> _Plan:
         start = survey.sound[0] if survey.sound else None
-        newest = 0 if start is None else start.upto
+        newest = 0 if start is None else start.last_sequence
         has_base = not survey.compacted or survey.base is not None
         standing = survey.compacted if has_base else 0
         # Up to `compacted` no row has arrays; without the base that stood for them they are as good as damaged.
@@ -119,7 +119,7 @@ class _Plan:
 
 
 def _lost(survey: Survey, plan: _Plan) -> list[str]:
-    newest = 0 if plan.start is None else plan.start.upto
+    newest = 0 if plan.start is None else plan.start.last_sequence
     which = "" if plan.start is None else f"checkpoint {plan.start.number}"
     lost = [
         f"{fault.describe(first, last)}; what they did is in {which}, but can no longer be retracted"
@@ -208,7 +208,7 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
 def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
     """Return the newest checkpoint and the base, with places in the new log, which is read back. Raises DamageError."""
     found = [plan.start, plan.stand_in]
-    places = read_back(path, [0 if each is None else each.upto for each in found])
+    places = read_back(path, [0 if each is None else each.last_sequence for each in found])
     newest, base = (
         None if each is None or each.named is None else replace(each.named, place=place)
         for each, place in zip(found, places, strict=True)

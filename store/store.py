@@ -36,6 +36,8 @@ from store.records import JSON, Checkpoint, Head, Record, check_key, check_text,
 
 __all__ = ["Store"]
 
+Arrays = Mapping[str, np.ndarray]
+
 
 class Store:
     """A folder of records that survive a power cut, and of arrays that are replaced as a whole.
@@ -102,7 +104,7 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
 
-    def _check_open(self, *, write: bool = False) -> None:
+    def _check_open(self, after: int = 0, *, write: bool = False) -> None:
         if os.getpid() != self._process:
             raise StoreClosedError(
                 f"{self.path} was opened by process {self._process}, of which this is a fork: open it here again"
@@ -111,6 +113,8 @@ class Store:
             raise StoreClosedError(f"the store in {self.path} is closed")
         if write and self.mode != "write":
             raise ReadOnlyError(f'{self.path} was opened with mode="read"')
+        if after < 0:
+            raise RecordError(f"after must not be negative, not {after}")
 
     @property
     def is_packed(self) -> bool:
@@ -130,7 +134,7 @@ class Store:
         key: bytes,
         *,
         attributes: Mapping[str, JSON] | None = None,
-        arrays: Mapping[str, np.ndarray] | None = None,
+        arrays: Arrays | None = None,
         time: float | None = None,
     ) -> Head:
         """Add a record and return its head once it is durable; in a batch, once it is written.
@@ -170,8 +174,7 @@ class Store:
         that a repair named as lost. Raises DamageError at the first that is damaged or, without `kind` and
         `label`, missing; with them, a record whose kind or label is damaged is passed over.
         """
-        self._check_open()
-        _check_after(after)
+        self._check_open(after)
         for what, text in (("the kind", kind), ("the label", label)):
             if text is not None:
                 check_text(what, text)
@@ -195,22 +198,20 @@ class Store:
 
         One is in memory at a time. Raises DamageError at the first that is damaged or missing; its
         `sequence` is the `after` with which to continue behind it. Raises CompactedError where the first
-        are compacted: `base` has their place, and its `upto` is the `after` to continue with.
+        are compacted: `base` has their place, and its `last_sequence` is the `after` to continue with.
         """
-        self._check_open()
-        _check_after(after)
+        self._check_open(after)
         if after < (compacted := self._journal.current().compacted):
             raise CompactedError(
                 f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
-                "base(), and continue behind its upto"
+                "base(), and continue behind its last_sequence"
             )
         return cast(Iterator[Record], self._journal.rows(after, self._journal.last(), arrays=True))
 
     def with_key(self, key: bytes) -> Iterator[Head]:
         """Yield the heads of the records with this key, in order; damaged ones are left out.
 
-        The first call in a store of many records may read where they are; after it each takes about a nanosecond a
-        record.
+        The first call may read where the records are; each after it takes about a nanosecond a record.
         """
         self._check_open()
         return self._journal.with_key(check_key(key))
@@ -230,7 +231,7 @@ class Store:
     def derived(self, name: str) -> Checkpoint | None:
         """Return what `keep_derived` kept of the newest checkpoint, None where there is nothing of it.
 
-        Its number and `upto` are that checkpoint's. Wrong, damaged or of another checkpoint it counts as missing; a
+        Its number and last row are that checkpoint's. Wrong, damaged or of another checkpoint it counts as missing; a
         digest that is right says nothing of who wrote it.
         """
         self._check_open()
@@ -239,9 +240,9 @@ class Store:
     def keep_derived(
         self,
         name: str,
-        arrays: Mapping[str, np.ndarray],
+        arrays: Arrays,
         *,
-        upto: int,
+        last_sequence: int,
         attributes: Mapping[str, JSON] | None = None,
     ) -> None:
         """Keep under a name what follows from the newest checkpoint; nothing where that is not up to the same row.
@@ -249,7 +250,7 @@ class Store:
         It takes the place of what was kept before, is not made durable, and is not part of copies. Raises
         StoreFullError, ReadOnlyError or another StoreError.
         """
-        self._checkpoints.keep_derived(name, self._draft(arrays, upto, attributes))
+        self._checkpoints.keep_derived(name, self._draft(arrays, last_sequence, attributes))
 
     @property
     def newest(self) -> int | None:
@@ -272,68 +273,64 @@ class Store:
         self._check_open()
         return self._checkpoints.base()
 
-    def commit(
-        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
-    ) -> int:
-        """Write a checkpoint that contains the records up to `upto`, make it current, return its number.
+    def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, JSON] | None = None) -> int:
+        """Write a checkpoint that contains the records up to `last_sequence`, make it current, return its number.
 
-        The checkpoint with the highest `upto` is current, and of several with the same the last committed.
+        The checkpoint with the highest `last_sequence` is current, and of several with the same the last committed.
         It waits for a background commit first, and raises its failure here in place of committing.
-        Raises RecordError for arrays, attributes or an `upto` that cannot be kept, StoreFullError,
+        Raises RecordError for arrays, attributes or a `last_sequence` that cannot be kept, StoreFullError,
         ReadOnlyError or another StoreError; the checkpoint before then stays current.
         """
-        draft = self._draft(arrays, upto, attributes)
+        draft = self._draft(arrays, last_sequence, attributes)
         self._idle()
         return self._checkpoints.commit(draft)
 
     def compact(
         self,
-        arrays: Mapping[str, np.ndarray],
+        arrays: Arrays,
         *,
-        upto: int,
+        last_sequence: int,
         attributes: Mapping[str, JSON] | None = None,
-        newest: tuple[Mapping[str, np.ndarray], Mapping[str, JSON]] | None = None,
+        newest: tuple[Arrays, Mapping[str, JSON]] | None = None,
     ) -> None:
-        """Let a base stand for the records up to `upto`: they give up their arrays and keep their heads.
+        """Let a base stand for the records up to `last_sequence`: they give up their arrays and keep their heads.
 
         The base is a checkpoint like others, but kept until the next base; a replay of the records begins
         with it. newest: arrays and attributes of a checkpoint that contains all records, committed beside it; without
         it the base is the newest. A log without the arrays is written beside the one there is, all is read back, and
         takes effect together or not at all; then the earlier log and checkpoints are removed. Nobody can append
-        meanwhile. Raises DamageError where a record behind `upto` cannot be read, and as `commit`.
+        meanwhile. Raises DamageError where a record behind `last_sequence` cannot be read, and as `commit`.
         """
-        base = self._draft(arrays, upto, attributes)
+        base = self._draft(arrays, last_sequence, attributes)
         last = None if newest is None else self._draft(newest[0], self._journal.last(), newest[1])
         self._idle()
         self._checkpoints.compact(base, last)
 
-    def commit_later(
-        self, arrays: Mapping[str, np.ndarray], *, upto: int, attributes: Mapping[str, JSON] | None = None
-    ) -> None:
+    def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, JSON] | None = None) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 
         While one is being written, only the newest of those handed over waits. A failure is logged and
         raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
         What cannot be kept is refused at once, with RecordError.
         """
-        draft = self._draft(arrays, upto, attributes, QUICK)
+        draft = self._draft(arrays, last_sequence, attributes, QUICK)
         self._checkpoints.raise_failure()
         self._checkpoints.commit_later(draft)
 
     def _draft(
-        self, arrays: Mapping[str, np.ndarray], upto: int, attributes: Mapping[str, JSON] | None, level: int = THOROUGH
+        self, arrays: Arrays, last_sequence: int, attributes: Mapping[str, JSON] | None, level: int = THOROUGH
     ) -> Draft:
         self._check_open(write=True)
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a checkpoint")
         first, last = self._journal.current().compacted, self._journal.last()
-        if isinstance(upto, bool) or not isinstance(upto, int) or not first <= upto <= last:
+        if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
             # Recovery could not resume before the base: the rows behind it have given up their arrays.
             raise RecordError(
-                f"upto must be a sequence from {first}, the last that was compacted, to {last}, the last that there "
-                f"is, not {upto!r}"
+                f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
+                f"there is, not {last_sequence!r}"
             )
-        return Draft(check_arrays(arrays), upto, to_json("attributes", attributes), level)
+        return Draft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
@@ -399,8 +396,3 @@ class Store:
             # Logged already, and it says less than what went wrong inside.
             if error is None:
                 raise
-
-
-def _check_after(after: int) -> None:
-    if after < 0:
-        raise RecordError(f"after must not be negative, not {after}")

@@ -112,9 +112,9 @@ class FoundCheckpoint:
         return not self.damage
 
     @property
-    def upto(self) -> int:
+    def last_sequence(self) -> int:
         """The last row that it contains, -1 where nobody knows."""
-        return -1 if self.named is None else self.named.upto
+        return -1 if self.named is None else self.named.last_sequence
 
 
 class Survey:
@@ -165,12 +165,12 @@ class Survey:
         is_base = base is not None and base.number == number
         try:
             reader = CheckpointReader(path, self.files)
-            found = NamedCheckpoint(reader.number, reader.upto, reader.sha256, NOWHERE)
+            found = NamedCheckpoint(reader.number, reader.last_sequence, reader.sha256, NOWHERE)
             expected = found if named is None else named
-            if (found.number, found.upto, found.sha256) != (number, expected.upto, expected.sha256):
+            if (found.number, found.last_sequence, found.sha256) != (number, expected.last_sequence, expected.sha256):
                 raise DamageError(
-                    f"{path} says that it is checkpoint {found.number}, up to row {found.upto}, and another than was "
-                    "written there",
+                    f"{path} says that it is checkpoint {found.number}, up to row {found.last_sequence}, and another "
+                    "than was written there",
                     path=path / "zarr.json",
                 )
             return FoundCheckpoint(number, path, expected, is_base, list(reader.damage()), dict(reader.identity))
@@ -191,7 +191,7 @@ class Survey:
                 durable = None if self.current.newest is None else self.current.newest.place
                 return FoundLog(self.files, named, self.current.log_identity, self.progress, durable)
         there = [log_path(self.folder, number) for number in log_numbers(self.folder)]
-        newest = self.sound[0].upto if self.sound else 0
+        newest = self.sound[0].last_sequence if self.sound else 0
         found = [FoundLog(self.files, path, None, self.progress) for path in there or aside[-1:]]
         # Of two that tell as much the newer: the other may be what a compaction replaced.
         best = max(reversed(found), key=lambda log: (log.compacted <= newest, log.last), default=None)
@@ -221,7 +221,7 @@ class Survey:
             elif sequence > self.compacted and sequence in self.log.without_arrays:
                 self._note(sequence, sequence, Fault.NO_ARRAYS)
             before = sequence
-        self.last = max([before, known, *(found.upto for found in self.checkpoints)])
+        self.last = max([before, known, *(found.last_sequence for found in self.checkpoints)])
         if before in self.log.torn:
             self.last = max(self.last, before + 1)
         self._note_gap(before, self.last)
@@ -247,12 +247,16 @@ class Survey:
 
     def _sort_sound(self) -> None:
         found = [found for found in self.checkpoints if found.sound]
-        self.sound = sorted(found, key=lambda found: (found.upto, found.number), reverse=True)
+        self.sound = sorted(found, key=lambda found: (found.last_sequence, found.number), reverse=True)
 
     @property
     def base(self) -> FoundCheckpoint | None:
         """The sound checkpoint that stands for the compacted rows."""
-        return next((found for found in self.sound if found.upto == self.compacted), None) if self.compacted else None
+        return (
+            next((found for found in self.sound if found.last_sequence == self.compacted), None)
+            if self.compacted
+            else None
+        )
 
     def moved(self) -> bool:
         """Whether a writer has committed something since."""
@@ -282,12 +286,12 @@ class Survey:
 
     def _is_spare(self, checkpoint: FoundCheckpoint) -> bool:
         """Return whether the state that a checkpoint holds can be had without it."""
-        upto = self.last if checkpoint.named is None else checkpoint.upto
-        uptos = [other.upto for other in self.sound if other is not checkpoint]
-        if checkpoint.is_base and upto == self.compacted:
-            return upto in uptos
-        starts = [start for start in [*uptos, *([0] if not self.compacted else [])] if start >= self.compacted]
-        return any(start >= upto or not self.faulty(start + 1, upto) for start in starts)
+        last_sequence = self.last if checkpoint.named is None else checkpoint.last_sequence
+        last_sequences = [other.last_sequence for other in self.sound if other is not checkpoint]
+        if checkpoint.is_base and last_sequence == self.compacted:
+            return last_sequence in last_sequences
+        starts = [start for start in [*last_sequences, *([0] if not self.compacted else [])] if start >= self.compacted]
+        return any(start >= last_sequence or not self.faulty(start + 1, last_sequence) for start in starts)
 
     def leftovers(self) -> Iterator[Problem]:
         """Yield the files that are there too many, and who removes them."""

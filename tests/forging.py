@@ -85,7 +85,7 @@ def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) ->
     log_of(path).write_bytes(data)
     sequences = [int.from_bytes(row[:8], "little") for row in rows]
     for named in filter(None, (current["newest"], current["base"])):
-        behind = [i for i, sequence in enumerate(sequences) if sequence > named["upto"]]
+        behind = [i for i, sequence in enumerate(sequences) if sequence > named["last_sequence"]]
         named["place"] = as_place(places[min(behind, default=len(rows))])
     set_current(path, **current)
 
@@ -141,7 +141,7 @@ def put_row(
     body = payload if isinstance(payload, bytes) else encode_payload(check_arrays(payload or {}))
     rows = {row_sequence(row): row for row in read_log(path)[1]}
     if sequence is None:
-        sequence = 1 + max([*rows, *(named["upto"] for named in named_in(path))], default=0)
+        sequence = 1 + max([*rows, *(named["last_sequence"] for named in named_in(path))], default=0)
     text = as_text({} if attributes is None else attributes)
     size = len(body) if size is None else size
     rows[sequence % 2**64] = as_row(sequence, kind, label, key, time, text, body, size, kept)
@@ -243,7 +243,7 @@ def seal(path: Path, number: int, known: Mapping[str, Any]) -> None:
     current = get_current(path)
     for named in filter(None, (current["newest"], current["base"])):
         if named["number"] == number:
-            named |= {name: known.get(name) for name in ("number", "upto", "sha256")}
+            named |= {name: known.get(name) for name in ("number", "last_sequence", "sha256")}
     set_current(path, **current)
 
 
@@ -334,9 +334,9 @@ def put_checkpoint(path: Path, attributes: Any, arrays: Mapping[str, np.ndarray]
     """Make this the newest checkpoint, or the base of all rows."""
     with Store.open(path) as store:
         if base:
-            store.compact(arrays, upto=store.last, attributes=attributes)
+            store.compact(arrays, last_sequence=store.last, attributes=attributes)
         else:
-            store.commit(arrays, upto=store.last, attributes=attributes)
+            store.commit(arrays, last_sequence=store.last, attributes=attributes)
 
 
 def copied(source: Path, target: Path) -> Path:

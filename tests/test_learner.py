@@ -473,12 +473,12 @@ def test_a_memory_can_be_opened_without_naming_its_sensor_and_with_either_readou
 
 
 def test_a_generation_is_written_while_observing(tmp_path, monkeypatch):
-    monkeypatch.setattr("scroll_tactile.memory.ledger.SNAPSHOT_EVERY", 3)
+    monkeypatch.setattr("scroll_tactile.memory.open_memory.SNAPSHOT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)
     learner._ledger.store.flush()
     with Store.open(tmp_path / "m", mode="read") as reader:
-        assert reader.latest().upto in range(3, 21)
+        assert reader.latest().last_sequence in range(3, 21)
     with opened(tmp_path / "m", mode="read") as reader:
         assert reader.digest() == learner.digest()
     learner.close()

@@ -111,7 +111,7 @@ def compact(
             raise typer.Exit(1)
         done = learner.compact(keep=keep)
     before, after = done.bytes_before / 2**20, done.bytes_after / 2**20
-    say(f"rows up to {done.upto} are compacted; on disk {before:.1f} MB before, {after:.1f} MB after")
+    say(f"rows up to {done.last_sequence} are compacted; on disk {before:.1f} MB before, {after:.1f} MB after")
 
 
 @memory.command()

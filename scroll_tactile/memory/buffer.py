@@ -9,28 +9,29 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
+from scroll_tactile.memory.replaying import require_base
 from scroll_tactile.memory.rows import OBSERVE, only_readings
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
 from store import Record, Store
 
-__all__ = ["candidates_of", "ranked_exemplars"]
+__all__ = ["exemplar_candidates", "ranked_exemplars"]
 
 logger = logging.getLogger(__name__)
 
 
 def ranked_exemplars(memory: Memory, store: Store | None) -> dict[str, list[Exemplar]]:
-    """The buffer, as `rank`, against the exact means of all that was observed. Raises as `candidates_of`."""
+    """The buffer, as `rank`, against the exact means of all that was observed. Raises as `exemplar_candidates`."""
     statistics = memory.statistics
 
     def mean(material: str, scale: Scale) -> npt.NDArray[np.int64]:
         return mean_code(statistics.sums(scale, [material])[0], int(statistics.counts(scale, [material])[0]))
 
-    return rank(candidates_of(memory, store), memory.capacity, mean)
+    return rank(exemplar_candidates(memory, store), memory.capacity, mean)
 
 
-def candidates_of(memory: Memory, store: Store | None) -> list[Exemplar]:
+def exemplar_candidates(memory: Memory, store: Store | None) -> list[Exemplar]:
     """The candidates for the buffer with their readings, by material and key; those lost to damage are left out.
 
     store: of the memory, None where it has none. Raises CompactedError where it was compacted since the memory was
@@ -54,7 +55,7 @@ def candidates_of(memory: Memory, store: Store | None) -> list[Exemplar]:
 
 def _exemplars_in(memory: Memory, store: Store, sequence: int) -> list[Exemplar]:
     """The exemplars that a row of the journal holds; 0: those of the base."""
-    memory.require_base(store)
+    require_base(memory, store)
     row = store.record(sequence) if sequence else store.base()
     if isinstance(row, Record) and row.kind == OBSERVE:
         columns, codes = memory.codes(row)

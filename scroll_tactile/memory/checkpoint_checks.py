@@ -46,11 +46,13 @@ class CheckpointChecks:
     def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, keeps: bool) -> None:
         self._sensor, self._dimension, self._plan, self._keeps = sensor, dimension, plan, keeps
 
-    def check(self, arrays: Arrays, attributes: Mapping[str, Any], upto: int | None, *, thorough: bool) -> None:
+    def check(
+        self, arrays: Arrays, attributes: Mapping[str, Any], last_sequence: int | None, *, thorough: bool
+    ) -> None:
         """Check all that a memory takes from a checkpoint.
 
-        upto: its last row; None of what a merge brought. thorough: whether second moments are shown to be some; none is
-        read later then.
+        last_sequence: its last row; None of what a merge brought. thorough: whether second moments are shown to be
+        some; none is read later then.
         """
         whole("dimension", attributes.get("dimension"), self._dimension, self._dimension)
         own, scales = list(map(int, self._plan.scales)), attributes.get("scales")
@@ -73,14 +75,14 @@ class CheckpointChecks:
         if self._keeps or "kept" in attributes:
             self._check_kept(arrays, _names("kept", attributes.get("kept"), materials))
         if "exemplars" in attributes:
-            self._check_exemplars(arrays, attributes["exemplars"], rows, upto)
+            self._check_exemplars(arrays, attributes["exemplars"], rows, last_sequence)
         for field in ("retracted", "excluded"):
-            sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, upto or 2**63 - 1)
+            sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, last_sequence or 2**63 - 1)
             expect(len(set(sequences.tolist())) == len(sequences), field, "different rows", sequences)
-        if upto is not None or "descriptions" in attributes:  # to a merge they are rows of their own
+        if last_sequence is not None or "descriptions" in attributes:  # to a merge they are rows of their own
             _check_descriptions(attributes.get("descriptions"))
-        if upto is not None or "tuned" in attributes:  # a merge leaves the tuned model where it is
-            whole("tuned_upto", attributes.get("tuned_upto"), 0, upto or 2**63 - 1)
+        if last_sequence is not None or "tuned" in attributes:  # a merge leaves the tuned model where it is
+            whole("tuned_last_sequence", attributes.get("tuned_last_sequence"), 0, last_sequence or 2**63 - 1)
         if "tuned" in attributes:
             self._check_tuned(arrays, attributes["tuned"])
 
@@ -155,7 +157,7 @@ class CheckpointChecks:
         array(arrays, "kept-levels", ("uint8",), (int(columns.sum()) * self._sensor.channels,))
 
     def _check_exemplars(
-        self, arrays: Arrays, about: Any, rows: Mapping[Scale, Mapping[str, int]], upto: int | None
+        self, arrays: Arrays, about: Any, rows: Mapping[Scale, Mapping[str, int]], last_sequence: int | None
     ) -> None:
         expect(isinstance(about, dict), "exemplars", "their materials", about)
         known = list(next(iter(rows.values()), {}))
@@ -164,7 +166,7 @@ class CheckpointChecks:
         count = len(materials)
         if "exemplar-sources" in arrays:
             sources = array(arrays, "exemplar-sources", ("int64",), (count,))
-            counts("exemplar-sources", sources, 0, 2**63 - 1 if upto is None else upto)
+            counts("exemplar-sources", sources, 0, 2**63 - 1 if last_sequence is None else last_sequence)
         if "exemplar-readings" not in arrays:
             return
         lengths = array(arrays, "exemplar-lengths", ("int64",), (count,))

@@ -6,14 +6,18 @@ refused where many are learned from files, in one process or by a fleet; `observ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import takewhile
 
 from scroll_tactile.memory.rows import MEMBER, OBSERVE
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.ranges import CURE
-from store import Head, Store
+from store import DamageError, Head, Store
 
 __all__ = ["Contents", "StoredContents", "refusal"]
+
+logger = logging.getLogger(__name__)
 
 
 def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
@@ -67,20 +71,41 @@ class Contents:
 
 
 class StoredContents:
-    """The touches of a memory that is kept in a store, looked for there. memory: gives it as it is just now."""
+    """The touches of a memory that is kept in a store, looked for there."""
 
-    def __init__(self, store: Store, memory: Callable[[], Memory]) -> None:
+    def __init__(self, store: Store, memory: Memory) -> None:
         self._store, self._memory = store, memory
 
-    def _standing(self, key: bytes) -> list[Head]:
-        memory = self._memory()
-        found = (head for head in self._store.with_key(key) if head.kind in (OBSERVE, MEMBER))
-        return [head for head in found if head.sequence <= memory.sequence and not memory.is_gone(head.sequence)]
+    def _active(self, heads: Iterable[Head]) -> Iterator[Head]:
+        heads = takewhile(lambda head: head.sequence <= self._memory.sequence, heads)
+        return (head for head in heads if head.kind in (OBSERVE, MEMBER) and not self._memory.is_gone(head.sequence))
+
+    def copy(self) -> Contents:
+        """All of them that are not damaged, to be changed apart."""
+        heads = self._active(_sound(self._store))
+        return Contents((head.label, head.key, head.sequence) for head in heads)
 
     def names(self, key: bytes) -> list[str]:
         """As `Contents.names`."""
-        return list(dict.fromkeys(head.label for head in self._standing(key)))
+        return list(dict.fromkeys(head.label for head in self._active(self._store.with_key(key))))
 
     def find(self, material: str, key: bytes) -> int | None:
         """As `Contents.find`."""
-        return min((head.sequence for head in self._standing(key) if head.label == material), default=None)
+        found = self._active(self._store.with_key(key))
+        return min((head.sequence for head in found if head.label == material), default=None)
+
+
+def _sound(store: Store) -> Iterator[Head]:
+    """The heads of a journal, but for those that are damaged: nobody can say what they hold."""
+    after = 0
+    while True:
+        try:
+            for head in store.heads(after):
+                yield head
+                after = head.sequence
+            return
+        except DamageError as damage:
+            logger.warning("%s", damage)
+            if damage.sequence is None or damage.sequence <= after:
+                return
+            after = damage.sequence

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, RootModel, ValidationError, model_validato
 from scroll_tactile.errors import DescriptionError
 from scroll_tactile.settings import LONGEST_NAME
 
-__all__ = ["Description", "Target", "checked", "require_constituents", "targets_of"]
+__all__ = ["Description", "Target", "checked", "describe", "require_constituents", "targets_of"]
 
 Description = dict[str, float | bool | None]
 """Constituent → its share by mass; or whether it is there, where it is no mass; or None where that is unknown."""
@@ -77,6 +77,14 @@ def checked(material: str, constituents: Mapping[str, Any]) -> Description:
         first = error.errors()[0]
         of = f", {first['loc'][0]!r}" if first["loc"] else ""
         raise DescriptionError(f"{where}{of}: {first['ctx']['error']}") from None
+
+
+def describe(descriptions: dict[str, Description], material: str, constituents: Any) -> None:
+    """Keep what a material is made of, in place of its description before; None removes the description."""
+    if constituents is None:
+        descriptions.pop(material, None)
+    else:
+        descriptions[material] = dict(constituents)
 
 
 def require_constituents(descriptions: Mapping[str, Description], wanted: Collection[str] | None) -> list[str]:

@@ -73,9 +73,9 @@ class Gate:
     def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
         """This checkpoint. Raises DamageError."""
         with self._refusing(f"checkpoint {checkpoint.number}"):
-            arrays, attributes, upto = checkpoint.arrays, checkpoint.attributes, checkpoint.upto
+            arrays, attributes, last_sequence = checkpoint.arrays, checkpoint.attributes, checkpoint.last_sequence
             every: dict[str, Any] = {**arrays, **checkpoint.late}
-            self._checkpoints.check(every, attributes, upto, thorough=self.thorough)
+            self._checkpoints.check(every, attributes, last_sequence, thorough=self.thorough)
         for late in checkpoint.late.values():
             late.check = partial(self._late, f"checkpoint {checkpoint.number}", late.check)
         return checkpoint
@@ -192,7 +192,9 @@ def require_counted(path: Path, checkpoint: Checkpoint, heads: Sequence[Head]) -
     """
     if heads and len(heads) < heads[-1].sequence:
         return
-    named = Counter(head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= checkpoint.upto)
+    named = Counter(
+        head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= checkpoint.last_sequence
+    )
     touches = checkpoint.arrays["observations"].tolist()
     for material, count in zip(cast("list[str]", checkpoint.attributes["materials"]), touches, strict=True):
         if count > named[material]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal, Self, cast
 
 from pydantic import BaseModel
 
@@ -14,15 +14,34 @@ from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.gate import MemoryStore, require_counted, wrong_retractions
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.packing import sums_without
+from scroll_tactile.memory.replaying import apply_description, replay
 from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, active_rows
-from scroll_tactile.memory.state import Memory, apply_description
+from scroll_tactile.memory.state import Memory
 from store import Checkpoint, Head, Record, Store
 from store.files import same_folder
 
-__all__ = ["Choice", "MergePlan"]
+__all__ = ["Choice", "MergePlan", "MergeRules"]
 
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
+
+
+@dataclass(frozen=True)
+class MergeRules:
+    """How another memory comes in.
+
+    once: leave out streams that both observed, of one material with one content hash. one_name: refuse touches that are
+    there under another name, or came under one before, and leave out those that came before under theirs: what was
+    learned from sources. clipped: contents that clipping made, of which the refusal says so. said: the source of
+    touches that say none. thorough: see `Gate`.
+    """
+
+    once: bool = True
+    one_name: bool = False
+    descriptions: Choice = "same"
+    clipped: Collection[bytes] = ()
+    said: str | None = None
+    thorough: bool = True
 
 
 @dataclass(frozen=True)
@@ -31,8 +50,8 @@ class MergePlan:
 
     rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed, and
     that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are there
-    under another name, and why that is refused. descriptions: by material, those that we have not. newest:
-    what a packed memory sums up. said: where touches come from that do not say it. Made by `MergePlan.of`.
+    under another name, and why that is refused. descriptions: by material, those that we have not. said: see
+    `MergeRules`. newest: what a packed memory sums up.
     """
 
     source: MemoryStore
@@ -42,8 +61,8 @@ class MergePlan:
     left_out: list[Head]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
-    newest: Checkpoint | None = None
-    said: str | None = None
+    said: str | None
+    newest: Checkpoint | None
 
     @classmethod
     def of(
@@ -52,19 +71,9 @@ class MergePlan:
         memory: Memory,
         theirs: MemoryStore,
         contents: Contents | StoredContents,
-        *,
-        once: bool,
-        one_name: bool,
-        descriptions: Choice,
-        clipped: Collection[bytes] = (),
-        said: str | None = None,
-    ) -> MergePlan:
-        """Look through both journals.
-
-        contents: which touches we have. once: leave out streams that both observed, of one material with one content
-        hash. one_name: refuse touches that are there under another name, or came under one before, and leave out those
-        that came before under theirs. clipped: contents that clipping made, of which the refusal says so. said: see
-        above.
+        rules: MergeRules,
+    ) -> Self:
+        """Look through both journals; contents: which touches we have.
 
         Raises MismatchError where theirs cannot be a part of ours, or describes a material otherwise and nobody chose,
         ObservationError where a touch cannot be left out, DamageError for what opening theirs refuses, and for a shared
@@ -76,8 +85,8 @@ class MergePlan:
             require_counted(theirs.path, found, heads)
         incoming = active_rows(heads)
         both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
-        refused, again = _by_first_names(incoming, contents, base, clipped) if one_name else ([], set())
-        out = {*(both if once else ()), *again, *(head.sequence for head, _ in refused)}
+        refused, again = _by_first_names(incoming, contents, base, rules.clipped) if rules.one_name else ([], set())
+        out = {*(both if rules.once else ()), *again, *(head.sequence for head, _ in refused)}
         if fixed := [
             head for head in incoming if head.sequence in out and (head.sequence <= base or head.kind == MEMBER)
         ]:
@@ -90,17 +99,16 @@ class MergePlan:
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
-        described = _descriptions(ours, memory, theirs, found, descriptions)
+        described = _descriptions(ours, memory, theirs, found, rules.descriptions)
         newest = _require_sound(theirs, heads, coming={head.sequence for head in rows})
-        if once:
+        if rules.once:
             for head in (head for head in incoming if head.sequence in both):
                 sequence = _row(contents, head) or 0
                 if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
                     ours.record(sequence)
         shared = len(both) + len(again)
-        return cls(
-            theirs, found, rows, shared, left_out, refused, described, newest if theirs.is_packed else None, said
-        )
+        summed = newest if theirs.is_packed else None
+        return cls(theirs, found, rows, shared, left_out, refused, described, rules.said, summed)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -110,16 +118,20 @@ class MergePlan:
         """
         base = self.base
         # A base comes in as one row, and the merges before it are a part of it.
-        part = 0 if base is None else sum(head.kind == MERGE and head.sequence <= base.upto for head in self.rows) - 1
+        part = (
+            0
+            if base is None
+            else sum(head.kind == MERGE and head.sequence <= base.last_sequence for head in self.rows) - 1
+        )
         total = len(self.rows) - part
         for material, description in self.descriptions.items():
-            memory.sequence = ours.append(DESCRIBE, material, b"", attributes={"constituents": description}).sequence
-            memory.describe(material, description)
+            head = ours.append(DESCRIBE, material, b"", attributes={"constituents": description})
+            replay(memory, Record(**vars(head), arrays={}), ours)
         sums = self._sums(memory)
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(base), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != MEMBER and sums is None:
-                memory.replay(Record(**vars(head), arrays=arrays), ours)
+                replay(memory, Record(**vars(head), arrays=arrays), ours)
             elif memory.exemplars is not None and "nbytes" in attributes:
                 memory.exemplars.add(label, key, head.sequence)
             memory.sequence = head.sequence
@@ -144,7 +156,7 @@ class MergePlan:
             arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
         for head in self.rows:
-            if base is not None and head.sequence <= base.upto:
+            if base is not None and head.sequence <= base.last_sequence:
                 if head.kind != MERGE:  # a merge before the base is a part of it
                     kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
                     yield MEMBER, head.label, head.key, kept, None, head.time
@@ -203,7 +215,7 @@ def _descriptions(
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
     theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes["descriptions"]))
-    for head in theirs.heads(0 if base is None else base.upto):
+    for head in theirs.heads(0 if base is None else base.last_sequence):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions
     new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}

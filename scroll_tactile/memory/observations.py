@@ -50,7 +50,7 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
         raise UnknownMaterialError(
             f"{material!r} was never observed; observed were {list(memory.statistics.materials)[:30]}"
         )
-    found = [head.sequence for head in memory.retractable(store, material)]
+    found = [head.sequence for head in _retractable(store, memory, material)]
     if len(found) != count:
         for _ in store.heads(memory.base):  # one that is damaged was passed over
             pass
@@ -61,6 +61,12 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
     return found
 
 
+def _retractable(store: Store, memory: Memory, material: str | None = None) -> list[Head]:
+    """The observations whose arrays the journal still holds, of one material or all, in order; no damaged ones."""
+    rows = store.heads(memory.base, kind=OBSERVE, label=material)
+    return [head for head in rows if head.sequence not in memory.retracted]
+
+
 def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
     """The sequences of all observations from a source, ascending: a file, or all that lies in a folder or address.
 
@@ -69,7 +75,7 @@ def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
     mine = [
         head for head in active_rows(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
     ]
-    held = {head.sequence for head in memory.retractable(store)}
+    held = {head.sequence for head in _retractable(store, memory)}
     if not mine:
         raise ObservationError(
             f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
@@ -117,5 +123,5 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
     if keep == 0:
         return store.last
-    sequences = [head.sequence for head in memory.retractable(store)]
+    sequences = [head.sequence for head in _retractable(store, memory)]
     return memory.base if len(sequences) <= keep else sequences[-keep] - 1

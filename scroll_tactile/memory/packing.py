@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
-from scroll_tactile.memory.buffer import candidates_of
+from scroll_tactile.memory.buffer import exemplar_candidates
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
@@ -31,7 +31,7 @@ def pack_memory(
     with_rows = rows and readings and not memory.base and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
     packed = copy(memory)
-    packed.tuned, packed.tuned_upto, packed.retracted, packed.excluded = None, 0, set(), set()
+    packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
     if not readings:
         identity |= {"exemplars": 0, "recall": 0}
         packed.kept = packed.exemplars = None
@@ -52,10 +52,12 @@ def pack_memory(
                 if packed.exemplars is not None:
                     packed.exemplars = _among(touches, memory)
                 written, attributes = packed.to_arrays()
-                into.commit(written, upto=into.last, attributes=attributes)
+                into.commit(written, last_sequence=into.last, attributes=attributes)
             else:
-                written, attributes = packed.to_arrays(into.last, candidates_of(memory, store) if readings else [])
-                into.compact(written, upto=into.last, attributes=attributes)
+                written, attributes = packed.to_arrays(
+                    into.last, exemplar_candidates(memory, store) if readings else []
+                )
+                into.compact(written, last_sequence=into.last, attributes=attributes)
         write_archive(Path(folder), path)
 
 
@@ -81,7 +83,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     found: its newest checkpoint. memory: any of that making. Raises DamageError, also where the sums are not those of
     the touches that it names.
     """
-    if found.upto != source.last:
+    if found.last_sequence != source.last:
         return None
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]
@@ -90,7 +92,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
         return None
     if observed.ndim != 1 or said != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
-    sums = memory.of_sums(found.arrays, found.attributes)
+    sums = memory.empty_like().fill(found.arrays, found.attributes)
     if not left_out:
         return sums
     gone, rest = memory.empty_like(), memory.empty_like()
@@ -100,5 +102,5 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
         gone.statistics.add(record.label, codes, columns)
     rest.statistics = sums.statistics - gone.statistics
     rest.exemplars = None  # the rows have them
-    rest.choose([head for head in heads if head.sequence not in left_out], source, sums)
+    rest.choose([head for head in heads if head.sequence not in left_out], source.record, sums)
     return rest

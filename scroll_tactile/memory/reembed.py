@@ -19,6 +19,7 @@ from pathlib import Path
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.gate import MemoryStore, require_counted
 from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.replaying import load, refill, replay
 from scroll_tactile.memory.rows import (
     DESCRIBE,
     OBSERVE,
@@ -44,8 +45,8 @@ SNAPSHOT_EVERY = 256  # rows, after which a run that goes on does not embed them
 class Reembedding:
     """The memory that takes the place of another one.
 
-    source: the store of the other one. identity: of the new one. load: reads a memory from the new one's store. encode:
-    embeds readings: the columns of the touch, and its rows of codes by scale. bare: whether rows keep readings alone.
+    source: the store of the other one. identity: of the new one. empty: a memory of its making. encode: embeds
+    readings: the columns of the touch, and its rows of codes by scale. bare: whether rows keep readings alone.
 
     Raises MismatchError where not every observation has its readings, DamageError where a checkpoint counts touches
     that no row has, StoreError.
@@ -55,7 +56,7 @@ class Reembedding:
         self,
         source: Store,
         identity: Identity,
-        load: Callable[[Store], Memory],
+        empty: Memory,
         encode: Callable[[Readings], tuple[int, Codes]],
         *,
         bare: bool,
@@ -71,7 +72,7 @@ class Reembedding:
             self._draft.close()
             shutil.rmtree(folder)
             self._draft = MemoryStore.open(folder, identity=identity.to_json())
-        self._memory = load(self._draft)
+        self._memory = load(empty, self._draft)
 
     def copy(self, progress: Callable[[str, int, int], object]) -> None:
         """Embed the rows that the new memory does not have yet; the old one can be used meanwhile.
@@ -83,7 +84,7 @@ class Reembedding:
             with draft.batch():
                 for record in islice(self._source.records(after=memory.sequence), BATCH):
                     self._carry(record)
-            memory.refill(draft)
+            refill(memory, draft)
             if memory.sequence - memory.saved >= SNAPSHOT_EVERY:
                 self._snapshot()
             progress("embedding", draft.last, self._source.last)
@@ -101,11 +102,11 @@ class Reembedding:
             record.kind, record.label, record.key, attributes=attributes, arrays=arrays, time=record.time
         )
         assert head.sequence == record.sequence
-        self._memory.replay(Record(**vars(head), arrays=arrays), self._draft, codes)
+        replay(self._memory, Record(**vars(head), arrays=arrays), self._draft, codes)
 
     def _snapshot(self) -> None:
         arrays, attributes = self._memory.to_arrays()
-        self._draft.commit(arrays, upto=self._memory.sequence, attributes=attributes)
+        self._draft.commit(arrays, last_sequence=self._memory.sequence, attributes=attributes)
         self._memory.saved = self._memory.sequence
 
     def put_in_place(self) -> Path:
@@ -114,7 +115,10 @@ class Reembedding:
         The caller has copied all rows. Raises StoreError where the old one was written since, in another process.
         """
         self._snapshot()
-        folder, upto = self._source.path.resolve(), self._draft.last  # resolved: a link goes on leading to the memory
+        folder, last_sequence = (
+            self._source.path.resolve(),
+            self._draft.last,
+        )  # resolved: a link goes on leading to the memory
         for store in (self._draft, self._source):
             store.close()
         whole, before, count = _named(folder, "reembedded"), _named(folder, "before"), 1
@@ -123,7 +127,7 @@ class Reembedding:
         lock = WriterLock(folder)
         try:
             with Store.open(folder, mode="read") as old:
-                if old.last != upto:
+                if old.last != last_sequence:
                     raise StoreError(f"{folder} was written while it was exchanged: embed it again, to go on")
             with reported(folder, "putting a memory embedded anew in place"):
                 self._draft.path.rename(whole)

@@ -32,7 +32,7 @@ from scroll_tactile.errors import (
     ScrollTactileError,
 )
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.merge import Choice
+from scroll_tactile.memory.merge import Choice, MergeRules
 from scroll_tactile.memory.rows import SOURCE
 from scroll_tactile.pipelines.addresses import expand, fetched
 from scroll_tactile.pipelines.engines import Engine, engine, require_workers
@@ -202,14 +202,13 @@ class _Destination:
     def merge(
         self, path: Path, progress: Progress, clipped: Collection[bytes] = (), source: str | None = None
     ) -> list[tuple[Head, str]]:
-        """Merge a memory, each touch once; its rows that are refused, and why. Raises as `Ledger.merge_sources`."""
+        """Merge a memory, each touch once; its rows that are refused, and why. Raises as `Ledger.merge`."""
         begun, processor = time.perf_counter(), time.process_time()
         try:
             ledger = self.opened()._ledger
             # What our own workers made is taken as what this memory holds itself.
-            merged, refused = ledger.merge_sources(
-                path, self._descriptions, progress, clipped, source, thorough=source is not None
-            )
+            rules = MergeRules(True, True, self._descriptions, clipped, source, thorough=source is not None)
+            merged, refused = ledger.merge(path, rules, progress)
             self._save()
         finally:
             self._report.merging += time.perf_counter() - begun

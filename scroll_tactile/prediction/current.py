@@ -151,7 +151,7 @@ class CurrentModel:
         except (StoreError, *WRONG) as error:
             logger.info("the model that was kept is not used: %s", error)
         else:
-            self._behind = [] if kept.upto == memory.sequence else None
+            self._behind = [] if kept.last_sequence == memory.sequence else None
         give_back_scratch()
 
     def kept(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:

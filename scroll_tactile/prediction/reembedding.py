@@ -57,9 +57,5 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
         image = extractor.image(touch)
         return image.shape[1], extractor.codes(image, touch.key)
 
-    def load(draft: Store) -> Memory:
-        return Memory.load(
-            draft, embedding.dimension, plan, made.exemplars, lambda readings: encode(readings)[1], keeping
-        )
-
-    return Reembedding(store, identity, load, encode, bare=identity.embedding.bare)
+    empty = Memory(embedding.dimension, plan, made.exemplars, lambda readings: encode(readings)[1], keeping)
+    return Reembedding(store, identity, empty, encode, bare=identity.embedding.bare)

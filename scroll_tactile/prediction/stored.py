@@ -141,7 +141,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     names: Any = about.get("names")
     # Rows behind the checkpoint may have brought materials and taken some: that the model is renewed for.
     now = list(memory.statistics.materials)
-    same = kept.upto == memory.sequence
+    same = kept.last_sequence == memory.sequence
     expect(isinstance(names, list) and bool(names), "names", "materials", names)
     expect(all(isinstance(name, str) for name in names) and names == sorted(set(names)), "names", "in order", names)
     expect(names == now if same else bool(set(names) & set(now)), "names", f"{now}", names)

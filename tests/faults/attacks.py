@@ -204,7 +204,7 @@ def forged_current(rng: random.Random, path: Path, scene: Scene) -> str:
             current[name]["place"][at] = value
         told += f" {current[name]['place']}"
     elif way == "number":
-        key = rng.choice(("number", "upto", "sha256"))
+        key = rng.choice(("number", "last_sequence", "sha256"))
         current[name][key] = rng.choice((*NUMBERS, "0" * 64, None, 1, 2, 3, 4, 5))
         told += f" {key} {current[name][key]}"
     elif way == "swap":

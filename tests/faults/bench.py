@@ -41,6 +41,7 @@ from faults.received import (
 )
 from scroll_tactile import TactileLearner
 from scroll_tactile.memory.gate import MemoryStore
+from scroll_tactile.memory.replaying import replay
 from scroll_tactile.memory.rows import pack_codes
 from store import Record, VersionError
 from store.encoding import decode_payload, encode_payload
@@ -246,7 +247,7 @@ class Bench:
             record = store.gate.record(Record(**made))
             self.learner = None
             with heard():
-                learner.memory.replay(record, store)
+                replay(learner.memory, record, store)
                 learner.digest()
             learner.close()
             return "let in"

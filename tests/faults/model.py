@@ -122,7 +122,7 @@ class State:
     last: int = 0
     base: int = 0
     tuned: Pairs | None = None
-    tuned_upto: int = 0
+    tuned_last_sequence: int = 0
     said: tuple[tuple[str, Constituents], ...] = ()
     embedding: str = "own"
     brought: bool = False
@@ -136,7 +136,7 @@ class State:
     def without(self, sequences: set[int]) -> State:
         """The state after a row that takes observations back."""
         left = tuple(one for one in self.observed if one.sequence not in sequences)
-        gone = any(sequence <= self.tuned_upto for sequence in sequences)
+        gone = any(sequence <= self.tuned_last_sequence for sequence in sequences)
         return replace(self, observed=left, last=self.last + 1, tuned=None if gone else self.tuned)
 
     def with_one(self, material: str, touch: Touch, *, fixed: bool = False) -> State:
@@ -235,17 +235,17 @@ def _merge(
 
 def _compact(state: State, _: Any, keep: int) -> tuple[State, Any]:
     loose = state.loose
-    upto = state.last if keep == 0 else loose[-keep].sequence - 1 if len(loose) > keep else 0
-    upto = max(upto, state.base)
-    observed = tuple(replace(one, fixed=one.fixed or one.sequence <= upto) for one in state.observed)
-    return replace(state, observed=observed, base=upto), upto
+    last_sequence = state.last if keep == 0 else loose[-keep].sequence - 1 if len(loose) > keep else 0
+    last_sequence = max(last_sequence, state.base)
+    observed = tuple(replace(one, fixed=one.fixed or one.sequence <= last_sequence) for one in state.observed)
+    return replace(state, observed=observed, base=last_sequence), last_sequence
 
 
 def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
     digest = tuned_digest(state.pairs, state.embedding)
     if digest is None:
         return state, "InputError"
-    return replace(state, tuned=state.pairs, tuned_upto=state.last), digest
+    return replace(state, tuned=state.pairs, tuned_last_sequence=state.last), digest
 
 
 def _backup(state: State, _: Any) -> tuple[State, Any]:
@@ -264,7 +264,7 @@ def _reembed(state: State, _: Any, embedding: str) -> tuple[State, Any]:
     """Nothing is lost but f*."""
     if state.base or state.brought:
         return state, "MismatchError"
-    return replace(state, embedding=embedding, tuned=None, tuned_upto=0), None
+    return replace(state, embedding=embedding, tuned=None, tuned_last_sequence=0), None
 
 
 def _fleet(state: State, _: Any, touches: Pairs) -> tuple[State, Any]:
@@ -332,7 +332,7 @@ _CALLS = {
     "relabel": lambda learner, _, sequence, material: learner.relabel(sequence, material),
     "describe": lambda learner, _, material, said: learner.describe(material, said and dict(said)),
     "merge": _do_merge,
-    "compact": lambda learner, _, keep: learner.compact(keep=keep).upto,
+    "compact": lambda learner, _, keep: learner.compact(keep=keep).last_sequence,
     "fine_tune": lambda learner, _: learner.fine_tune(epochs=1).digest,
     "backup": _do_backup,
     "pack": lambda learner, home, name, rows: learner.pack(home / name, rows=rows),

@@ -232,12 +232,12 @@ def currents() -> dict[str, Named]:
         "a place behind the end": newest_is(place=[2**62, 2**62, "00" * 16]),
         "a place at the beginning": newest_is(place=[0, 0, "00" * 16]),
         "a checkpoint of another number": newest_is(number=7),
-        "a checkpoint up to 2^62": newest_is(upto=2**62),
+        "a checkpoint up to 2^62": newest_is(last_sequence=2**62),
         "no checkpoint": change(newest=None),
         "a base": lambda path, _: set_current(path, base=get_current(path)["newest"]),
         "rows that come twice": doubled,
         "a text": change(newest="x"),
-        "a number that is none": newest_is(upto=True),
+        "a number that is none": newest_is(last_sequence=True),
     }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from faults.planting import Patches, nothing
-from scroll_tactile.memory import merge, packing
+from scroll_tactile.memory import ledger, merge, packing, replaying
 from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.memory.state import Memory
 from store import checkpoints, journal, repair
@@ -15,9 +15,9 @@ from store import checkpoints, journal, repair
 
 def _place_too_late(patch: Patches) -> None:
     def make(_: Any) -> Any:
-        def place(self: Any, upto: int) -> Any:
+        def place(self: Any, last_sequence: int) -> Any:
             with self._using("looking for a place") as at:
-                found = [place for row, place in at.places if row > upto]
+                found = [place for row, place in at.places if row > last_sequence]
                 return found[0] if found else at.places[-1][1]
 
         return place
@@ -28,7 +28,9 @@ def _place_too_late(patch: Patches) -> None:
 def _one_row_too_many(patch: Patches) -> None:
     def make(commit: Any) -> Any:
         def committed(self: Any, draft: Any) -> Any:
-            return commit(self, dataclasses.replace(draft, upto=min(draft.upto + 1, self._journal.last())))
+            return commit(
+                self, dataclasses.replace(draft, last_sequence=min(draft.last_sequence + 1, self._journal.last()))
+            )
 
         return committed
 
@@ -41,8 +43,8 @@ def _numbers_given_out_again(patch: Patches) -> None:
 
 def _compaction_drops_a_row(patch: Patches) -> None:
     def make(payloads: Any) -> Any:
-        def fewer(self: Any, upto: int) -> Iterator[bytes]:
-            found = list(payloads(self, upto))
+        def fewer(self: Any, last_sequence: int) -> Iterator[bytes]:
+            found = list(payloads(self, last_sequence))
             return iter(found[:-1])
 
         return fewer
@@ -52,19 +54,19 @@ def _compaction_drops_a_row(patch: Patches) -> None:
 
 def _base_with_a_retracted_touch(patch: Patches) -> None:
     def make(until: Any) -> Any:
-        def spoilt(self: Any, given: Any, upto: int) -> Any:
-            base = until(self, given, upto)
-            for sequence in sorted(self.retracted):
-                if self.base < sequence <= upto:
+        def spoilt(memory: Any, given: Any, last_sequence: int) -> Any:
+            base = until(memory, given, last_sequence)
+            for sequence in sorted(memory.retracted):
+                if memory.base < sequence <= last_sequence:
                     record = given.record(sequence)
-                    columns, codes = self.codes(record)
+                    columns, codes = memory.codes(record)
                     base.statistics.add(record.label, codes, columns)
                     break
             return base
 
         return spoilt
 
-    patch(Memory, "until", make)
+    patch(ledger, "until", make)
 
 
 def _excluded_forgotten(patch: Patches) -> None:
@@ -79,15 +81,15 @@ def _excluded_forgotten(patch: Patches) -> None:
 
 
 def _kept_not_retracted(patch: Patches) -> None:
-    def make(refill: Any) -> Any:
-        def spoilt(self: Any, given: Any) -> None:
-            kept = self.kept
-            refill(self, given)
-            self.kept = kept
+    def make(chosen: Any) -> Any:
+        def spoilt(memory: Any, given: Any, last_sequence: int) -> Any:
+            fresh = chosen(memory, given, last_sequence)
+            fresh.kept = memory.kept
+            return fresh
 
         return spoilt
 
-    patch(Memory, "refill", make)
+    patch(replaying, "_chosen", make)
 
 
 def _all(heads: Any) -> Any:

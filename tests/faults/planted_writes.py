@@ -191,7 +191,7 @@ def _relabel_in_two(patch: Patches) -> None:
 
 
 def _merge_in_parts(patch: Patches) -> None:
-    patch(ledger.Ledger, "_merge", _without_batch)
+    patch(ledger.Ledger, "merge", _without_batch)
 
 
 WRITES: dict[str, Callable[[Patches], None]] = {

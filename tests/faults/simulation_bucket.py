@@ -11,6 +11,7 @@ from faults.simulation_disk import flip
 from faults.simulation_events import OneMemory
 from faults.simulation_model import Rows
 from faults.simulation_world import Machine
+from scroll_tactile.memory.merge import MergeRules
 from store import StoreError
 
 MOST = 24  # touches of a memory that is merged
@@ -72,7 +73,8 @@ class Carrying(OneMemory):
 
         def do(learner: Any) -> Any:
             if of_sources:
-                merged, refused = learner._ledger.merge_sources(path, choice, lambda *_: None)
+                rules = MergeRules(one_name=True, descriptions=choice)
+                merged, refused = learner._ledger.merge(path, rules, lambda *_: None)
                 return [merged.observations, merged.shared, merged.described, len(refused)]
             merged = learner.merge(path, shared="once" if once else "twice", descriptions=choice)
             return [merged.observations, merged.shared, merged.described, 0]

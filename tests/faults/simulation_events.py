@@ -129,7 +129,7 @@ class OneMemory(World):
             machine,
             rng,
             f"compact {keep}",
-            lambda learner: learner.compact(keep=keep).upto,
+            lambda learner: learner.compact(keep=keep).last_sequence,
             lambda ours: model.compact(ours, keep),
         )
 

@@ -92,13 +92,13 @@ class Rows:
         """The first rows alone."""
         return replace(self, rows=self.rows[:count])
 
-    def based(self, upto: int) -> Rows:
+    def based(self, last_sequence: int) -> Rows:
         """Compacted up to a row."""
         pairs = list(self.stands)
         for sequence, row in self.standing:
-            if self.base < sequence <= upto:
+            if self.base < sequence <= last_sequence:
                 pairs += row[1] if row[0] == "merge" else [row[1:]] if row[0] == "observe" else []
-        return replace(self, base=upto, stands=tuple(sorted(pairs)))
+        return replace(self, base=last_sequence, stands=tuple(sorted(pairs)))
 
 
 Then = tuple[Rows, Any]
@@ -151,9 +151,9 @@ def describe(ours: Rows, material: str, said: Any) -> Then:
 def compact(ours: Rows, keep: int) -> Then:
     """As `TactileLearner.compact`."""
     loose = ours.loose
-    upto = len(ours.rows) if keep == 0 else loose[-keep] - 1 if len(loose) > keep else ours.base
-    upto = max(upto, ours.base)
-    return (ours.based(upto) if upto > ours.base else ours), upto
+    last_sequence = len(ours.rows) if keep == 0 else loose[-keep] - 1 if len(loose) > keep else ours.base
+    last_sequence = max(last_sequence, ours.base)
+    return (ours.based(last_sequence) if last_sequence > ours.base else ours), last_sequence
 
 
 def packed(ours: Rows, rows: bool) -> Rows:
@@ -166,7 +166,7 @@ def packed(ours: Rows, rows: bool) -> Rows:
 
 
 def merge(ours: Rows, theirs: Rows, once: bool, choice: str, one_name: bool) -> Then:
-    """As `Ledger.merge`, and `Ledger.merge_sources` where one_name: a touch that came twice there is counted once."""
+    """As `Ledger.merge`, by rules of this once and one_name: a touch that came twice there is counted once."""
     if ours.embedding != theirs.embedding:
         return ours, "MismatchError"
     have = {pair for _, pair in ours.listed}

@@ -71,7 +71,7 @@ class Rotting(Carrying):
                 self.counts["rot: refused when it was read"] += 1
                 self.say(f"    reading what was opened: {error!r:.150}")
                 self.drop(machine)
-        self._repair(machine, whole, hurt, 0 if newest is None else newest.upto)
+        self._repair(machine, whole, hurt, 0 if newest is None else newest.last_sequence)
 
     @staticmethod
     def _hurt(path: Path, rng: random.Random) -> tuple[Path, str]:

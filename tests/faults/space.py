@@ -88,7 +88,7 @@ def rows_alone(home: Path, count: int) -> dict[str, Any]:
             with store.batch():
                 for i in range(begin, min(begin + BATCH, count)):
                     store.append("a", f"material {i % 1000}", i.to_bytes(16), arrays={"x": x})
-        store.commit({"x": np.zeros(1000)}, upto=max(count - 100, 0))
+        store.commit({"x": np.zeros(1000)}, last_sequence=max(count - 100, 0))
     figures: dict[str, Any] = {"rows": count, "bytes": sum(file.stat().st_size for file in path.glob("log-*"))}
     for mode in ("read", "write"):
         begun = time.perf_counter()
@@ -98,7 +98,7 @@ def rows_alone(home: Path, count: int) -> dict[str, Any]:
             "look whether something came": lambda store: (store.newest, store.last, store.compacted),
             "read the newest checkpoint's attributes": lambda store: store.latest(only=()),
             "read the newest checkpoint": lambda store: store.latest(),
-            "read the rows behind it": lambda store: list(store.records(after=store.latest(only=()).upto)),
+            "read the rows behind it": lambda store: list(store.records(after=store.latest(only=()).last_sequence)),
             "find the rows of one material": lambda store: list(store.heads(label="material 7")),
         }.items():
             begun = time.perf_counter()

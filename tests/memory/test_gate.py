@@ -299,7 +299,7 @@ ABOUT = {
     "kept": [[], ["z"] * 12, None],
     "exemplars": [None, [], {}, {"materials": ["z"] * 12}],
     "descriptions": [None, [], {"a": None}, {"a": {"wool": "x"}}, {"": {"wool": 1.0}}],
-    "tuned_upto": [None, -1, 10**9, "x"],
+    "tuned_last_sequence": [None, -1, 10**9, "x"],
     "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
 }
 IN_GENERATIONS = "observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded"

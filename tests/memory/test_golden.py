@@ -127,7 +127,7 @@ def test_it_is_sound(golden):
 def test_every_kind_of_row_and_checkpoint_is_in_it(golden):
     with Store.open(golden, mode="read") as held:
         assert {head.kind for head in held.heads()} == {"observe", "retract", "merge", "member", "describe"}
-        assert 0 < held.compacted < held.latest().upto < held.last
+        assert 0 < held.compacted < held.latest().last_sequence < held.last
         assert {"sample", "kept", "exemplars", "descriptions", "tuned"} <= set(held.latest().attributes)
         assert len(held.base().arrays["exemplar-readings"])
 
@@ -170,7 +170,8 @@ def test_it_is_what_this_version_writes(golden, tmp_path):
             rows = [(head.kind, head.label, head.key, sorted(head.attributes)) for head in held.heads()]
             arrays = [sorted(record.arrays) for record in held.records(held.compacted)]
             points = [
-                (point.upto, sorted(point.arrays), sorted(point.attributes)) for point in (held.latest(), held.base())
+                (point.last_sequence, sorted(point.arrays), sorted(point.attributes))
+                for point in (held.latest(), held.base())
             ]
             written.append((held.identity, rows, arrays, points))
             assert held.identity == Identity.read(held).to_json()

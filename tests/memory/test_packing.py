@@ -199,7 +199,7 @@ class TestDamage:
         with Store.open(tmp_path / "two.memory", mode="read") as store:
             newest = store.latest()
         with Store.open(tmp_path / "one.memory") as store:
-            store.commit(newest.arrays, upto=newest.upto, attributes=newest.attributes)
+            store.commit(newest.arrays, last_sequence=newest.last_sequence, attributes=newest.attributes)
         archive.write_archive(tmp_path / "one.memory", tmp_path / "forged")
         before = other.digest()
         with pytest.raises(DamageError, match=r"forged counts other touches than it names|forged counts \d touches of"):
@@ -350,7 +350,7 @@ def test_rows_that_no_memory_packs(tmp_path, other):
     """A retraction of all rows that there could ever be, in a file with right checksums."""
     with Store.open(tmp_path / "m", identity=dict(other._ledger.store.identity)) as store:
         store.append("retract", "", b"", attributes={"sequences": [[1, 2**60]]})
-        store.commit({}, upto=1, attributes={})
+        store.commit({}, last_sequence=1, attributes={})
     archive.write_archive(tmp_path / "m", tmp_path / "forged")
     require_refused(other, tmp_path / "forged", "row 1|checkpoint")
     assert check_memory(tmp_path / "forged")

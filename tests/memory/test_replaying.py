@@ -9,7 +9,7 @@ from forging import spoil_row
 from touches import OBSERVED, PAD, stream, without
 
 from scroll_tactile import Augmented, Capabilities, Joined, Kernels, Maps, TactileLearner
-from scroll_tactile.memory import ledger
+from scroll_tactile.memory import open_memory
 from store import DamageError, Store
 
 
@@ -154,7 +154,7 @@ def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_p
 
 
 def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(ledger, "SNAPSHOT_EVERY", 5)
+    monkeypatch.setattr(open_memory, "SNAPSHOT_EVERY", 5)
     killed = TactileLearner.open(tmp_path / "m", **made)
     observe(killed, OBSERVED)
     killed._ledger.store.close()

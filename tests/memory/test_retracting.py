@@ -281,8 +281,8 @@ class TestCompact:
 
     def test_an_empty_memory_has_nothing_to_compact(self, path):
         with TactileLearner.open(path, **SETTINGS) as learner:
-            assert learner.compact().upto == 0
-            assert learner.compact(keep=5).upto == 0
+            assert learner.compact().last_sequence == 0
+            assert learner.compact(keep=5).last_sequence == 0
 
 
 class TestRefresh:

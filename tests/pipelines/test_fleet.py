@@ -134,7 +134,7 @@ class TestSameBytes:
 @pytest.fixture
 def full(monkeypatch):
     """A disk that is full when so many steps were merged, until it is asked for 0."""
-    merge, merged = Ledger.merge_sources, []
+    merge, merged = Ledger.merge, []
 
     def after(count):
         def merging(self, other, *words, **named):
@@ -143,7 +143,7 @@ def full(monkeypatch):
             merged.append(other)
             return merge(self, other, *words, **named)
 
-        monkeypatch.setattr(Ledger, "merge_sources", merge if count is None else merging)
+        monkeypatch.setattr(Ledger, "merge", merge if count is None else merging)
 
     return after
 

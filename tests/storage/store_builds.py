@@ -24,10 +24,10 @@ def values(number):
     return np.random.default_rng(number).integers(0, 2**40, 900 if number % 5 == 0 else 200)
 
 
-def state(upto):
+def state(last_sequence):
     """The arrays of a checkpoint."""
-    rows = np.arange(400.0).reshape(100, 4) + upto
-    return {"sum": np.array(upto), "rows": rows, "names": np.array([f"to {upto}", "é"])}
+    rows = np.arange(400.0).reshape(100, 4) + last_sequence
+    return {"sum": np.array(last_sequence), "rows": rows, "names": np.array([f"to {last_sequence}", "é"])}
 
 
 def add(opened, number):
@@ -36,8 +36,8 @@ def add(opened, number):
     )
 
 
-def commit(call, upto, **options):
-    return call(state(upto), upto=upto, attributes={"n": upto}, **options)
+def commit(call, last_sequence, **options):
+    return call(state(last_sequence), last_sequence=last_sequence, attributes={"n": last_sequence}, **options)
 
 
 def build(path, *, compacted=False, last=LAST):
@@ -128,7 +128,7 @@ def write_log(path, payloads, *, header=None, kind=ROW):
 
     def placed(named):
         at = 0
-        while named and at + 1 < len(places) and places[at + 1][0] <= named.upto:
+        while named and at + 1 < len(places) and places[at + 1][0] <= named.last_sequence:
             at += 1
         return named and replace(named, place=places[at][1])
 

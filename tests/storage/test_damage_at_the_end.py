@@ -17,7 +17,7 @@ def compacted(tmp_path) -> Path:
     with Store.open(folder, identity={"for": "a test"}) as store:
         for i in range(3):
             store.append("row", f"{i}", b"key", arrays=ARRAYS)
-        store.compact(ARRAYS, upto=1)
+        store.compact(ARRAYS, last_sequence=1)
         offsets, sizes = store._journal._open.rows.offsets, store._journal._open.rows.sizes
         place = offsets[-1] + 88 + sizes[-1] - 1
     log = folder / "log-00000002"
@@ -58,7 +58,7 @@ def test_rows_of_a_batch_whose_end_alone_is_damaged_are_kept(tmp_path, place):
         with store.batch():
             for i in range(3):
                 store.append("row", f"{i}", b"key", arrays=ARRAYS)
-        store.commit(ARRAYS, upto=3)
+        store.commit(ARRAYS, last_sequence=3)
     log = folder / "log-00000001"
     data = bytearray(log.read_bytes())
     data[len(data) - 88 + place] ^= 1

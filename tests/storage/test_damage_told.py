@@ -16,7 +16,7 @@ def test_what_is_passed_over_is_told(tmp_path, caplog, ask, harm):
     with Store.open(tmp_path / "s", identity={"of": "rows"}) as kept:
         for number in range(8):
             kept.append("observe", "a", bytes([number]) * 32, arrays={"x": np.full(64, number, np.uint8)})
-        kept.commit({"sum": np.arange(3)}, upto=kept.last)
+        kept.commit({"sum": np.arange(3)}, last_sequence=kept.last)
     log = log_of(tmp_path / "s")
     with LogReader(log) as reader:
         rows = [frame for batch in reader.refresh() for frame in batch]

@@ -36,7 +36,7 @@ def kept(tmp_path_factory):
     path = tmp_path_factory.mktemp("kept") / "s"
     with Store.open(path, identity={}) as opened:
         opened.append("a", "b", b"")
-        opened.commit(ARRAYS, upto=1)
+        opened.commit(ARRAYS, last_sequence=1)
     return path
 
 
@@ -94,7 +94,7 @@ def test_so_little_that_stands_for_so_much_is_written_as_it_is_and_read_back(pat
     monkeypatch.setattr(store_chunks, "SPARE", 2**20)
     zeros = np.zeros(5 * 2**20, np.uint8)
     with Store.open(path) as opened:
-        opened.commit({"zeros": zeros}, upto=1)
+        opened.commit({"zeros": zeros}, last_sequence=1)
         assert opened.latest().arrays["zeros"].tobytes() == zeros.tobytes()
     assert check_store(path) == []
 
@@ -182,9 +182,9 @@ OWN = {
     "a number in words": {"number": "1"},
     "a number below 0": {"number": -1},
     "another number": {"number": 2},
-    "no upto": {"upto": None},
-    "an upto above any": {"upto": 2**63},
-    "another upto": {"upto": 0},
+    "no last_sequence": {"last_sequence": None},
+    "an last_sequence above any": {"last_sequence": 2**63},
+    "another last_sequence": {"last_sequence": 0},
     "attributes in a list": {"attributes": [1]},
     "an identity in words": {"identity": "x"},
     "another identity": {"identity": {"of": "another"}},
@@ -232,7 +232,7 @@ def test_more_attributes_than_are_read_are_not_written(opened, monkeypatch):
         with pytest.raises(RecordError, match="attributes"):
             opened.append("a", "b", b"", attributes=many)
         with pytest.raises(RecordError, match="attributes"):
-            opened.commit({}, upto=0, attributes=many)
+            opened.commit({}, last_sequence=0, attributes=many)
 
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])

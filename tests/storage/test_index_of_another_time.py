@@ -20,15 +20,15 @@ def restored(tmp_path, monkeypatch):
     folder, copy = tmp_path / "store", tmp_path / "copy"
     with Store.open(folder, identity={"for": "a test"}) as opened:
         append(opened, "first", 4)
-        opened.commit(ARRAYS, upto=4)
+        opened.commit(ARRAYS, last_sequence=4)
         opened.backup(copy)
         append(opened, "then", 4)
-        opened.commit(ARRAYS, upto=8)
+        opened.commit(ARRAYS, last_sequence=8)
     assert list((folder / "derived").iterdir())
     shutil.copytree(copy, folder, dirs_exist_ok=True)
     with Store.open(folder) as opened:
         append(opened, "otherwise", 3, more=500)  # too few for an index of its own
-        opened.commit(ARRAYS, upto=7)
+        opened.commit(ARRAYS, last_sequence=7)
     return folder
 
 

@@ -29,8 +29,8 @@ def made(path, rows=100, seed=0):
             head = kept.append("observe", "a", key, arrays={"x": np.arange(3)})
             keys[head.sequence] = key
             if draw.random() < 0.2:
-                kept.commit({"sum": np.arange(4)}, upto=head.sequence)
-        kept.commit({"sum": np.arange(4)}, upto=kept.last)
+                kept.commit({"sum": np.arange(4)}, last_sequence=head.sequence)
+        kept.commit({"sum": np.arange(4)}, last_sequence=kept.last)
     return keys
 
 
@@ -102,11 +102,11 @@ def test_files_of_another_log_are_not_believed(tmp_path):
 def test_a_new_log_has_files_of_its_own(tmp_path):
     keys = made(tmp_path / "s")
     with Store.open(tmp_path / "s") as kept:
-        kept.compact({"sum": np.arange(4)}, upto=60)
+        kept.compact({"sum": np.arange(4)}, last_sequence=60)
         for _ in range(20):
             head = kept.append("observe", "b", b"new")
             keys[head.sequence] = b"new"
-        kept.commit({"sum": np.arange(4)}, upto=kept.last)
+        kept.commit({"sum": np.arange(4)}, last_sequence=kept.last)
     with Store.open(tmp_path / "s", mode="read") as kept:
         assert [head.sequence for head in kept.with_key(b"new")] == list(range(101, 121))
         assert [head.sequence for head in kept.heads()] == list(keys)

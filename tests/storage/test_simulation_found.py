@@ -30,7 +30,7 @@ def test_a_repair_keeps_the_sound_rows_of_a_last_batch_that_a_checkpoint_proves(
         with store.batch():
             for name in "abc":
                 store.append("row", name, b"")
-        store.commit({}, upto=3)
+        store.commit({}, last_sequence=3)
     log = path / "log-00000001"
     data = bytearray(log.read_bytes())
     place = -1
@@ -63,7 +63,7 @@ def test_of_a_log_and_the_one_that_compaction_replaced_a_repair_takes_the_newer(
     with Store.open(path, identity={}) as store:
         store.append("row", "a", b"")
         before = (path / "log-00000001").read_bytes()
-        store.compact({}, upto=1)
+        store.compact({}, last_sequence=1)
     (path / "log-00000001").write_bytes(before)  # a power cut brought it back
     (path / "CURRENT").unlink()
     repair_store(path)

@@ -185,7 +185,7 @@ def test_a_full_or_forbidden_disk_leaves_nothing(tmp_path, small_disk):
         with pytest.raises(StoreFullError, match="free some space"):
             opened.backup(small_disk / "copy")
         assert list(small_disk.iterdir()) == []
-        opened.commit({"x": np.random.default_rng(0).integers(0, 2**60, 200_000)}, upto=40)
+        opened.commit({"x": np.random.default_rng(0).integers(0, 2**60, 200_000)}, last_sequence=40)
         with pytest.raises(StoreFullError):
             opened.backup(small_disk / "copy")
         assert list(small_disk.iterdir()) == []

@@ -83,9 +83,9 @@ def test_after_a_failed_append_none_is_there_whether_or_not_the_caller_goes_on(o
 
 ONE = {"x": np.arange(3)}
 IMPOSSIBLE = {
-    "commit": lambda opened: opened.commit(ONE, upto=1),
-    "commit_later": lambda opened: opened.commit_later(ONE, upto=1),
-    "compact": lambda opened: opened.compact(ONE, upto=1),
+    "commit": lambda opened: opened.commit(ONE, last_sequence=1),
+    "commit_later": lambda opened: opened.commit_later(ONE, last_sequence=1),
+    "compact": lambda opened: opened.compact(ONE, last_sequence=1),
     "flush": lambda opened: opened.flush(),
     "close": lambda opened: opened.close(),
     "batch": lambda opened: opened.batch().__enter__(),
@@ -101,12 +101,12 @@ def test_what_a_batch_does_not_allow_is_refused_at_once_and_does_no_harm(opened,
         add(opened, "two")
     assert labels(opened) == ["before", "one", "two"]
     assert opened.latest() is None
-    assert opened.commit(ONE, upto=3) == 1
+    assert opened.commit(ONE, last_sequence=3) == 1
 
 
 def test_a_batch_and_a_background_commit_do_not_wait_for_each_other_for_ever(opened):
     for _ in range(5):
-        opened.commit_later(ONE, upto=1)
+        opened.commit_later(ONE, last_sequence=1)
         with opened.batch():
             add(opened, "one")
             with pytest.raises(StoreError, match="end it first"):

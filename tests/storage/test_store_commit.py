@@ -23,12 +23,12 @@ class Gate:
     """Holds writers of checkpoints at the door and counts them."""
 
     def __init__(self, monkeypatch):
-        self.open, self.reached, self.uptos = threading.Event(), threading.Event(), []
+        self.open, self.reached, self.last_sequences = threading.Event(), threading.Event(), []
         self.write = store.checkpoints.write_checkpoint
         monkeypatch.setattr(store.checkpoints, "write_checkpoint", self)
 
     def __call__(self, parent, number, draft, identity):
-        self.uptos.append(draft.upto)
+        self.last_sequences.append(draft.last_sequence)
         self.reached.set()
         assert self.open.wait(10)
         return self.write(parent, number, draft, identity)
@@ -37,31 +37,31 @@ class Gate:
 def test_appends_go_on_and_the_newest_waiting_commit_wins(opened, monkeypatch):
     gate = Gate(monkeypatch)
     opened.append("a", "b", b"")
-    opened.commit_later(ONE, upto=0)
+    opened.commit_later(ONE, last_sequence=0)
     assert gate.reached.wait(10)
-    for upto in (1, 2, 3):
+    for last_sequence in (1, 2, 3):
         opened.append("a", "b", b"")
-        opened.commit_later(ONE, upto=upto)
+        opened.commit_later(ONE, last_sequence=last_sequence)
     assert opened.last == 4
     assert opened.latest() is None
     assert [thread.name for thread in threading.enumerate()].count("store commit s_0") == 1
     gate.open.set()
     opened.flush()
-    assert gate.uptos == [0, 3]
-    assert opened.latest().upto == 3
+    assert gate.last_sequences == [0, 3]
+    assert opened.latest().last_sequence == 3
 
 
 def test_a_commit_waits_for_the_one_in_the_background(opened, monkeypatch):
     gate = Gate(monkeypatch)
-    opened.commit_later(ONE, upto=0)
+    opened.commit_later(ONE, last_sequence=0)
     assert gate.reached.wait(10)
     threading.Timer(0.05, gate.open.set).start()
-    assert opened.commit(ONE, upto=0) == 2
+    assert opened.commit(ONE, last_sequence=0) == 2
 
 
 def test_closing_finishes_what_was_handed_over(tmp_path):
     with Store.open(tmp_path, identity={}) as opened:
-        opened.commit_later(ONE, upto=0, attributes={"a": [1]})
+        opened.commit_later(ONE, last_sequence=0, attributes={"a": [1]})
     with Store.open(tmp_path) as opened:
         assert (opened.latest().number, opened.latest().attributes) == (1, {"a": [1]})
     assert "store commit" not in " ".join(thread.name for thread in threading.enumerate())
@@ -72,15 +72,15 @@ def test_a_program_that_forgets_to_close_ends_and_loses_no_row(tmp_path):
     code = """
 import atexit, sys, numpy, store
 opened = store.Store.open(sys.argv[1], identity={})
-atexit.register(lambda: opened.commit_later({"x": numpy.arange(3)}, upto=1))
+atexit.register(lambda: opened.commit_later({"x": numpy.arange(3)}, last_sequence=1))
 opened.append("a", "b", b"")
-opened.commit_later({"x": numpy.arange(2)}, upto=1)
+opened.commit_later({"x": numpy.arange(2)}, last_sequence=1)
 """
     root = Path(store.__file__).parents[1]
     subprocess.run([sys.executable, "-c", code, tmp_path / "s"], cwd=root, check=True, timeout=60, capture_output=True)
     with Store.open(tmp_path / "s") as again:
         assert again.last == 1
-        assert again.commit(ONE, upto=1)
+        assert again.commit(ONE, last_sequence=1)
     assert check_store(tmp_path / "s") == []
 
 
@@ -92,8 +92,8 @@ def fail(*_):
     "surface",
     [
         lambda opened: opened.flush(),
-        lambda opened: opened.commit(ONE, upto=0),
-        lambda opened: opened.commit_later(ONE, upto=0),
+        lambda opened: opened.commit(ONE, last_sequence=0),
+        lambda opened: opened.commit_later(ONE, last_sequence=0),
         lambda opened: opened.close(),
     ],
     ids=["flush", "commit", "commit_later", "close"],
@@ -101,7 +101,7 @@ def fail(*_):
 def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeypatch, caplog, surface):
     with monkeypatch.context() as broken:
         broken.setattr(store.files, "sync_tree", fail)
-        opened.commit_later(ONE, upto=0)
+        opened.commit_later(ONE, last_sequence=0)
         opened._checkpoints.wait()
     with pytest.raises(StoreError, match="the disk says no"):
         surface(opened)
@@ -109,24 +109,24 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
     if surface.__code__.co_names != ("close",):
         opened.flush()
         assert folders(opened.path) == []
-        assert opened.commit(ONE, upto=0) == 1
+        assert opened.commit(ONE, last_sequence=0) == 1
 
 
 def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
     monkeypatch.setattr(store.checkpoints, "write_checkpoint", fail)
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
-        opened.commit_later(ONE, upto=0)
+        opened.commit_later(ONE, last_sequence=0)
         raise KeyError
 
 
 def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
-    opened.commit(ONE, upto=0)
+    opened.commit(ONE, last_sequence=0)
     places = [(store.files, "sync_tree"), (store.checkpoint_files, "_write_zarr"), (store.files, "sync_folder")]
     for module, name in places:
         with monkeypatch.context() as broken:
             broken.setattr(module, name, fail)
             with pytest.raises(StoreError, match="the disk says no"):
-                opened.commit({"x": np.arange(3)}, upto=0)
+                opened.commit({"x": np.arange(3)}, last_sequence=0)
         assert folders(opened.path) == ["00000001"]
         assert opened.latest().arrays["x"].tobytes() == ONE["x"].tobytes()
 
@@ -146,7 +146,7 @@ def test_every_file_and_folder_is_durable_before_the_checkpoint_counts(opened, m
 
     noted(os, "fsync", lambda file: str(Path(f"/proc/self/fd/{file}").readlink()))
     noted(os, "replace", lambda old, new: str(new))
-    opened.commit({"x": np.arange(10), "y": np.array(1.5)}, upto=0)
+    opened.commit({"x": np.arange(10), "y": np.array(1.5)}, last_sequence=0)
     parent = opened.path / "checkpoints"
     final = parent / "00000001"
     i = events.index(("replace", str(final)))
@@ -163,7 +163,7 @@ def test_every_file_and_folder_is_durable_before_the_checkpoint_counts(opened, m
 
 
 def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
-    opened.commit(ONE, upto=0)
+    opened.commit(ONE, last_sequence=0)
 
     def starve(*_):
         raise MemoryError
@@ -176,7 +176,7 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
 
 @pytest.mark.parametrize("instant", ["CheckpointReader", "read"])
 def test_a_reader_whose_checkpoint_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
-    opened.commit(ONE, upto=0)
+    opened.commit(ONE, last_sequence=0)
     owner = store.checkpoints if instant == "CheckpointReader" else ArrayFiles
     real = getattr(owner, instant)
     waiting = [2, 3, 4]
@@ -184,7 +184,7 @@ def test_a_reader_whose_checkpoint_is_replaced_while_it_reads_gets_the_new_one(o
     def replaced(*args, **options):
         if waiting:
             monkeypatch.setattr(owner, instant, real)
-            opened.commit({"x": np.arange(waiting[0])}, upto=0)
+            opened.commit({"x": np.arange(waiting[0])}, last_sequence=0)
             del waiting[0]
             monkeypatch.setattr(owner, instant, replaced)
         return real(*args, **options)

@@ -24,12 +24,12 @@ def add(opened, number):
     return opened.append("a", f"row {number}", bytes([number]), arrays={"x": noise(number)}).sequence
 
 
-def sums(upto):
-    return {"sum": np.array(upto * (upto + 1) // 2), "bulk": np.full(500, upto, np.float64)}
+def sums(last_sequence):
+    return {"sum": np.array(last_sequence * (last_sequence + 1) // 2), "bulk": np.full(500, last_sequence, np.float64)}
 
 
-def compact(opened, upto, **options):
-    opened.compact(sums(upto), upto=upto, newest=(sums(opened.last), {}), **options)
+def compact(opened, last_sequence, **options):
+    opened.compact(sums(last_sequence), last_sequence=last_sequence, newest=(sums(opened.last), {}), **options)
 
 
 @pytest.fixture(scope="session")
@@ -38,7 +38,7 @@ def made(tmp_path_factory):
     with Store.open(tmp_path_factory.mktemp("made") / "s", identity={"for": "compaction"}) as fresh:
         for number in range(1, LAST + 1):
             add(fresh, number)
-        fresh.commit(sums(LAST), upto=LAST)
+        fresh.commit(sums(LAST), last_sequence=LAST)
     return fresh.path
 
 
@@ -71,7 +71,7 @@ def agrees(opened, compacted, last=LAST):
             opened.records(after)
     found = opened.base()
     if compacted:
-        assert (found.upto, found.arrays["sum"]) == (compacted, sums(compacted)["sum"])
+        assert (found.last_sequence, found.arrays["sum"]) == (compacted, sums(compacted)["sum"])
     else:
         assert found is None
     return True
@@ -79,7 +79,7 @@ def agrees(opened, compacted, last=LAST):
 
 def test_the_space_is_given_back_to_the_disk(opened):
     before = log_of(opened.path).stat().st_size
-    opened.compact(sums(LAST), upto=LAST)
+    opened.compact(sums(LAST), last_sequence=LAST)
     opened.close()
     # A row without its arrays takes some 200 bytes; there is one log and one checkpoint.
     assert log_of(opened.path).stat().st_size < LAST * 300 < before
@@ -87,12 +87,12 @@ def test_the_space_is_given_back_to_the_disk(opened):
     assert sorted(entry.name for entry in opened.path.iterdir()) == ["CURRENT", "checkpoints", "lock", "log-00000002"]
 
 
-@pytest.mark.parametrize("upto", [4, -1, LAST + 1, True, 5.0])
-def test_there_is_no_way_back_before_the_base(opened, upto):
+@pytest.mark.parametrize("last_sequence", [4, -1, LAST + 1, True, 5.0])
+def test_there_is_no_way_back_before_the_base(opened, last_sequence):
     compact(opened, 5)
     for call in (opened.commit, opened.commit_later, opened.compact):
-        with pytest.raises(RecordError, match=f"upto must be a sequence from 5, .* to {LAST}"):
-            call(sums(0), upto=upto)
+        with pytest.raises(RecordError, match=f"last_sequence must be a sequence from 5, .* to {LAST}"):
+            call(sums(0), last_sequence=last_sequence)
     assert agrees(opened, 5)
 
 
@@ -101,11 +101,11 @@ def test_a_damaged_base_is_named_and_the_newest_checkpoint_gone_on_from(opened, 
     spoil(base(opened.path))
     with pytest.raises(DamageError, match="array 'bulk' of checkpoint 2"):
         opened.base()
-    assert opened.latest().upto == LAST
+    assert opened.latest().last_sequence == LAST
     # It is kept all the same, for a repair to decide.
     for number in range(LAST + 1, LAST + 4):
         add(opened, number)
-        opened.commit(sums(number), upto=number)
+        opened.commit(sums(number), last_sequence=number)
     assert "00000002" in folders(opened.path)
     assert caplog.records == []
 
@@ -131,10 +131,10 @@ def test_a_lost_head_is_no_more_silently_left_out_than_a_row(opened):
         assert (again.compacted, folders(again.path)) == (0, ["00000001"])
 
 
-@pytest.mark.parametrize("upto", [5, LAST])
-def test_a_flipped_bit_in_a_log_that_nothing_was_appended_to_is_damage(opened, upto):
+@pytest.mark.parametrize("last_sequence", [5, LAST])
+def test_a_flipped_bit_in_a_log_that_nothing_was_appended_to_is_damage(opened, last_sequence):
     """All its rows are one batch, which must not look as one that a power cut left."""
-    opened.compact(sums(upto), upto=upto)
+    opened.compact(sums(last_sequence), last_sequence=last_sequence)
     opened.close()
     flip_row(opened.path, LAST - 1)
     assert damage(opened.path)
@@ -227,7 +227,7 @@ def test_whatever_call_fails_all_that_was_acknowledged_is_there(made, tmp_path, 
             add(opened, LAST + 1)
             outcomes.add((raised is None, opened.compacted))
             assert agrees(opened, opened.compacted, LAST + 1)
-            assert opened.latest().upto == LAST
+            assert opened.latest().last_sequence == LAST
             with Store.open(opened.path, mode="read") as reader:
                 assert agrees(reader, opened.compacted, LAST + 1)
             killed = as_after_a_crash(opened, tmp_path / f"killed{at}")
@@ -256,22 +256,22 @@ def test_whatever_call_of_a_commit_fails_the_store_goes_on(tmp_path, monkeypatch
         at += 1
         with Store.open(tmp_path / f"s{at}", identity={}) as opened:
             add(opened, 1)
-            opened.commit(sums(0), upto=0)
+            opened.commit(sums(0), last_sequence=0)
             with monkeypatch.context() as broken:
                 calls = failing(broken, name, at, OSError(errno.EIO, "the disk says no"), after=after)
                 try:
-                    opened.commit(sums(1), upto=1)
+                    opened.commit(sums(1), last_sequence=1)
                 except StoreError as caught:
                     assert "the disk says no" in str(caught)
             if len(calls) < at:
                 break
-            assert opened.latest().upto in (0, 1)
+            assert opened.latest().last_sequence in (0, 1)
             # Both may be named on the disk until a sync has succeeded.
             assert len(folders(opened.path)) >= 1
             with Store.open(opened.path, mode="read") as reader:
-                assert reader.latest().upto == opened.latest().upto
+                assert reader.latest().last_sequence == opened.latest().last_sequence
             add(opened, 2)
-            opened.commit(sums(2), upto=2)
+            opened.commit(sums(2), last_sequence=2)
             assert len(folders(opened.path)) == 1
         assert check_store(opened.path) == []
 
@@ -325,7 +325,7 @@ def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
     assert "what was replaced could not be removed" in caplog.text
     assert agrees(opened, 5)
     assert len(folders(opened.path)) == 3
-    opened.commit(sums(LAST), upto=LAST)
+    opened.commit(sums(LAST), last_sequence=LAST)
     assert len(folders(opened.path)) == 2
 
 
@@ -357,11 +357,11 @@ def test_a_reader_stays_open_over_ten_compactions(opened):
     with Store.open(opened.path, mode="read") as reader, Store.open(opened.path, mode="read") as lazy:
         files = open_files()
         last = LAST
-        for upto in range(1, 11):
+        for last_sequence in range(1, 11):
             assert add(opened, last := last + 1) == last
-            compact(opened, upto)
-            assert agrees(reader, upto, last)
-            assert reader.latest().upto == last
+            compact(opened, last_sequence)
+            assert agrees(reader, last_sequence, last)
+            assert reader.latest().last_sequence == last
         assert agrees(lazy, 10, last)
         assert log_of(opened.path).name == "log-00000011"
         assert open_files() == files

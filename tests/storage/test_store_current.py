@@ -38,9 +38,9 @@ def is_whole(path, compacted, latest=15):
         assert [head.label for head in opened.heads()] == [f"row {number}" for number in range(1, LAST + 1)]
         assert len(list(opened.records(compacted))) == LAST - compacted
         found, base = opened.latest(), opened.base()
-        assert found.upto == latest
+        assert found.last_sequence == latest
         assert same_arrays(found.arrays, state(latest))
-        assert (base.upto if base else 0) == compacted
+        assert (base.last_sequence if base else 0) == compacted
     assert damage(path) == []
     return True
 
@@ -106,11 +106,11 @@ FORGED = {
     "a format that is true": lambda path: {"format": True},
     "a checkpoint in a list": lambda path: {"newest": [1]},
     "a checkpoint without a place": lambda path: {"newest": named(path, place=None)},
-    "an upto in words": lambda path: {"newest": named(path, upto="15")},
+    "an last_sequence in words": lambda path: {"newest": named(path, last_sequence="15")},
     "a number above any": lambda path: {"newest": named(path, number=2**64)},
     "a sha256 in capitals": lambda path: {"newest": named(path, sha256="AB" * 32)},
     "a base without a newest": lambda path: {"newest": None, "base": named(path)},
-    "a base newer than the newest": lambda path: {"base": named(path, upto=16)},
+    "a base newer than the newest": lambda path: {"base": named(path, last_sequence=16)},
     "a place in no frame": lambda path: placed(path, offset=named(path)["place"][0] + 1),
     "a place beyond the end": lambda path: placed(path, offset=2**40),
     "a place at the last byte of all": lambda path: placed(path, offset=2**63 - 1),
@@ -165,18 +165,18 @@ def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, curren
 
 
 @pytest.mark.parametrize("which_one", ["newest", "base"])
-@pytest.mark.parametrize("change", [{"number": 9}, {"sha256": "0" * 64}, {"upto": 14}])
+@pytest.mark.parametrize("change", [{"number": 9}, {"sha256": "0" * 64}, {"last_sequence": 14}])
 def test_a_checkpoint_that_is_another_than_the_one_named_is_not_believed(compacted, which_one, change):
     known = known_current(compacted)[which_one]
-    change = change | ({"upto": 5} if "upto" in change and which_one == "base" else {})
+    change = change | ({"last_sequence": 5} if "last_sequence" in change and which_one == "base" else {})
     put_current(compacted, **{which_one: known | change})
     with Store.open(compacted, mode="read") as opened:
         if which_one == "newest":
-            assert opened.latest().upto == 6
+            assert opened.latest().last_sequence == 6
         else:
             with pytest.raises(DamageError, match="checkpoint"):
                 opened.base()
-            assert opened.latest().upto == 15
+            assert opened.latest().last_sequence == 15
     assert damage(compacted)
     repair_store(compacted)
     assert damage(compacted) == []
@@ -196,7 +196,9 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
     # A checkpoint of the other, named by a forged CURRENT.
     shutil.rmtree(newest(plain))
     shutil.copytree(newest(tmp_path / "other"), newest(plain))
-    put_current(plain, newest=named(plain, upto=3, sha256=known_current(tmp_path / "other")["newest"]["sha256"]))
+    put_current(
+        plain, newest=named(plain, last_sequence=3, sha256=known_current(tmp_path / "other")["newest"]["sha256"])
+    )
     with Store.open(plain, mode="read") as opened:
         assert opened.latest() is None
     assert "another store" in " ".join(problem.what for problem in damage(plain))
@@ -261,7 +263,7 @@ def crashed(tmp_path_factory):
     with Store.open(home / "s", identity=IDENTITY) as opened:
         for number in range(1, 5):
             opened.append("a", f"row {number}", b"")
-        opened.commit({}, upto=4)
+        opened.commit({}, last_sequence=4)
         with opened.batch():
             opened.append("a", "row 5", b"")
             opened.append("a", "row 6", b"")

@@ -110,7 +110,9 @@ SPOIL = {
         "its sha256 differs",
     ),
     "the group's last row": (
-        lambda folder: rewrite(folder / "zarr.json", lambda data: data.replace(b'"upto": ', b'"upto": 9')),
+        lambda folder: rewrite(
+            folder / "zarr.json", lambda data: data.replace(b'"last_sequence": ', b'"last_sequence": 9')
+        ),
         "its sha256 differs",
     ),
     "nothing left": (shutil.rmtree, "zarr.json cannot be read"),
@@ -128,7 +130,7 @@ def test_a_spoilt_checkpoint_is_named_and_the_base_taken(compacted, harm, said, 
     assert {problem.kind for problem in problems} == {"spare"}
     with Store.open(compacted, mode=mode) as opened, caplog.at_level(logging.WARNING):
         found = opened.latest()
-    assert found.upto == 6
+    assert found.last_sequence == 6
     assert same_arrays(found.arrays, state(6))
     (warning,) = caplog.messages
     assert str(folder) in warning
@@ -143,7 +145,7 @@ def test_a_spoilt_base_is_lost(compacted, harm, said):
     with Store.open(compacted, mode="read") as opened:
         with pytest.raises(DamageError, match="checkpoint"):
             opened.base()
-        assert opened.latest().upto == 15
+        assert opened.latest().last_sequence == 15
 
 
 def test_behind_a_spoilt_checkpoint_the_log_has_every_row(plain, caplog):
@@ -151,8 +153,8 @@ def test_behind_a_spoilt_checkpoint_the_log_has_every_row(plain, caplog):
         spoil(newest(plain))
         assert opened.latest() is None
         assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
-        assert opened.commit({"x": np.arange(7)}, upto=6) == 2  # an older one takes no one's place
+        assert opened.commit({"x": np.arange(7)}, last_sequence=6) == 2  # an older one takes no one's place
         assert folders(plain) == ["00000001"]
-        assert opened.commit({"x": np.arange(7)}, upto=LAST) == 2
+        assert opened.commit({"x": np.arange(7)}, last_sequence=LAST) == 2
         assert opened.latest().number == 2
     assert "array 'rows' of checkpoint 1" in caplog.text and "replaying" in caplog.text

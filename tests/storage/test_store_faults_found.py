@@ -36,7 +36,7 @@ def test_a_check_leaves_no_file_open(path):
 def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(path, monkeypatch, module):
     before = [read_current(path / "CURRENT")]
     with Store.open(path) as writer:
-        writer.compact({}, upto=2)
+        writer.compact({}, last_sequence=2)
     with Store.open(path, mode="read") as reader:
         monkeypatch.setattr(module, "read_current", lambda *given: before.pop() if before else read_current(*given))
         if module is store.backup:
@@ -57,15 +57,15 @@ def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(path):
 @pytest.mark.parametrize("named", [1, 3])
 def test_a_place_that_is_none_or_behind_other_rows_is_found_and_mended(path, named):
     with Store.open(path) as writer:
-        writer.commit({}, upto=named)
+        writer.commit({}, last_sequence=named)
     assert check_store(path) == []
     newest = get_current(path)["newest"]
     with Store.open(path) as writer:
         writer.append("kind", "label", b"")
-        writer.commit({}, upto=4)
+        writer.commit({}, last_sequence=4)
     later = get_current(path)["newest"]
     place = later["place"] if named == 1 else [newest["place"][0] + 1, *newest["place"][1:]]
-    set_current(path, newest=later | {"place": place, **({"upto": 3} if named == 1 else {})})
+    set_current(path, newest=later | {"place": place, **({"last_sequence": 3} if named == 1 else {})})
     assert any("no place behind which" in problem.what for problem in check_store(path))
     repair_store(path)
     assert check_store(path) == [] or all(problem.kind == "leftover" for problem in check_store(path))

@@ -30,9 +30,9 @@ def sound(found):
     """The last row that a checkpoint contains, if it is as it was committed."""
     if found is None:
         return 0
-    assert same_arrays(found.arrays, state(found.upto))
-    assert found.attributes == {"n": found.upto}
-    return found.upto
+    assert same_arrays(found.arrays, state(found.last_sequence))
+    assert found.attributes == {"n": found.last_sequence}
+    return found.last_sequence
 
 
 def is_a_state_there_has_been(found, whole, kept):

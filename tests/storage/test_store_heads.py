@@ -59,7 +59,7 @@ def test_heads_from_before_the_beginning_are_refused(opened):
 def test_damaged_heads_are_named(opened, covered):
     """Where a checkpoint contains them, too, and whoever opens the store has not read them."""
     if covered:
-        opened.commit({}, upto=9)
+        opened.commit({}, last_sequence=9)
     opened.close()
     flip_row(opened.path, 6)
     with Store.open(opened.path, mode="read") as reader:
@@ -74,7 +74,7 @@ def test_damaged_heads_are_named(opened, covered):
 
 @pytest.mark.parametrize("gone", [(4, 5, 6), (1, 2), (9, 10)])
 def test_missing_heads_are_named_where_all_are_asked_for(opened, gone):
-    opened.commit({}, upto=10)
+    opened.commit({}, last_sequence=10)
     opened.close()
     lose_rows(opened.path, *gone)
     with Store.open(opened.path, mode="read") as reader:
@@ -98,7 +98,7 @@ def test_a_record_that_is_not_there_is_refused(opened, wrong):
 
 
 def test_damage_of_one_record_is_not_that_of_another(opened):
-    opened.commit({}, upto=10)
+    opened.commit({}, last_sequence=10)
     opened.close()
     lose_rows(opened.path, 5)
     flip_row(opened.path, 4, arrays=True)

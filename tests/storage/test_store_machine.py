@@ -28,7 +28,7 @@ class History(RuleBasedStateMachine):
         self.home = Path(tempfile.mkdtemp())
         self.lives = 0
         self.rows: list[tuple[str, bytes]] = []
-        self.current: tuple[int, int, bytes] | None = None  # upto, number, content
+        self.current: tuple[int, int, bytes] | None = None  # last_sequence, number, content
         self.base: tuple[int, int, bytes] | None = None
 
     @initialize()
@@ -60,34 +60,36 @@ class History(RuleBasedStateMachine):
         except Undone:
             self.rows = before
 
-    def numbered(self, upto, array):
+    def numbered(self, last_sequence, array):
         """A checkpoint has the number behind those that are kept."""
         kept = [made[1] for made in (self.current, self.base) if made]
-        return upto, 1 + max(kept, default=0), array.tobytes()
+        return last_sequence, 1 + max(kept, default=0), array.tobytes()
 
     @rule(where=st.floats(0, 1), value=st.integers(0, 255), later=st.booleans())
     def commit(self, where, value, later):
-        upto = self.compacted + int(where * (len(self.rows) - self.compacted))
+        last_sequence = self.compacted + int(where * (len(self.rows) - self.compacted))
         array = np.full((2, 3), value, "|u1")
-        (self.store.commit_later if later else self.store.commit)({"x": array}, upto=upto)
+        (self.store.commit_later if later else self.store.commit)({"x": array}, last_sequence=last_sequence)
         self.store.flush()
-        made = self.numbered(upto, array)
-        self.current = made if self.current is None or upto >= self.current[0] else self.current
+        made = self.numbered(last_sequence, array)
+        self.current = made if self.current is None or last_sequence >= self.current[0] else self.current
 
     @rule(where=st.floats(0, 1), value=st.integers(0, 255), with_newest=st.booleans())
     def compact(self, where, value, with_newest):
-        upto = self.compacted + int(where * (len(self.rows) - self.compacted))
+        last_sequence = self.compacted + int(where * (len(self.rows) - self.compacted))
         array = np.full((3, 2), value, "|u1")
-        self.store.compact({"x": array}, upto=upto, newest=({"x": array}, {}) if with_newest else None)
-        self.current = self.base = self.numbered(upto, array)
+        self.store.compact(
+            {"x": array}, last_sequence=last_sequence, newest=({"x": array}, {}) if with_newest else None
+        )
+        self.current = self.base = self.numbered(last_sequence, array)
         if with_newest:
             self.current = self.numbered(len(self.rows), array)
 
     @rule()
     def refuse(self):
-        wrong = [lambda: self.store.append("a", "\0", b""), lambda: self.store.commit({}, upto=10**6)]
+        wrong = [lambda: self.store.append("a", "\0", b""), lambda: self.store.commit({}, last_sequence=10**6)]
         if self.compacted:
-            wrong.append(lambda: self.store.commit({}, upto=self.compacted - 1))
+            wrong.append(lambda: self.store.commit({}, last_sequence=self.compacted - 1))
         for call in wrong:
             try:
                 call()
@@ -155,8 +157,8 @@ class History(RuleBasedStateMachine):
                     pass
                 else:
                     raise AssertionError("not compacted")
-        assert (latest and (latest.upto, latest.number, latest.arrays["x"].tobytes())) == self.current
-        assert (base and (base.upto, base.number, base.arrays["x"].tobytes())) == self.base
+        assert (latest and (latest.last_sequence, latest.number, latest.arrays["x"].tobytes())) == self.current
+        assert (base and (base.last_sequence, base.number, base.arrays["x"].tobytes())) == self.base
         assert newest == (self.current and self.current[1])
 
     def teardown(self):

@@ -85,8 +85,8 @@ def test_a_reader_may_do_nothing_that_writes(tmp_path):
     with Store.open(tmp_path, mode="read") as reader:
         for call in (
             lambda: reader.append("a", "b", b""),
-            lambda: reader.commit({}, upto=0),
-            lambda: reader.commit_later({}, upto=0),
+            lambda: reader.commit({}, last_sequence=0),
+            lambda: reader.commit_later({}, last_sequence=0),
         ):
             with pytest.raises(ReadOnlyError):
                 call()
@@ -104,8 +104,8 @@ def test_closing_is_final_and_may_be_repeated(tmp_path):
         opened.records,
         lambda: next(rows),
         opened.latest,
-        lambda: opened.commit({}, upto=0),
-        lambda: opened.commit_later({}, upto=0),
+        lambda: opened.commit({}, last_sequence=0),
+        lambda: opened.commit_later({}, last_sequence=0),
         opened.flush,
         opened.size,
         opened.__enter__,
@@ -204,7 +204,7 @@ def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):
     with Store.open(small_disk / "s", identity={}) as opened:
         ballast = small_disk / "ballast"
         ballast.write_bytes(bytes(400_000))
-        opened.commit({"x": np.arange(3)}, upto=0)
+        opened.commit({"x": np.arange(3)}, last_sequence=0)
         sent = []
         with pytest.raises(StoreFullError, match="free some space"):
             while True:
@@ -213,24 +213,24 @@ def test_a_full_disk_loses_nothing_and_the_store_goes_on(small_disk):
         durable = len(sent) - 1
         assert opened.last == durable > 1
         with pytest.raises(StoreFullError):
-            opened.commit({"x": noise.integers(0, 2**60, 200_000)}, upto=1)
+            opened.commit({"x": noise.integers(0, 2**60, 200_000)}, last_sequence=1)
         assert len(list((small_disk / "s" / "checkpoints").iterdir())) == 1
         ballast.unlink()
         assert opened.append("a", "b", b"", arrays={"x": sent[-1]}).sequence == durable + 1
-        assert opened.commit({"x": np.arange(4)}, upto=durable + 1)
+        assert opened.commit({"x": np.arange(4)}, last_sequence=durable + 1)
     with Store.open(small_disk / "s") as opened:
         assert [row.arrays["x"].tobytes() for row in opened.records()] == [array.tobytes() for array in sent]
-        assert opened.latest().upto == durable + 1
+        assert opened.latest().last_sequence == durable + 1
 
 
 def test_a_disk_that_may_not_be_written_can_be_read(small_disk):
     path = small_disk / "s"
     with Store.open(path, identity={}) as opened:
         opened.append("a", "b", b"")
-        opened.commit({"x": np.arange(3)}, upto=1)
+        opened.commit({"x": np.arange(3)}, last_sequence=1)
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with Store.open(path, mode="read") as reader:
-        assert (reader.last, reader.latest().upto, len(list(reader.records()))) == (1, 1, 1)
+        assert (reader.last, reader.latest().last_sequence, len(list(reader.records()))) == (1, 1, 1)
     for folder in (path, small_disk / "new"):
         with pytest.raises(ReadOnlyError):
             Store.open(folder, identity={})
@@ -247,7 +247,7 @@ def test_what_cannot_be_removed_keeps_nobody_from_closing_or_from_the_lock(tmp_p
         broken.setattr(Path, "unlink", read_only)
         broken.setattr("store.checkpoint_files._write_zarr", lambda *_: read_only(tmp_path))
         with pytest.raises(StoreError):
-            opened.commit({}, upto=1)
+            opened.commit({}, last_sequence=1)
         opened.close()
     with Store.open(tmp_path / "s") as again:
         assert again.last == 1

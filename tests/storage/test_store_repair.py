@@ -61,11 +61,11 @@ def agrees(path, *, kept, base=0, latest=None, lost=()):
             for number in range(1, base + 1):
                 with pytest.raises(CompactedError):
                     opened.record(number)
-            for found, upto in ((opened.latest(), latest), (opened.base(), base or None)):
-                assert (found and found.upto) == upto
+            for found, last_sequence in ((opened.latest(), latest), (opened.base(), base or None)):
+                assert (found and found.last_sequence) == last_sequence
                 if found:
-                    assert found.attributes == {"n": upto}
-                    assert same_arrays(found.arrays, state(upto))
+                    assert found.attributes == {"n": last_sequence}
+                    assert same_arrays(found.arrays, state(last_sequence))
     return True
 
 
@@ -76,7 +76,7 @@ def goes_on(path):
         assert add(opened, number).sequence == number
         commit(opened.commit, number)
         commit(opened.compact, number)
-        assert opened.base().upto == number
+        assert opened.base().last_sequence == number
     assert damage(path) == []
     return True
 
@@ -169,7 +169,7 @@ CHECKPOINTS = {
 
 @pytest.mark.parametrize(("harm", "expected"), CHECKPOINTS.values(), ids=CHECKPOINTS)
 def test_damaged_checkpoints_are_put_aside_and_the_next_best_gone_on_from(stores, tmp_path, harm, expected):
-    (is_compacted, spoilt, lost), (kept, upto, latest, said) = harm, expected
+    (is_compacted, spoilt, lost), (kept, last_sequence, latest, said) = harm, expected
     path = shutil.copytree(stores[is_compacted], tmp_path / "s")
     for number in lost:
         flip_row(path, number, arrays=True)
@@ -181,7 +181,7 @@ def test_damaged_checkpoints_are_put_aside_and_the_next_best_gone_on_from(stores
     assert (done.kept, done.aside) == (kept, log.with_name(f"{log.name}.damaged"))
     said = [*said, *(f"checkpoint {folder.name.lstrip('0')}: array 'rows'" for folder in spoilt)]
     assert [text[: len(begin)] for text, begin in zip(done.lost, said, strict=True)] == said
-    assert agrees(path, kept=kept, base=upto, latest=latest)
+    assert agrees(path, kept=kept, base=last_sequence, latest=latest)
     assert [contents(folder.with_name(f"{folder.name}.damaged")) for folder in spoilt] == before
     assert goes_on(path)
 
@@ -373,7 +373,9 @@ def test_killed_at_any_step_it_can_be_begun_again(stores, tmp_path, monkeypatch,
         with Store.open(whole, mode="read") as right, Store.open(path, mode="read") as found:
             assert (found.last, found.compacted, found.identity) == (right.last, right.compacted, right.identity)
             assert list(found.heads()) == list(right.heads())
-            assert (found.latest() and found.latest().upto) == (right.latest() and right.latest().upto)
+            assert (found.latest() and found.latest().last_sequence) == (
+                right.latest() and right.latest().last_sequence
+            )
         # The damaged log is never lost on the way.
         if log.exists():
             asides = [file.read_bytes() for file in path.iterdir() if ".damaged" in file.name]

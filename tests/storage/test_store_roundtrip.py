@@ -75,9 +75,9 @@ def test_a_record_comes_back_with_the_same_bytes(kept, kind, label, key, time, a
 @several
 @given(attributes, arrays)
 def test_a_checkpoint_comes_back_with_the_same_bytes(kept, attributes, arrays):
-    number = kept.commit(arrays, upto=kept.last, attributes=attributes)
+    number = kept.commit(arrays, last_sequence=kept.last, attributes=attributes)
     found = kept.latest()
-    assert (found.number, found.upto, found.attributes) == (number, kept.last, attributes)
+    assert (found.number, found.last_sequence, found.attributes) == (number, kept.last, attributes)
     assert same(found.arrays, arrays)
 
 
@@ -97,18 +97,18 @@ SPECIAL = {
 
 def test_awkward_arrays_come_back_in_both_places(kept):
     head = kept.append("a", "b", b"", arrays=SPECIAL)
-    kept.commit(SPECIAL, upto=head.sequence)
+    kept.commit(SPECIAL, last_sequence=head.sequence)
     assert same(kept.record(head.sequence).arrays, SPECIAL)
     assert same(kept.latest().arrays, SPECIAL)
 
 
 def test_large_arrays_are_chunked_along_the_first_axis(kept):
     rows = np.arange(3 * 700_000, dtype=np.float64).reshape(3, 700_000)
-    kept.commit({"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)}, upto=kept.last)
+    kept.commit({"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)}, last_sequence=kept.last)
     assert same(kept.latest().arrays, {"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)})
     chunks = kept.path / "checkpoints" / f"{kept.latest().number:08d}" / "rows" / "c"
     assert sorted(chunk.name for chunk in chunks.iterdir()) == ["0", "1", "2"]
-    kept.commit({"rows": rows.astype(np.int64)}, upto=kept.last)  # byte by byte: an axis more
+    kept.commit({"rows": rows.astype(np.int64)}, last_sequence=kept.last)  # byte by byte: an axis more
     assert same(kept.latest().arrays, {"rows": rows.astype(np.int64)})
 
 
@@ -148,15 +148,15 @@ def test_what_cannot_be_kept_is_refused_and_nothing_changes(kept, wrong):
     if "arrays" in wrong or "attributes" in wrong:
         for commit in (kept.commit, kept.commit_later):
             with pytest.raises(RecordError):
-                commit(**({"arrays": {}, "upto": 0} | wrong))
+                commit(**({"arrays": {}, "last_sequence": 0} | wrong))
     assert kept.last == before
     kept.flush()
 
 
-@pytest.mark.parametrize("upto", [-1, 10**9, True, 1.0])
-def test_a_checkpoint_may_not_claim_rows_that_are_not_there(kept, upto):
-    with pytest.raises(RecordError, match="upto"):
-        kept.commit({}, upto=upto)
+@pytest.mark.parametrize("last_sequence", [-1, 10**9, True, 1.0])
+def test_a_checkpoint_may_not_claim_rows_that_are_not_there(kept, last_sequence):
+    with pytest.raises(RecordError, match="last_sequence"):
+        kept.commit({}, last_sequence=last_sequence)
 
 
 def test_a_message_names_the_place_in_the_attributes(kept):
@@ -192,12 +192,12 @@ def test_the_attributes_of_a_checkpoint_or_some_of_its_arrays_are_read_without_t
     arrays = {"a": np.arange(3), "b": np.arange(4.0), "c": np.array(["é"])}
     with Store.open(tmp_path, identity={}) as opened:
         assert opened.latest(only=()) is None
-        opened.commit(arrays, upto=0, attributes={"made": "now"})
+        opened.commit(arrays, last_sequence=0, attributes={"made": "now"})
         (tmp_path / "checkpoints" / "00000001" / "b" / "zarr.json").unlink()
         found = opened.latest(only=["c", "none such", "a"])
         assert same(found.arrays, {"a": arrays["a"], "c": arrays["c"]})
         found = opened.latest(only=())
-        assert (found.number, found.upto, found.attributes, found.arrays) == (1, 0, {"made": "now"}, {})
+        assert (found.number, found.last_sequence, found.attributes, found.arrays) == (1, 0, {"made": "now"}, {})
         assert caplog.records == []
         assert opened.latest(only=["b"]) is None
         assert "array 'b' of checkpoint 1" in caplog.text
@@ -208,7 +208,7 @@ def test_the_attributes_of_a_checkpoint_or_some_of_its_arrays_are_read_without_t
 @pytest.mark.parametrize("only", [None, (), ["x"]])
 def test_a_checkpoint_of_a_newer_format_is_refused_also_for_its_attributes(tmp_path, only):
     with Store.open(tmp_path, identity={}) as opened:
-        opened.commit({"x": np.arange(3)}, upto=0)
+        opened.commit({"x": np.arange(3)}, last_sequence=0)
     describe_again(tmp_path, format=2)
     with Store.open(tmp_path, mode="read") as opened, pytest.raises(VersionError, match=r"format 2; .* upgrade"):
         opened.latest(only=only)

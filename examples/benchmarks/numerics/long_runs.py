@@ -89,15 +89,15 @@ def run_updates(seed: int, dimension: int, most: int, methods: Sequence[str], no
             solver.start(dimension, targets.shape[1], penalty)
             fed, spent = 0, 0.0
             while fed < most:
-                upto = max(DISTINCT, 10 * fed)
-                note(f"{upto} one-row updates, {dimension} features: {method}")
+                last_sequence = max(DISTINCT, 10 * fed)
+                note(f"{last_sequence} one-row updates, {dimension} features: {method}")
                 begin = time.process_time()
-                for _ in range((upto - fed) // DISTINCT):
+                for _ in range((last_sequence - fed) // DISTINCT):
                     for row, target in single_rows:
                         solver.update(row, target)
                 solver.settle()
                 spent += time.process_time() - begin
-                fed = upto
+                fed = last_sequence
                 if fed not in truths:
                     truths[fed] = np.asarray(exact_weights(rows, targets, penalty, fed // DISTINCT))
                 begin = time.process_time()

@@ -1,0 +1,242 @@
+"""How a memory follows its journal: it is loaded from a store, row by row, and chooses samples again from there."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import takewhile
+from typing import cast
+
+from scroll_tactile.errors import UnknownMaterialError
+from scroll_tactile.memory.descriptions import Description, describe
+from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    MEMBER,
+    MERGE,
+    OBSERVE,
+    RETRACT,
+    Added,
+    Codes,
+    active_rows,
+    only_readings,
+    retracted_by,
+    unpack_readings,
+    unspanned,
+)
+from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
+from store import CompactedError, DamageError, Head, Record, Store
+
+__all__ = ["apply_appended", "apply_description", "load", "refill", "replay", "require_base", "until"]
+
+logger = logging.getLogger(__name__)
+
+ATTEMPTS = 20  # of a reader, while a writer changes the store
+
+
+def load(empty: Memory, store: Store) -> Memory:
+    """The memory that a store holds: its newest checkpoint, then the journal's rows after it; made as the empty one."""
+    for _ in range(ATTEMPTS - 1):
+        newest = store.newest
+        try:
+            memory = _loaded(empty.empty_like(), store)
+        except CompactedError:  # a writer compacted it between two reads
+            continue
+        # A checkpoint that came between the reads may hold a tuned model from before the rows that were read.
+        if store.newest == newest:
+            return memory
+    return _loaded(empty.empty_like(), store)
+
+
+def _loaded(memory: Memory, store: Store) -> Memory:
+    memory.base = store.compacted
+    # Without a sound checkpoint the base raises what is lost; without a base the journal has every row.
+    newest = store.latest(late=[LATE_ROWS, *(f"{LATE_SECOND}{scale}" for scale in memory.plan.scales)])
+    start = store.base() if newest is None else newest
+    if start is not None:
+        memory.fill(start.arrays, start.attributes, start.last_sequence, source=0, late=start.late)
+    memory.checkpoint = None if newest is None else newest.number
+    memory.saved = memory.sequence
+    for record in store.records(after=memory.sequence):
+        replay(memory, record, store)
+    refill(memory, store)
+    logger.info("%s: checkpoint %s, and rows up to %d", store.path, memory.checkpoint, memory.sequence)
+    return memory
+
+
+def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = None) -> list[Added] | None:
+    """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.
+
+    Every row becomes a part of the memory here, whether it was just written, read again or embedded anew. codes: of an
+    observation, where they are known; None to make them. Call `refill` after the last row. Raises CapacityError before
+    anything is added.
+    """
+    changed: list[Added] | None = []
+    if record.kind == OBSERVE:
+        columns = cast(int, record.attributes["columns"])
+        codes = memory.codes(record)[1] if codes is None else codes
+        source = record.sequence if only_readings(record.arrays) else None
+        wanted = memory.kept is not None and memory.kept.wants(record.label, record.key)
+        readings = unpack_readings(record.arrays) if wanted else None
+        memory.add(record.label, record.key, columns, codes, record.sequence, source, readings)
+        changed = [(record.label, codes, 1)]
+    elif record.kind == RETRACT:
+        gone = unspanned(record.attributes["sequences"])
+        changed = [_retracted(memory, record, sequence, store) for sequence in gone if sequence > memory.base]
+        for sequence in sorted({sequence for sequence in gone if sequence <= memory.base} - memory.excluded):
+            logger.warning(  # a repair made the base: `compact` would have left it out
+                "%s: observation %d was retracted by row %d, but still counts: its features were lost to damage. Only "
+                "a copy from before the damage can leave it out",
+                store.path,
+                sequence,
+                record.sequence,
+            )
+    elif record.kind == MERGE:
+        _join(memory, record)
+        changed = None
+    else:
+        assert record.kind in (MEMBER, DESCRIBE), "the gate lets no other row through"
+    apply_description(memory.descriptions, record)
+    memory.sequence = record.sequence
+    return changed
+
+
+def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> Added:
+    """Retract an observation as a journal row says. Raises DamageError where there is none that could be."""
+    observed = store.record(sequence)
+    try:
+        if observed.kind == OBSERVE and sequence not in memory.retracted:
+            return memory.retract(observed)
+    except UnknownMaterialError as error:  # the sums are without it
+        logger.debug("%s", error)
+    raise DamageError(
+        f"row {record.sequence} of {store.path} retracts row {sequence}, which is no observation, or not in the "
+        "sums any more: it is damaged, or was made by another program (scroll-tactile memory check)",
+        path=store.path,
+        sequence=record.sequence,
+    )
+
+
+def _join(memory: Memory, record: Record) -> None:
+    """Add another memory of the same making: a row that holds the arrays and attributes of its base."""
+    other = memory.empty_like().fill(record.arrays, record.attributes, source=record.sequence)
+    memory.join(other, exemplars="exemplar-readings" in record.arrays)
+
+
+def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:
+    """Apply a journal row to descriptions; a forgotten material loses its description."""
+    if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
+        describe(descriptions, row.label, row.attributes.get("constituents"))
+
+
+def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Added] | None:
+    """Apply the rows that a writer appended, and take a tuned model that it made; what changed, see `replay`."""
+    changed = [replay(memory, record, store) for record in records]
+    refill(memory, store)
+    newest = store.latest() if store.newest != memory.checkpoint else None
+    if newest is not None and newest.last_sequence <= memory.sequence:
+        memory.checkpoint = newest.number
+        # Of all kinds: a damaged row that is passed over may be a retraction.
+        behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.last_sequence))
+        gone = min(retracted_by(behind), default=None)
+        if gone is None or gone > cast(int, newest.attributes["tuned_last_sequence"]):
+            memory.take_tuned(newest.arrays, newest.attributes)
+    return None if None in changed else [each for added in changed for each in added or ()]
+
+
+def refill(memory: Memory, store: Store) -> None:
+    """Choose sample and exemplars again without what was retracted; does nothing where they held none of it."""
+    if memory.stale:
+        # Rows that a writer appended since this memory was read are left for the next `load`.
+        chosen = _chosen(memory, store, memory.sequence)
+        memory.sample, memory.kept, memory.exemplars = chosen.sample, chosen.kept, chosen.exemplars
+        memory.stale = False
+
+
+def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
+    """The memory of the observations up to a row that are not retracted: what a base at that row holds."""
+    made, later = _chosen(memory, store, last_sequence), memory.empty_like()
+    for head in store.heads(memory.base):  # whoever compacts has read all
+        if head.sequence <= last_sequence:
+            apply_description(made.descriptions, head)
+        elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
+            replay(later, store.record(head.sequence), store)
+    made.statistics = memory.statistics - later.statistics
+    made.base, made.sequence, made.tuned = memory.base, last_sequence, None
+    made.retracted = set(memory.retracted)
+    return made
+
+
+def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
+    """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
+    fresh, heads = _base_samples(memory, store), _behind_base(memory, store, last_sequence)
+    for head in heads:
+        if head.kind == MERGE:
+            _join(fresh, store.record(head.sequence))
+    observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]
+    fresh.choose(observed, store.record, memory)
+    return fresh
+
+
+def _behind_base(memory: Memory, store: Store, last_sequence: int) -> list[Head]:
+    """The rows up to one from which samples are chosen.
+
+    A damaged row may be of any kind: without it other touches would be chosen, and be saved as if they were the right
+    ones. So DamageError is raised; only who reads, and saves nothing, gets what is left, with a warning.
+    """
+    try:
+        return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.base)))
+    except DamageError as damage:
+        if store.mode == "write":
+            raise DamageError(
+                f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair the "
+                "memory (scroll-tactile memory repair)",
+                path=damage.path,
+                sequence=damage.sequence,
+            ) from damage
+        logger.warning("%s; samples of touches are chosen without it, others than there were", damage)
+    left = (head for kind in (MERGE, OBSERVE) for head in store.heads(memory.base, kind=kind))
+    return [head for head in left if head.sequence <= last_sequence]
+
+
+def _base_samples(memory: Memory, store: Store) -> Memory:
+    """A memory with what the base holds; an empty one without a base."""
+    fresh = memory.empty_like()
+    require_base(memory, store)
+    try:
+        if (base := store.base()) is not None:
+            fresh.fill(base.arrays, base.attributes, source=0)
+    except DamageError as damage:
+        # The statistics are whole without it; a memory that did not open would lose them too.
+        logger.warning(
+            "%s; no other touch can take the place of a retracted one: repair the memory (scroll-tactile memory "
+            "repair)",
+            damage,
+        )
+        counted = _counted(memory, store)
+        fresh.sample.update(
+            (name, key, replace(touch, copies=counted[name, key]))
+            for name, key, touch in memory.sample
+            if counted[name, key]
+        )
+        if fresh.kept is not None and memory.kept is not None:
+            fresh.kept.update(item for item in memory.kept if item[:2] in counted)
+        if fresh.exemplars is not None and memory.exemplars is not None:
+            fresh.exemplars.update(item for item in memory.exemplars if item[:2] in counted)
+    return fresh
+
+
+def _counted(memory: Memory, store: Store) -> Counter[tuple[str, bytes]]:
+    """How often each stream was observed, by material and key, up to the base and without what was retracted.
+
+    The base was made without what a later row retracts of it, and a retraction may have been lost to damage since.
+    """
+    rows = active_rows(head for head in store.heads() if head.sequence <= memory.base)
+    return Counter((head.label, head.key) for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence))
+
+
+def require_base(memory: Memory, store: Store) -> None:
+    """Raise CompactedError where the store was compacted since this memory was read."""
+    if store.compacted != memory.base:
+        raise CompactedError(f"{store.path} was compacted since it was read: read it again")

@@ -38,7 +38,7 @@ def evidence(rng, keys, step=TRUE, odd=0.0):
 
 def recollection(scores, certainty=0.5, trust=0.0):
     unseen = np.full((2, 8), np.nan)
-    return Recollection(scores, certainty, CLEAN, np.zeros(2, bool), unseen, trust, -1.0, 1.0, 0.0)
+    return Recollection(scores, certainty, CLEAN, np.zeros(2, bool), unseen, trust, False, -1.0, 1.0, 0.0)
 
 
 def judged(columns, logits, scores, keys=KEYS, certainty=0.5):

@@ -1,5 +1,7 @@
 """Touches longer than those learned."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from touches import Windowed
@@ -35,7 +37,7 @@ def test_without_views_a_longer_touch_is_read_as_far_as_was_learned():
             learner.observe(name, SCENE.touch(name, at).first(2.0))
     touch = SCENE.touch(SCENE.materials[0], 9)
     whole, part = learner.predict(touch), learner.predict(touch.first(2.0))
-    assert whole == part
+    assert whole == replace(part, unusual=("longer",))
     assert whole.seconds == 2.0
     learner.observe(SCENE.materials[0], SCENE.touch(SCENE.materials[0], 5))
     assert learner.predict(touch).seconds == 4.0

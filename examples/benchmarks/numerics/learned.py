@@ -204,7 +204,11 @@ def _left_out_error(memory: Memory, readout: Readout) -> float | None:
             continue
         i = int.from_bytes(key, "big")
         kept = np.arange(len(memory.places)) != i
-        true = truth_of(memory, memory.codes, readout, kept).answers(memory.codes[i])
+        others, place = truth_of(memory, memory.codes, readout, kept), int(memory.places[i])
+        true = others.answers(memory.codes[i])
+        # Its own material is no further away than from a new touch; scores are about their mean over the materials.
+        nearer = others.far(memory.codes[i], place) / np.count_nonzero(memory.places == place) ** 2 / 2
+        true.lda[:, place] += nearer
         # The ridge of the others, with the shares of all.
         true.ridge[...] += _shares(memory.places) - _shares(memory.places[kept])
         at = [apart["lda"].rows[number, stage] for stage in range(rows)]

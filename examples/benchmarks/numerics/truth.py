@@ -162,15 +162,25 @@ class TrueReadout:
             scale = arb(self._gamma) * arb((1, -self._unit))
             return _floats([[scale * v for v in _centred(row)] for row in self._solved.tolist()])
 
-    def answers(self, rows: npt.NDArray[Any]) -> Answers:
-        """The answers for rows of shape (m, d)."""
+    def _away(self, rows: npt.NDArray[Any]) -> arb_mat:
+        """Rows (m, d) about the mean."""
         table, unit = whole(rows)
         shift = arb((1, unit - self._unit))
+        return arb_mat([[shift * int(v) - m for v, m in zip(row, self._mean, strict=True)] for row in table.tolist()])
+
+    def far(self, rows: npt.NDArray[Any], place: int) -> FloatArray:
+        """The squared Mahalanobis distance of rows (m, d) from the material at a place, (m,)."""
+        with ctx.workprec(4 * FIRST_BITS):
+            away, gamma = self._away(rows), arb(self._gamma)
+            within, z = _dots(away, certain(self._within, away.transpose())), (away * self._solved).tolist()
+            found = [gamma * (near - 2 * row[place] + self._sizes[place]) for near, row in zip(within, z, strict=True)]
+            return np.asarray(_floats([found])[0])
+
+    def answers(self, rows: npt.NDArray[Any]) -> Answers:
+        """The answers for rows of shape (m, d)."""
         total, gamma = sum(self.counts), arb(self._gamma)
         with ctx.workprec(4 * FIRST_BITS):
-            away = arb_mat(
-                [[shift * int(v) - m for v, m in zip(row, self._mean, strict=True)] for row in table.tolist()]
-            )
+            away = self._away(rows)
             down = away.transpose()
             z = (away * self._solved).tolist()
             within = _dots(away, certain(self._within, down))

@@ -224,4 +224,5 @@ def _joined(learners: Sequence[TactileLearner]) -> TactileLearner:
 
 
 def _predictions(learner: TactileLearner, probes: Sequence[Labelled]) -> list[Prediction]:
+    learner.settle()  # a memory that was closed and opened has read its model, and followed since
     return [learner.predict(stream) for _, stream in probes]

@@ -98,4 +98,4 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
     if len(shares) == 1:
         return np.asarray(shares[0])
     sums = [[math.fsum(column) for column in of.T] for of in shares.transpose(1, 0, 2)]
-    return np.minimum(1.0, 2 / len(shares) * np.array(sums))
+    return np.minimum(1.0, 2 * np.array(sums) / len(shares))

@@ -129,22 +129,6 @@ class Likelihood:
                 self._tables.popitem(last=False)
         return found
 
-    def logs(self, noise: Noise, pairs: Pairs) -> npt.NDArray[np.int16]:
-        """The logs of a table, right at some pairs 256 · y + x alone: of a touch beside others few of them occur."""
-        with self._lock:
-            found = self._tables.get(noise)
-        if found is not None:
-            return found.logs
-        if 4 * len(pairs) > LEVELS**2:
-            return self.table(noise).logs
-        y, x = pairs >> 8, pairs & 255
-        read = (y != MISSING) & (x != MISSING)
-        y, x = y[read], x[read]
-        below = np.where(y > 0, self._below(noise, x, y - 1), 0.0)
-        logs = np.zeros(256 * 256, dtype=np.int16)
-        logs[pairs[read]] = np.rint(_logs(np.maximum(self._below(noise, x, y) - below, 0.0)) * UNIT)
-        return logs
-
     def _made(self, noise: Noise) -> Table:
         chances = self._chances(noise)
         whole = np.zeros((256, 256), dtype=np.int16)

@@ -18,7 +18,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -100,15 +99,9 @@ class _Pairs:
     places: Rows
     weights: FloatArray
 
-    @cached_property
-    def _occurring(self) -> Rows:
-        occurs = np.zeros(256 * 256, dtype=np.bool_)
-        occurs[self.places] = True
-        return np.flatnonzero(occurs)
-
     def logs(self, likelihood: Likelihood, noise: Noise) -> FloatArray:
         """Log-likelihood of the touch by each of the others, (others,)."""
-        logs = likelihood.logs(noise, self._occurring)
+        logs = likelihood.table(noise).logs
         return np.asarray(logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
 
 

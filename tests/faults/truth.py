@@ -129,8 +129,8 @@ class Truth:
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
         found = [self._conformal[row].p_values(keeping.levels(once[key].readings)) for key in sorted(once)]
         if len(found) == 1:
-            return tuple(found[0][name] for name in names)
-        return tuple(min(1.0, 2 * math.fsum(of[name] for of in found) / len(found)) for name in names)
+            return tuple(found[0][name].share for name in names)
+        return tuple(min(1.0, 2 * math.fsum(of[name].share for of in found) / len(found)) for name in names)
 
 
 @dataclass

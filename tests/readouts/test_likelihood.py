@@ -71,14 +71,3 @@ def test_levels_of_readings():
     sensor = Sensor(name="s", channels=2, rate=10, low=(0, -1), high=(254, 1), unit="", duration=1)
     readings = np.array([[0, -1], [127, 0], [254, 1], [300, -np.inf], [np.nan, 0.5]])
     assert levels_of(readings, sensor).tolist() == [[0, 127, 254, 254, MISSING], [0, 127, 254, 0, 190]]
-
-
-@pytest.mark.parametrize("noise", [*NOISES, *(Noise(step) for step in (0, 1, 923)), Noise(0, True), Noise(40, True)])
-def test_logs_of_some_pairs_are_those_of_the_table_in_bytes(noise):
-    rng = np.random.default_rng(noise.step + 1)
-    spread, weights = rng.uniform(0.5, 20, LEVELS), np.ones(LEVELS)
-    edges = (np.array([0, 1, 253, 254, MISSING])[:, None] << 8 | np.array([0, 1, 253, 254, MISSING])).ravel()
-    whole = Likelihood(spread, weights).table(noise).logs
-    for count in (1, 7, 1000, 10_000):
-        pairs = np.unique(np.append(rng.integers(0, 256**2, count), edges))
-        assert Likelihood(spread, weights).logs(noise, pairs)[pairs].tobytes() == whole[pairs].tobytes()

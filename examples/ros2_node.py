@@ -26,7 +26,7 @@ class Hand(Node):  # type: ignore[misc]  # of ROS 2, which may not be here
     def act(self, answer: Answer) -> None:
         """Where an arm would move: as soon as it is safe to, not when the touch is over."""
         if answer["event"] == "decided":
-            felt = answer["material"] if answer["known"] else "something new"
+            felt = "something new" if answer["known"] is False else answer["material"]
             self.get_logger().info(f"{felt} after {answer['seconds']:.2f} s of touch")
         elif answer["event"] == "ended" and not answer["decided"]:
             self.get_logger().info(f"not sure: {', '.join(answer['candidates']) or 'like nothing known'}")

@@ -36,9 +36,9 @@ MOST_TABLES = 64  # of 128 kB
 
 LevelArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
-Pairs = npt.NDArray[np.intp]
 
 _LEVELS = np.arange(float(LEVELS))
+_DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of level y from x, [x, y]
 
 
 def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
@@ -131,8 +131,8 @@ class Likelihood:
 
     def _made(self, noise: Noise) -> Table:
         chances = self._chances(noise)
+        logs = np.log((1 - FLOOR) * chances + FLOOR / LEVELS)
         whole = np.zeros((256, 256), dtype=np.int16)
-        logs = _logs(chances)
         whole[:LEVELS, :LEVELS] = np.rint(logs.T * UNIT)
         mean = chances @ _LEVELS
         middle, typical = self.weights @ _LEVELS, self.weights @ mean
@@ -151,24 +151,15 @@ class Likelihood:
         )
 
     def _chances(self, noise: Noise) -> FloatArray:
-        """P(y | x), [x, y]."""
-        levels = np.arange(LEVELS)
-        return np.maximum(np.diff(self._below(noise, levels[:, None], levels), axis=1, prepend=0.0), 0.0)
-
-    def _below(self, noise: Noise, x: Pairs, y: Pairs) -> FloatArray:
-        """P(y or less | x); what lies beyond an end of the range is read as that end."""
+        """P(y | x), [x, y]; what lies beyond an end of the range is read as that end."""
         reach = noise.amplitude * (LEVELS - 1)
-        distance = np.asarray(y + 0.5 - x, dtype=np.float64)
         if noise.normal or not reach:
-            below = _normal(distance / np.hypot(self.spread, reach / math.sqrt(3))[x])
+            below = _normal(_DISTANCE / np.hypot(self.spread, reach / math.sqrt(3))[:, None])
         else:
-            spread = np.hypot(self.spread, BLUR * reach)[x]
-            below = (_sloped(distance + reach, spread) - _sloped(distance - reach, spread)) / (2 * reach)
-        return np.where(y == LEVELS - 1, 1.0, below)
-
-
-def _logs(chances: FloatArray) -> FloatArray:
-    return np.asarray(np.log((1 - FLOOR) * chances + FLOOR / LEVELS))
+            spread = np.hypot(self.spread, BLUR * reach)[:, None]
+            below = (_sloped(_DISTANCE + reach, spread) - _sloped(_DISTANCE - reach, spread)) / (2 * reach)
+        below[:, -1] = 1.0
+        return np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)
 
 
 def _normal(z: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Likelihood, Noise, Table
+from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
 from scroll_tactile.readouts.recollection import (
     Kept,
     Measured,
@@ -99,10 +99,9 @@ class _Pairs:
     places: Rows
     weights: FloatArray
 
-    def logs(self, likelihood: Likelihood, noise: Noise) -> FloatArray:
+    def logs(self, table: Table) -> FloatArray:
         """Log-likelihood of the touch by each of the others, (others,)."""
-        logs = likelihood.table(noise).logs
-        return np.asarray(logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
+        return np.asarray(table.logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
 
 
 @dataclass
@@ -313,18 +312,18 @@ class Recall:
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
         pairs = self._pairs(beside, asked)
-        logs = pairs.logs(self.measured.likelihood, noise)
+        logs = pairs.logs(self._table(noise))
         for stride in () if given or noise == CLEAN else (1,) if noise.normal else (8, 2, 1):
             finer = self._finer(rows, beside, logs, asked, noise, stride)
             if finer != noise:
-                noise, logs = finer, pairs.logs(self.measured.likelihood, finer)
+                noise, logs = finer, pairs.logs(self._table(finer))
         return self._told(asked, rows, beside, logs, noise, columns)
 
     def apart(self, row: int) -> tuple[float, float]:
         """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
         asked = _Asked.of(self._levels[row], self.longest, whole=False, quiet=self._quiet(row))
         beside = self._beside(self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0], asked)
-        best = beside[np.argmax(self._pairs(beside, asked).logs(self.measured.likelihood, CLEAN))]
+        best = beside[np.argmax(self._pairs(beside, asked).logs(self._table(CLEAN)))]
         return shape_of(*self._deviation(asked, best, CLEAN))
 
     def nearest(self, row: int) -> tuple[LevelArray, LevelArray] | None:
@@ -431,7 +430,7 @@ class Recall:
         pairs = self._pairs(beside, asked, values)
 
         def likelihood(noise: Noise) -> float:
-            return float(pairs.logs(self.measured.likelihood, noise).max())
+            return float(pairs.logs(self._table(noise)).max())
 
         found = [CLEAN]
         for noises in COARSE:
@@ -449,7 +448,7 @@ class Recall:
             same = self._labels[rows] == self._labels[rows[np.argmax(logs)]]
             nearest = _blends(beside[same], logs[same], WARMTHS[:2])
         pairs = self._pairs(nearest, asked)
-        return max(noise.near(stride), key=lambda near: float(pairs.logs(self.measured.likelihood, near).max()))
+        return max(noise.near(stride), key=lambda near: float(pairs.logs(self._table(near)).max()))
 
     def _told(
         self, asked: _Asked, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise, columns: int
@@ -493,7 +492,7 @@ class Recall:
             if np.count_nonzero(mine) > 1:
                 blends = _blends(beside[mine], logs[mine], WARMTHS)
                 pairs = self._pairs(blends, asked)
-                best[material] = max(best[material], float(pairs.logs(self.measured.likelihood, noise).max()))
+                best[material] = max(best[material], float(pairs.logs(self._table(noise)).max()))
         return best
 
 

@@ -90,15 +90,19 @@ class Calibration:
 
     def measures(self, false_alarms: float) -> bool:
         """Whether enough known touches were left out to say which novelty such a share of them exceeds."""
-        return int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1))) <= len(self.novelties)
+        return self._rank(false_alarms) <= len(self.novelties)
 
     def threshold(self, false_alarms: float) -> float:
         """The novelty that a share `false_alarms` of known touches exceeds, by the left-out ones."""
         if len(self.novelties) < FEWEST:
             return UNMEASURED
-        # The conformal quantile: of n + 1 exchangeable touches no more than this share lies above it.
-        rank = int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
-        return float(self.novelties[rank - 1]) if self.measures(false_alarms) else float(2 * self.novelties[-1])
+        if not self.measures(false_alarms):
+            return float(2 * self.novelties[-1])
+        return float(self.novelties[self._rank(false_alarms) - 1])
+
+    def _rank(self, false_alarms: float) -> int:
+        """Of the conformal quantile: of n + 1 exchangeable touches no more than this share lies above it."""
+        return int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
 
 
 TINY = 1e-300

@@ -131,10 +131,8 @@ class Conformal:
     def copy(self) -> Conformal:
         """Another of the same touches: what comes to it does not come to this one."""
         other = copy.copy(self)
-        other._near, other._squares = (
-            dict(self._near),
-            dict(self._squares),
-        )  # all else is replaced when it follows, and never changed
+        # All else is replaced when it follows, and never changed.
+        other._near, other._squares = dict(self._near), dict(self._squares)
         return other
 
     @property

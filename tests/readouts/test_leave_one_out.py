@@ -51,6 +51,27 @@ def groups_of(touches):
 KINDS = st.lists(st.tuples(st.integers(0, 4), st.integers(1, 3), st.integers(1, 2)), min_size=2, max_size=9)
 
 
+def require_left_out(found, place, row, own, without, every, material, weight, readout, kind):
+    """A row is scored as by the readout that never had its touch, of so many rows, the last of them `own`.
+
+    Of its own material it gains 1/n² of its distance, halved as scores are.
+    """
+    reference, share = found.names, float(Fraction(weight) / every.counts[material])
+    scores = without.lda(row, reference, readout.origin)
+    scores[reference.index(material)] += without.far(own, material) * share**2 / 2
+    if kind == "ridge":  # but for the shares, which are those of all touches
+        shares = [float(without.shares[name]) for name in reference]
+        scores = np.array(without.ridge(row, reference)) - shares + readout.shares
+    require_near(found.scores[place], scores)
+    require_near(found.distances[place], without.distances(row, reference))
+    best = reference[int(found.scores[place].argmax())]
+    away = [float(int(x) - m) for x, m in zip(row, without.means[best], strict=True)]
+    total = float(readout.counts.sum())
+    variances = [(float(every.scatter[j][j]) + readout.penalty) / total for j in range(WIDTH)]
+    far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
+    require_near(found.strangeness[place], far * (1 - share**2) if best == material else far)
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     KINDS,
@@ -76,7 +97,6 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     excess = total / sum(int(count) for count in statistics.counts(SCALE, reference))
     places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
     every = Dense(groups_of(touches), readout.penalty, readout.share)
-    variances = [(float(every.scatter[j][j]) + readout.penalty) / float(total) for j in range(WIDTH)]
     judged = set()
     for i, (material, key, rows, copies) in enumerate(touches):
         rest = [other for j, other in enumerate(touches) if i != j]
@@ -86,26 +106,9 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
         for stage, row in enumerate(rows):
             judged.add((places[material, key], stage))
             place = found.rows[places[material, key], stage]
-            scores = dense.lda(row, reference, readout.origin)
-            scores[reference.index(material)] += gain(dense, every, material, len(rows) * copies, row)
-            if kind == "ridge":  # but for the shares, which are those of all touches
-                shares = [float(dense.shares[name]) for name in reference]
-                scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
-            require_near(found.scores[place], scores)
-            require_near(found.distances[place], dense.distances(row, reference))
-            best = dense.means[reference[int(found.scores[place].argmax())]]
-            away = [float(int(x) - m) for x, m in zip(row, best, strict=True)]
-            far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
-            if reference[int(found.scores[place].argmax())] == material:
-                far *= 1 - float(Fraction(len(rows) * copies) / every.counts[material]) ** 2
-            require_near(found.strangeness[place], far)
+            require_left_out(found, place, row, row, dense, every, material, len(rows) * copies, readout, kind)
     assert found.rows.keys() == judged
     assert sorted(found.rows.values()) == list(range(len(found.scores)))
-
-
-def gain(without, every, material, weight, row):
-    """What a row gains as of its own material: 1/n² of its distance, halved as scores are."""
-    return without.far(row, material) * float(Fraction(weight) / every.counts[material]) ** 2 / 2
 
 
 @settings(max_examples=15, deadline=None)
@@ -127,7 +130,6 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
     }
     found = left_out(readout, sample, STAGES, kind, asked)
     every = Dense(groups_of(touches), readout.penalty, readout.share)
-    variances = [(float(every.scatter[j][j]) + readout.penalty) / float(total) for j in range(WIDTH)]
     judged = set()
     for i, (material, key, rows, copies) in enumerate(touches):
         rest = [other for j, other in enumerate(touches) if i != j]
@@ -137,19 +139,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
         for number, codes in asked[places[material, key]].items():
             judged.add((places[material, key], number))
             place, row = found.rows[places[material, key], number], codes.astype(np.int64)
-            scores = dense.lda(row, reference, readout.origin)
-            scores[reference.index(material)] += gain(dense, every, material, len(rows) * copies, rows[-1])
-            if kind == "ridge":
-                shares = [float(dense.shares[name]) for name in reference]
-                scores = np.array(dense.ridge(row, reference)) - shares + readout.shares
-            require_near(found.scores[place], scores)
-            require_near(found.distances[place], dense.distances(row, reference))
-            best = dense.means[reference[int(found.scores[place].argmax())]]
-            away = [float(int(x) - m) for x, m in zip(row, best, strict=True)]
-            far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
-            if reference[int(found.scores[place].argmax())] == material:
-                far *= 1 - float(Fraction(len(rows) * copies) / every.counts[material]) ** 2
-            require_near(found.strangeness[place], far)
+            require_left_out(found, place, row, rows[-1], dense, every, material, len(rows) * copies, readout, kind)
     assert found.rows.keys() == judged
 
 

@@ -364,8 +364,13 @@ class Journal:
             finally:
                 # A sync that failed leaves it open which of the two is named.
                 self._unsettled = True
-            with self._using("putting another log in place"):
-                pass
+            try:
+                with self._using("opening the log that took its place"):
+                    pass
+            except StoreError as error:  # it stands; whoever uses it next opens it, or learns why that cannot be
+                logger.warning(
+                    "%s: the log that took the place of another could not be opened yet: %s", self.folder, error
+                )
 
     def size(self) -> int:
         """Return the bytes of the log."""

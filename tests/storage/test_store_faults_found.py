@@ -1,5 +1,6 @@
 """What the judges of tests/faults found in the store, each as small as it can be."""
 
+import errno
 import os
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from forging import get_current, log_of, set_current, spoil_row
 
 import store.archive
 import store.backup
+import store.log_writer
 from store import DamageError, Store, check_store, repair_store
 from store.layout import read_current
 
@@ -71,3 +73,20 @@ def test_a_place_that_is_none_or_behind_other_rows_is_found_and_mended(path, nam
     assert check_store(path) == [] or all(problem.kind == "leftover" for problem in check_store(path))
     with Store.open(path) as again:
         assert [head.sequence for head in again.heads()] == [1, 2, 3, 4]
+
+
+def test_a_compaction_that_is_committed_stands_though_its_log_cannot_be_opened_at_once(path, monkeypatch, caplog):
+    synced = store.log_writer.sync_open
+
+    def failing(descriptor, **how):
+        if read_current(path / "CURRENT").log == 2:
+            monkeypatch.setattr(store.log_writer, "sync_open", synced)
+            raise OSError(errno.EIO, "the disk")
+        synced(descriptor, **how)
+
+    with Store.open(path) as writer:
+        monkeypatch.setattr(store.log_writer, "sync_open", failing)
+        writer.compact({}, last_sequence=2)
+        assert "could not be opened yet" in caplog.text
+        assert (writer.compacted, writer.append("kind", "label", b"3").sequence) == (2, 4)
+    assert (check_store(path), log_of(path).name) == ([], "log-00000002")

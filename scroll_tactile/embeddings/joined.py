@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Capabilities, Embedding, capabilities_of, embed_windows, is_embedding
+from scroll_tactile.embeddings.protocol import (
+    Capabilities,
+    Embedding,
+    capabilities_of,
+    embed_competing,
+    embed_windows,
+    is_embedding,
+)
 from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import InputError
 
@@ -56,6 +63,7 @@ class Joined:
             reads_frames=bool(framed),
             rest=rest,
             embeds_windows=True,
+            competes=all(part.competes for part in declared),
             composite=True,
             exact=all(part.exact for part in declared),
         )
@@ -85,9 +93,18 @@ class Joined:
     ) -> dict[int, npt.NDArray[np.floating]]:
         """Embed windows of an image: width → first columns, to width → features (windows, d)."""
         embedded = [embed_windows(part, image, windows) for part in self.parts]
-        return {
-            width: np.concatenate(
-                [np.divide(rows[width], part.bound) for rows, part in zip(embedded, self.parts, strict=True)], axis=1
-            )
-            for width in windows
-        }
+        return {width: self._beside([rows[width] for rows in embedded]) for width in windows}
+
+    def embed_competing(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
+    ) -> tuple[dict[int, npt.NDArray[np.floating]], npt.NDArray[np.floating]]:
+        """Embed windows of an image, and all of it by the competing kernels of each part: features (d,)."""
+        embedded = [embed_competing(part, image, windows, width) for part in self.parts]
+        features = {width: self._beside([rows[width] for rows, _ in embedded]) for width in windows}
+        return features, self._beside([competing for _, competing in embedded])
+
+    def _beside(self, features: Sequence[npt.NDArray[np.floating]]) -> npt.NDArray[np.floating]:
+        """The features of the parts, (…, d of a part) each, one after another."""
+        return np.concatenate(
+            [np.divide(own, part.bound) for own, part in zip(features, self.parts, strict=True)], axis=-1
+        )

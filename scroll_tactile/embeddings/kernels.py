@@ -25,6 +25,7 @@ from scroll_tactile.embeddings.banks import (
     window_statistics,
     workspace,
 )
+from scroll_tactile.embeddings.competing import GROUP, counts, groups, groups_by_dilation
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import ENOUGH
@@ -70,7 +71,7 @@ class Kernels:
 
     name = "kernels"
     bound = 1.0
-    capabilities = Capabilities(embeds_windows=True, exact=True, reads_whole_touches=True)
+    capabilities = Capabilities(embeds_windows=True, competes=True, exact=True, reads_whole_touches=True)
 
     def __init__(self, *, seed: int = DEFAULT_SEED, dimension: int = 1008) -> None:
         if not LEAST_FEATURES <= dimension <= MOST_FEATURES:
@@ -108,9 +109,10 @@ class Kernels:
     @cached_property
     def fingerprint(self) -> str:
         """A hash of the settings and of the features of three fixed images, made by the code that embeds."""
-        digest = hashlib.sha256(f"kernels 1 {self.seed} {self.dimension} {LEVELS}".encode())
+        digest = hashlib.sha256(f"kernels 2 {self.seed} {self.dimension} {LEVELS}".encode())
         for channels, readings in ((1, 9), (3, 30), (5, 300)):
-            digest.update(self.embed(canary(channels, readings)).astype("<f4").tobytes())
+            embedded, competing = self.embed_competing(canary(channels, readings), {readings: [0]}, readings)
+            digest.update(embedded[readings].astype("<f4").tobytes() + competing.astype("<f4").tobytes())
         return digest.hexdigest()
 
     def embed(self, image: npt.NDArray[np.float32], width: int | None = None) -> npt.NDArray[np.float32]:
@@ -137,38 +139,67 @@ class Kernels:
         columns = image.shape[1]
         if columns > MOST_COLUMNS and any(width < columns for width in windows):
             return {width: self._one_by_one(image, width, starts) for width, starts in windows.items()}
-        levels = to_levels(image)
+        return self._embedded(to_levels(image), windows)[0]
+
+    def embed_competing(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
+    ) -> tuple[dict[int, npt.NDArray[np.float32]], npt.NDArray[np.float32]]:
+        """Embed windows of an image and, by the same responses, all of it by competing kernels; see `competing`.
+
+        image: shape (C, T), T at most 2048. width: that it stands for, at least T. Returns what `embed_windows` does,
+        and features of shape (d,): proportions p of the steps of time, as (2/π)·asin √p; zeros behind the last group.
+        """
+        _require_image(image)
+        levels, wide = to_levels(image), max(width, SHORTEST)
+        if _suffices(image.shape[1], width):
+            features, competing = self._embedded(levels, windows, wide)
+        else:
+            features, (_, competing) = self.embed_windows(image, windows), self._read(_mirrored(levels, wide), {}, wide)
+        return features, competing
+
+    def _embedded(
+        self, levels: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], competing: int | None = None
+    ) -> tuple[dict[int, npt.NDArray[np.float32]], npt.NDArray[np.float32]]:
+        columns = levels.shape[1]
         whole = {w: tuple(starts) for w, starts in windows.items() if _suffices(min(w, columns), w)}
-        features = self._read(levels, whole) if whole else {}
+        features, proportions = self._read(levels, whole, competing)
         for width, starts in windows.items():
             if width not in whole:
                 wide = max(width, SHORTEST)
                 cuts = (_mirrored(levels[:, start : start + width], wide) for start in starts)
-                features[width] = np.stack([self._read(cut, {wide: (0,)})[wide][0] for cut in cuts])
-        return features
+                features[width] = np.stack([self._read(cut, {wide: (0,)})[0][wide][0] for cut in cuts])
+        return features, proportions
 
     def _one_by_one(self, image: npt.NDArray[np.float32], width: int, starts: Sequence[int]) -> npt.NDArray[np.float32]:
         parts = (np.ascontiguousarray(image[:, start : start + width]) for start in starts)
         return np.stack([self.embed(part, width) for part in parts])
 
     def _read(
-        self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]]
-    ) -> dict[int, npt.NDArray[np.float32]]:
+        self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]], competing: int | None = None
+    ) -> tuple[dict[int, npt.NDArray[np.float32]], npt.NDArray[np.float32]]:
+        """Features of windows, and those of competing kernels for an image of a width; zeros where none is given."""
         channels, readings = levels.shape
+        contests = _contests(self.dimension, competing)
+        proportions = [np.zeros(self.dimension % (2 * GROUP) if competing else self.dimension, np.float32)]
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
         plans = {width: _plan(channels, self._proportions(width), width) for width in windows}
         uses = {
             dilation: {w: part.count for w, plan in plans.items() for part in plan if part.dilation == dilation}
-            for dilation in _dilations(max(windows))
+            for dilation in _dilations(max([*windows, competing or 0]))
         }
-        counts = tuple((dilation, max(of.values())) for dilation, of in uses.items())
+        needed = [max([*of.values(), GROUP * contests.get(dilation, 0)]) for dilation, of in uses.items()]
         with one_thread():
-            every = tuple(self._bank(channels, dilation) for dilation, _ in counts)
-            banks = _banks(every, tuple(count for _, count in counts))
+            every = tuple(self._bank(channels, dilation) for dilation in uses)
+            banks = _banks(every, tuple(needed))
             np.matmul(banks.channels, levels, out=workspace.array("sums", len(banks.channels), readings))
-            for own, (dilation, count), of, rows in zip(every, counts, uses.values(), banks.rows, strict=True):
+            for own, (dilation, of), rows in zip(every, uses.items(), banks.rows, strict=True):
+                responses = workspace.respond(rows, readings, dilation)
+                if count := contests.get(dilation, 0):
+                    proportions.append(angles(responses.shape[1])[counts(responses, groups(own, count)).ravel()])
+                if not of:
+                    continue
                 where = tuple((min(width, readings), windows[width]) for width in of)
-                found = _counts(own, rows, readings, count, where)
+                found = _counts(own, responses, max(of.values()), where)
                 first = 0
                 for width, features in of.items():
                     last = first + len(windows[width])
@@ -181,7 +212,8 @@ class Kernels:
                 cut = np.stack([levels[:, start : start + width] for start in starts])
                 triangle = triangle_features(self.seed, channels, self.dimension - self._proportions(width))
                 pooled[width].append(triangle(window_statistics(cut)))
-        return {width: np.concatenate(parts, axis=1) for width, parts in pooled.items()}
+        joined = {width: np.concatenate(parts, axis=1) for width, parts in pooled.items()}
+        return joined, np.concatenate([*proportions[1:], proportions[0]])
 
     def _proportions(self, width: int) -> int:
         """How many of the features are proportions in a window of this width; the rest are of levels."""
@@ -206,6 +238,12 @@ def _dilations(width: int) -> list[int]:
     while (TAPS - 1) * 2 * dilations[-1] <= REACH * width:
         dilations.append(2 * dilations[-1])
     return dilations
+
+
+def _contests(features: int, width: int | None) -> dict[int, int]:
+    """Dilation → the number of its groups of competing kernels in an image of a width."""
+    dilations = _dilations(width) if width else []
+    return dict(zip(dilations, groups_by_dilation(features, len(dilations)), strict=True)) if dilations else {}
 
 
 @lru_cache(maxsize=64)
@@ -239,30 +277,28 @@ def _banks(banks: tuple[Bank, ...], counts: tuple[int, ...]) -> Banks:
 
 def _counts(
     kernels: Bank,
-    rows: slice,
-    readings: int,
+    responses: npt.NDArray[np.float32],
     count: int,
     where: tuple[tuple[int, tuple[int, ...]], ...],
 ) -> npt.NDArray[np.int64]:
     """How often each feature's threshold is exceeded in each window: integers of shape (windows, count).
 
-    rows: of the sums that the workspace has, those of the bank's kernels.
+    responses: of the bank's rows, shape (rows, places); only the places in `where` count.
     """
-    responses = workspace.respond(rows, readings, kernels.dilation)
     exceeded = workspace.array("second", count, responses.shape[1])  # the responses are made
     for first in range(0, count, len(kernels)):
         size = min(len(kernels), count - first)
         thresholds = kernels.thresholds[first // len(kernels), :size, None]
         np.copyto(exceeded[first : first + size], responses[kernels.rows[:size]] > thresholds)
-    counted = exceeded @ _pooling(readings, kernels.dilation, where)
+    counted = exceeded @ _pooling(responses.shape[1], kernels.dilation, where)
     return counted.T.astype(np.int64)
 
 
 @lru_cache(maxsize=16)  # of at most 1 MB each
-def _pooling(readings: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> npt.NDArray[np.float32]:
+def _pooling(places: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> npt.NDArray[np.float32]:
     """0/1 matrix of shape (positions, windows): which of the convolution's positions lie within a window."""
     span = (TAPS - 1) * dilation
-    place = np.arange(readings - span)
+    place = np.arange(places)
     columns = [(place >= start) & (place < start + width - span) for width, starts in where for start in starts]
     return np.stack(columns, axis=1).astype(np.float32)
 

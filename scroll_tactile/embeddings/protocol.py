@@ -17,11 +17,13 @@ from scroll_tactile.signals.windows import WindowPlan, scales, whole_columns
 __all__ = [
     "TOGETHER",
     "Capabilities",
+    "CompetingEmbedding",
     "CompositeEmbedding",
     "Embedding",
     "WindowEmbedding",
     "canary",
     "capabilities_of",
+    "embed_competing",
     "embed_windows",
     "is_embedding",
     "parts_of",
@@ -46,6 +48,8 @@ class Capabilities:
         `readouts.shrinkage`. More than once for features that are far from normally distributed.
     reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
     embeds_windows: it has `embed_windows(image, windows)`, see `WindowEmbedding`.
+    competes: it reads whole touches by competing kernels, too, a third view of them: it has `embed_competing(image,
+        windows, width)`, see `CompetingEmbedding`.
     composite: it has `parts`, see `CompositeEmbedding`.
     tunable: it has `network()`, a copy of its network to be fine-tuned, see `Vision.network`.
     exact: its features are the same bits on every machine, so that a memory need not keep them beside the readings.
@@ -58,6 +62,7 @@ class Capabilities:
     reads_frames: bool = False
     rest: Rest = field(default=None, compare=False)  # two arrays compare element by element
     embeds_windows: bool = False
+    competes: bool = False
     composite: bool = False
     tunable: bool = False
     exact: bool = False
@@ -109,6 +114,16 @@ class WindowEmbedding(Embedding, Protocol):
         ...
 
 
+class CompetingEmbedding(WindowEmbedding, Protocol):
+    """An embedding that counts which kernels respond most to a whole touch: `Capabilities.competes`."""
+
+    def embed_competing(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
+    ) -> tuple[Mapping[int, FloatArray], FloatArray]:
+        """What `embed_windows` gives; and features (d,) of all of the image, which stands for one of `width` steps."""
+        ...
+
+
 class CompositeEmbedding(Embedding, Protocol):
     """An embedding that is others side by side, each one's features divided by its bound: `Capabilities.composite`."""
 
@@ -147,13 +162,15 @@ def parts_of(embedding: Embedding) -> tuple[Embedding, ...]:
 def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
     """How an embedding reads the touches of a sensor: which windows, and which scales judge, as it declares."""
     declared = capabilities_of(embedding)
+    whole = whole_columns(sensor) if declared.reads_whole_touches else 0
     return WindowPlan(
         scales(sensor),
         declared.partial_windows,
         declared.judged_scales,
         declared.shrinkage,
         sensor.camera,
-        whole_columns(sensor) if declared.reads_whole_touches else 0,
+        whole,
+        declared.competes and whole > 0,
     )
 
 
@@ -188,6 +205,17 @@ def embed_windows(
         width: np.stack([embedding.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts])
         for width, starts in windows.items()
     }
+
+
+def embed_competing(
+    embedding: Embedding, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
+) -> tuple[dict[int, FloatArray], FloatArray]:
+    """Embed windows of a tactile image, as `embed_windows`, and all of it by competing kernels: features (d,).
+
+    embedding: one whose capabilities say that it `competes`. width: of the touch that the image stands for.
+    """
+    features, competing = cast(CompetingEmbedding, embedding).embed_competing(image, windows, width)
+    return dict(features), competing
 
 
 def canary(channels: int, columns: int) -> npt.NDArray[np.float32]:

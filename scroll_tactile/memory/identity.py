@@ -13,12 +13,20 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from scroll_tactile.embeddings.kernels import Kernels
-from scroll_tactile.embeddings.protocol import Capabilities, Embedding, embed_windows, require_rest, window_plan
+from scroll_tactile.embeddings.protocol import (
+    Capabilities,
+    Embedding,
+    embed_competing,
+    embed_windows,
+    require_rest,
+    window_plan,
+)
 from scroll_tactile.embeddings.registry import MOST_DEPTH, configuration_of, from_configuration
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
 from scroll_tactile.memory.kept import usual_kept
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.signals.windows import COMPETING, ScaleKind
 from scroll_tactile.statistics.grid import BITS
 from store import DamageError
 
@@ -108,7 +116,7 @@ class Grid(_Kept):
 class Identity(_Kept):
     """Everything that a memory is made with and that never changes.
 
-    reading: whether wide windows may be partial, and which scales judge. views: whether whole touches are read beside
+    reading: whether wide windows may be partial, and which scales judge. views: of whole touches, that are read beside
     windows. exemplars: streams in the buffer. recall: touches kept for recall.
     """
 
@@ -116,7 +124,7 @@ class Identity(_Kept):
     embedding: EmbeddingIdentity
     grid: Grid
     reading: tuple[bool, Literal["all", "widest"]]
-    views: bool
+    views: tuple[ScaleKind, ...]
     augmentation: Augmented | None
     exemplars: _Streams
     recall: _Streams
@@ -149,7 +157,7 @@ class Identity(_Kept):
                 embedding=made,
                 grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
                 reading=(plan.partial, plan.judged),
-                views=bool(plan.whole),
+                views=tuple(view.kind for view in plan.views),
                 augmentation=augmentation,
                 exemplars=usual_exemplars(sensor) if exemplars is None else exemplars,
                 recall=usual_recall(sensor, embedding) if recall is None else recall,
@@ -244,11 +252,12 @@ class Identity(_Kept):
     def require_plan(self, path: Path, embedding: Embedding) -> None:
         """Raise MismatchError for an embedding that reads other windows, or a memory of another grid."""
         plan = window_plan(self.sensor, embedding)
-        made, reads = [*self.reading, self.views], [plan.partial, plan.judged, bool(plan.whole)]
+        views = tuple(view.kind for view in plan.views)
+        made, reads = (*self.reading, self.views), (plan.partial, plan.judged, views)
         if made != reads:
             raise EmbeddingMismatchError(
-                f"{path} was made with an embedding whose partial_windows, judged_scales and reads_whole_touches are "
-                f"{made}; it was opened with one whose are {reads}. Open it with those"
+                f"{path} was made with an embedding whose partial_windows, judged_scales and views of whole touches "
+                f"are {made}; it was opened with one whose are {reads}. Open it with those"
             )
         grid = Grid(bits=BITS, scales=plan.widths, frames=plan.frames)
         if self.grid != grid:
@@ -270,8 +279,9 @@ class AbsentEmbedding:
         self.capabilities = Capabilities(
             partial_windows=partial,
             judged_scales=judged,
-            reads_whole_touches=identity.views,
+            reads_whole_touches=bool(identity.views),
             embeds_windows=True,
+            competes=COMPETING.kind in identity.views,
             exact=made.bare,
         )
 
@@ -290,6 +300,12 @@ class AbsentEmbedding:
     ) -> Mapping[int, npt.NDArray[np.floating]]:
         """As `embed`."""
         return embed_windows(self._made, image, windows)
+
+    def embed_competing(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
+    ) -> tuple[Mapping[int, npt.NDArray[np.floating]], npt.NDArray[np.floating]]:
+        """As the embedding does. Raises EmbeddingMismatchError where only its user can make it."""
+        return embed_competing(self._made, image, windows, width)
 
 
 def _is_exact(configuration: Mapping[str, Any]) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_windows, require_rest
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_competing, embed_windows, require_rest
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
@@ -18,7 +18,7 @@ from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.views import shape_image, stretched
-from scroll_tactile.signals.windows import SHAPE, WHOLE, Extent, Scale, WindowPlan
+from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
 
@@ -199,27 +199,37 @@ class FeatureExtractor:
         if places is not None:
             windows = {scale: [starts[place] for place in places[scale]] for scale, starts in windows.items()}
         views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
-        width = self._plan.whole
-        if cache is not None:
-            cache.turn(image)
-            embedded, found = (
-                self._completed(image, {int(scale): starts for scale, starts in windows.items()}, cache),
-                {},
-            )
-        elif WHOLE in views and views[WHOLE] is image and width not in self._plan.widths:
+        by_width = {int(scale): starts for scale, starts in windows.items()}
+        if views and views[WHOLE] is image and cache is None and self._plan.whole not in by_width:
             # A touch of the usual length is convolved once for its windows and for itself.
-            embedded = self._embedded(image, {**{int(scale): starts for scale, starts in windows.items()}, width: [0]})
-            found = {WHOLE: embedded.pop(width)}
+            embedded, found = self._whole(image, by_width)
         else:
-            embedded = self._embedded(image, {int(scale): starts for scale, starts in windows.items()})
-            found = {}
-        for view, picture in views.items():
-            if view not in found:
-                found[view] = self._embedded(picture, {width: [0]})[width]
+            embedded = self._embedded(image, by_width) if cache is None else self._completed(image, by_width, cache)
+            found = self._whole(views[WHOLE], {})[1] if views else {}
+        if views:
+            found[SHAPE] = self._embedded(views[SHAPE], {self._plan.whole: [0]})[self._plan.whole]
         return {Scale("window", width): rows for width, rows in embedded.items()} | dict(sorted(found.items()))
+
+    def _whole(
+        self, image: Image, windows: Extent
+    ) -> tuple[dict[int, npt.NDArray[np.floating]], dict[Scale, npt.NDArray[np.floating]]]:
+        """The features of windows of a whole touch, and its own by view, (1, d): as it is, and by competing kernels."""
+        width, every = self._plan.whole, {**windows, self._plan.whole: [0]}
+        if not self._plan.competes:
+            embedded = self._embedded(image, every)
+            return embedded, {WHOLE: embedded.pop(width)}
+        features, competing = embed_competing(self._embedding, image, every, width)
+        embedded = self._sound(features, every)
+        if competing.shape != (self._embedding.dimension,):
+            raise EmbeddingError(
+                f"expected competing features of shape ({self._embedding.dimension},) from {self._embedding.name!r}; "
+                f"came {competing.shape}"
+            )
+        return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
         """The features of windows, of which only those are embedded that have no row; of the columns that they need."""
+        cache.turn(image)
         absent = cache.missing(windows)
         if not absent:
             return cache.joined(windows, absent, {})
@@ -234,7 +244,12 @@ class FeatureExtractor:
         return {WHOLE: usual, SHAPE: shape_image(usual)}
 
     def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
-        embedded = embed_windows(self._embedding, image, windows)
+        return self._sound(embed_windows(self._embedding, image, windows), windows)
+
+    def _sound(
+        self, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
+    ) -> dict[int, npt.NDArray[np.floating]]:
+        """What an embedding gave for windows. Raises EmbeddingError for features of another shape."""
         for width, features in embedded.items():
             expected = (len(windows[width]), self._embedding.dimension)
             if features.shape != expected:

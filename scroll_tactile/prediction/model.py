@@ -363,8 +363,9 @@ class Model:
     def _distances(
         self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> FloatArray:
-        """The relative Mahalanobis distance at each scale, (S,)."""
-        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in scales])
+        """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
+        measuring = [scale for scale in scales if scale.measures_novelty]
+        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in measuring])
 
 
 def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:

@@ -294,11 +294,11 @@ class _Reader:
         count = whole("moments", self._about.get("moments"), 1, len(rows) - 1)
         for part in (rows[:count, 0], rows[count:, 0]):
             expect(bool((np.diff(part) >= 0).all()), "moments", "columns in order", part)
-        of_rows = [len(stages[int(stage)]) for stage in rows[:count, 1]]
-        of_rows[-1] = len(stages[-1]) + len(views)
+        of_rows = [list(stages[int(stage)]) for stage in rows[:count, 1]]
+        of_rows[-1] = [*stages[-1], *views]
         expect(rows[count - 1, 1] == len(stages) - 1, "moments", "the last stage, of a complete touch", rows[:, 1])
-        of_rows += [of_rows[-1] if recall is None else len(views)] * (len(rows) - count)
-        found = list(self._calibrations([*map(len, stages), *of_rows]))
+        of_rows += [of_rows[-1] if recall is None else list(views)] * (len(rows) - count)
+        found = list(self._calibrations([*stages, *of_rows]))
         moments = [
             Moment(int(columns), int(stage), calibration, *rest)
             for (columns, stage, *rest), calibration in zip(rows.tolist(), found[len(stages) :], strict=True)
@@ -307,20 +307,23 @@ class _Reader:
         fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), recall, trajectories)
         return found[: len(stages)], fusion
 
-    def _calibrations(self, scales: Sequence[int]) -> Iterator[Calibration]:
-        """Calibrations of so many scales each."""
-        total = sum(scales)
+    def _calibrations(self, scales: Sequence[Sequence[Scale]]) -> Iterator[Calibration]:
+        """A calibration of each of some lists of scales."""
+        sizes = [(len(of), sum(scale.measures_novelty for scale in of)) for of in scales]
+        edges = np.cumsum([(0, 0), *sizes], axis=0).tolist()
+        total, measuring = edges[-1]
         lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))
         counts("novelty-counts", lengths, 0, MOST_ROWS)
         weights, usual = self.floats("weights", (total,), 0.0, 1e300), self.floats("usual", (total,), 0.0)
-        shapes = self.floats("scale_novelty", (total, 2))
+        shapes = self.floats("scale_novelty", (measuring, 2))
         expect(bool((shapes[:, 1] > 0).all()), "scale_novelty", "spreads above 0", "others")
         novelties = self.floats("novelties", (int(lengths.sum()),))
-        edges, ends = np.cumsum([0, *scales]).tolist(), np.cumsum([0, *lengths.tolist()]).tolist()
+        ends = np.cumsum([0, *lengths.tolist()]).tolist()
         for i in range(len(scales)):
-            own, known = slice(edges[i], edges[i + 1]), novelties[ends[i] : ends[i + 1]]
+            own, measured = (slice(edges[i][j], edges[i + 1][j]) for j in (0, 1))
+            known = novelties[ends[i] : ends[i + 1]]
             expect(bool((np.diff(known) >= 0).all()), "novelties", "ascending", "others")
-            yield Calibration(weights[own], shapes[own], known, usual[own])
+            yield Calibration(weights[own], shapes[measured], known, usual[own])
 
     def _trajectories(self, moments: int) -> Trajectories:
         chances = array(self._arrays, "chances", ("float64",), (None, moments, None))

@@ -63,7 +63,7 @@ class Calibration:
     """How the scores and distances of one stage are to be read.
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
-    scale_novelty: mean and spread of each scale's novelty for known materials, shape (S, 2).
+    scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
     novelties: sorted standardised novelty of known, left-out touches, shape (touches,).
     usual: the median strangeness of known touches at each scale, shape (S,); infinite where none is doubted.
     """
@@ -83,7 +83,7 @@ class Calibration:
             return np.asarray(strangeness / np.maximum(self.usual, TINY))
 
     def novelty(self, distances: FloatArray) -> FloatArray:
-        """Standardised novelty, shape (…,), of distances by scale, shape (…, S)."""
+        """Standardised novelty, shape (…,), of distances at the scales that measure it, shape (…, S')."""
         mean, spread = self.scale_novelty.T
         standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
         return standard
@@ -123,14 +123,16 @@ def calibrate_stage(
     viewed: whether each is doubted where a touch looks strange in it.
     """
     apart = [left for _, left in scales]
+    measuring = [(readout, left) for readout, left in scales if readout.scale.measures_novelty]
     names = common_names(apart)
     touches = judged_touches(stage, apart) if len(names) > 1 else []
     usual = np.full(len(apart), np.inf)
     if not touches:
         unheld = np.full(len(apart), _unheld(names, scales, kind))
-        return Calibration(unheld, _assumed([readout for readout, _ in scales]), np.zeros(0), usual)
+        return Calibration(unheld, _assumed(measuring), np.zeros(0), usual)
     scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
-    distances = np.stack([_picked(left, left.distances, names, touches, stage).min(axis=1) for left in apart], axis=1)
+    measured = [_picked(left, left.distances, names, touches, stage).min(axis=1) for _, left in measuring]
+    distances = np.stack(measured, axis=1)
     own = {name: i for i, name in enumerate(names)}
     if viewed:
         strange = np.stack([left.strangeness[[left.rows[touch, stage] for touch in touches]] for left in apart], axis=1)
@@ -138,7 +140,7 @@ def calibrate_stage(
         scores *= np.minimum(1.0, usual / np.maximum(strange, TINY))[:, :, None]
     weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(apart))
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed([readout for readout, _ in scales]), np.zeros(0), usual)
+        return Calibration(weights, _assumed(measuring), np.zeros(0), usual)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
     unsorted = Calibration(weights, shape, np.zeros(0), usual).novelty(distances)
@@ -244,10 +246,10 @@ def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kin
     return min(share, AHEAD / max(float(np.median(ahead.min(axis=1))), TINY))
 
 
-def _assumed(readouts: Sequence[Readout]) -> FloatArray:
+def _assumed(scales: Sequence[tuple[Readout, LeftOut]]) -> FloatArray:
     """Without touches left out: the distances of the class means themselves, spread by their own mean size."""
     shapes = []
-    for readout in readouts:
+    for readout, _ in scales:
         derived = readout.derived()
         sizes = np.diagonal(derived.gram)
         typical = np.einsum("ri,ij,rj->r", derived.gram, derived.background, derived.gram) - sizes

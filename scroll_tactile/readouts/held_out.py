@@ -56,10 +56,11 @@ def held_out(
     strange = np.stack([left.strangeness[at] for left, at in zip(said, rows, strict=True)], axis=1)
     weights = calibration.believed(strange)
     logits = np.zeros((len(places), len(names)))
-    distances = np.zeros((len(places), len(said)))
-    for i, (left, at, columns) in enumerate(zip(said, rows, materials, strict=True)):
+    distances = []
+    for i, (scale, left, at, columns) in enumerate(zip(scales, said, rows, materials, strict=True)):
         logits += weights[:, i, None] * left.scores[np.ix_(at, columns)]
-        distances[:, i] = left.distances[np.ix_(at, columns)].min(axis=1) if at else 0.0
+        if places and scale.measures_novelty:
+            distances.append(left.distances[np.ix_(at, columns)].min(axis=1))
     logits -= logits.max(axis=1, keepdims=True) if len(names) else 0.0
     logits -= np.log(np.exp(logits).sum(axis=1, keepdims=True))
     return HeldOut(
@@ -69,5 +70,5 @@ def held_out(
         np.array([own[touches[place][0]] for place in places], dtype=np.intp),
         logits,
         calibration.relative(strange).min(axis=1) if places else np.zeros(0),
-        np.asarray(calibration.novelty(distances)) if places else np.zeros(0),
+        np.asarray(calibration.novelty(np.stack(distances, axis=1))) if places else np.zeros(0),
     )

@@ -20,11 +20,13 @@ from scroll_tactile.readouts.calibration import (
 )
 from scroll_tactile.readouts.leave_one_out import left_out
 from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
-DIMENSION, SCALES, STAGES = 8, (10, 40), [[10], [10, 40]]
-REACHED = [{10: [[0]]}, {10: [[1]], 40: [[0]]}]
+DIMENSION, SCALES = 8, (Scale("window", 10), Scale("window", 40))
+STAGES = [[SCALES[0]], [*SCALES]]
+REACHED = [{SCALES[0]: [[0]]}, {SCALES[0]: [[1]], SCALES[1]: [[0]]}]
 
 
 def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000):
@@ -149,10 +151,10 @@ def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, sh
 
 def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are_large():
     statistics, sample = scene(materials=2, touches=4)
-    (stage,) = stages_of(statistics, sample, stages=[[10]])
+    (stage,) = stages_of(statistics, sample, stages=STAGES[:1])
     assert len(stage.novelties) == 0
-    readout = Readout(Task.of(statistics, 10, ["0", "1"]), statistics)
-    means = statistics.sums(10, ["0", "1"]) / statistics.counts(10, ["0", "1"])[:, None]
+    readout = Readout(Task.of(statistics, SCALES[0], ["0", "1"]), statistics)
+    means = statistics.sums(SCALES[0], ["0", "1"]) / statistics.counts(SCALES[0], ["0", "1"])[:, None]
     typical = np.mean([readout.novelty(mean, [0, 1]) for mean in means])
     size = np.diagonal(readout.derived().gram).mean()
     assert stage.novelty(np.array([typical])) == pytest.approx(0, abs=1e-6)
@@ -188,9 +190,9 @@ def test_a_touch_counts_only_where_every_scale_left_it_out():
     statistics, sample = Statistics(DIMENSION, SCALES), TouchSample()
     for material, touches, wide in (("a", 8, 4), ("b", 6, 1), ("c", 5, 0), ("d", 8, 6)):
         for i in range(touches):
-            codes = {10: rng.integers(-1000, 1000, (1 + (i < wide), DIMENSION), dtype=np.int32)}
+            codes = {SCALES[0]: rng.integers(-1000, 1000, (1 + (i < wide), DIMENSION), dtype=np.int32)}
             if i < wide:
-                codes[40] = rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)
+                codes[SCALES[1]] = rng.integers(-1000, 1000, (1, DIMENSION), dtype=np.int32)
             statistics.add(material, codes)
             sample.add(material, rng.bytes(32), SampledTouch.of(REACHED[: len(codes)], codes))
     narrow, wide = stages_of(statistics, sample)

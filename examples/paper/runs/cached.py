@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Capabilities, Embedding, capabilities_of, embed_windows, parts_of
+from scroll_tactile.embeddings.protocol import (
+    Capabilities,
+    Embedding,
+    capabilities_of,
+    embed_competing,
+    embed_windows,
+    parts_of,
+)
 
 __all__ = ["Cached"]
 
@@ -89,12 +96,27 @@ class Cached:
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
     ) -> dict[int, FloatArray]:
         """Width → features of shape (windows, d), as `embed_windows` gives for the wrapped one, to the bit."""
-        digest = blake2b(f"{image.shape} {image.dtype}".encode(), digest_size=32)
-        digest.update(np.ascontiguousarray(image).data.cast("B"))
-        keys = {width: (digest.digest(), width, tuple(starts)) for width, starts in windows.items()}
+        digest = _digest(image)
+        keys = {width: (digest, width, tuple(starts)) for width, starts in windows.items()}
         missing = {width: starts for width, starts in windows.items() if keys[width] not in self._kept}
         if missing:
             for width, features in embed_windows(self._embedding, image, missing).items():
                 features.setflags(write=False)  # all callers get the same array
                 self._kept[keys[width]] = features
         return {width: self._kept[key] for width, key in keys.items()}
+
+    def embed_competing(
+        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
+    ) -> tuple[dict[int, FloatArray], FloatArray]:
+        """What `embed_windows` gives, and features (d,) by competing kernels, as the wrapped one gives them."""
+        key = (_digest(image), -width, ())
+        if key not in self._kept:
+            _, self._kept[key] = embed_competing(self._embedding, image, {}, width)
+            self._kept[key].setflags(write=False)
+        return self.embed_windows(image, windows), self._kept[key]
+
+
+def _digest(image: npt.NDArray[np.float32]) -> bytes:
+    digest = blake2b(f"{image.shape} {image.dtype}".encode(), digest_size=32)
+    digest.update(np.ascontiguousarray(image).data.cast("B"))
+    return digest.digest()

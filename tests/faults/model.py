@@ -253,8 +253,8 @@ def _backup(state: State, _: Any) -> tuple[State, Any]:
 
 
 def _pack(state: State, _: Any, name: str, rows: bool) -> tuple[State, Any]:
-    """Rows stay behind where any are missing; a file of no touches has none."""
-    whole = rows and bool(state.observed) and not (state.base or state.brought)
+    """Rows stay behind where any are missing."""
+    whole = rows and not (state.base or state.brought)
     pairs = tuple(one.pair for one in state.observed)
     other = Other(pairs, 0 if whole else len(pairs), not whole, state.said, state.embedding)
     return replace(state, packed=(*state.packed, (name, other))), None

@@ -1,8 +1,8 @@
 """What follows from a checkpoint, in files of the folder `derived`, and counts where it is of that checkpoint.
 
 A file is a mark and version, the checkpoint's sha256, the bytes of a JSON object, this object, arrays as a row has
-them, not compressed, and a digest of all before. The digest has no key: a file from elsewhere can hold anything, and
-whoever reads it has to check what he needs.
+them, compressed where that halves them, and a digest of all before. The digest has no key: a file from elsewhere can
+hold anything, and whoever reads it has to check what he needs.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def write_derived(folder: Path, name: str, follows: str, attributes: str, arrays
     """
     about = attributes.encode("ascii")
     head = HEADER.pack(MARK, bytes.fromhex(follows), len(about))
-    data = b"".join((head, about, encode_payload(arrays, plain=True)))
+    data = b"".join((head, about, encode_payload(arrays, sparingly=True)))
     path = folder / DERIVED / name
     path.parent.mkdir(exist_ok=True)
     draft = path.with_name(path.name + NEW)

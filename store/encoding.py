@@ -150,8 +150,10 @@ def array_digest(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def encode_payload(arrays: Mapping[str, np.ndarray], *, plain: bool = False) -> bytes:
-    """Return checked arrays as the bytes of a journal row's payload; plain: not compressed, to be read at once.
+def encode_payload(arrays: Mapping[str, np.ndarray], *, sparingly: bool = False) -> bytes:
+    """Return checked arrays as the bytes of a journal row's payload.
+
+    sparingly: only what compressing halves is compressed, and the rest is read at once.
 
     Raises RecordError when they hold more than 256 MiB together.
     """
@@ -162,7 +164,7 @@ def encode_payload(arrays: Mapping[str, np.ndarray], *, plain: bool = False) -> 
         )
     if len(arrays) > 0xFFFF:
         raise RecordError(f"one record has {len(arrays)} arrays, more than 65535")
-    payload = _packed(arrays, _plain if plain else _compressed)
+    payload = _packed(arrays, _halved if sparingly else _compressed)
     return payload if size <= SPARE + RATIO * len(payload) else _packed(arrays, _plain)
 
 
@@ -186,6 +188,11 @@ def _compressed(array: np.ndarray) -> tuple[int, bytes]:
     if raw.size >= SMALL and len(frame := compress(raw, item_size(array.dtype))) < raw.size:
         return ZSTD, frame
     return _plain(array)
+
+
+def _halved(array: np.ndarray) -> tuple[int, bytes]:
+    codec, buffer = _compressed(array)
+    return (codec, buffer) if 2 * len(buffer) <= array.nbytes else _plain(array)
 
 
 def _plain(array: np.ndarray) -> tuple[int, bytes]:

@@ -26,7 +26,9 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
-from scroll_tactile.statistics.moments import MOST_ROWS, one_thread, within_scatter
+from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
+from scroll_tactile.statistics.tables import rows_of
+from store.late import LateArray
 
 __all__ = ["CheckpointChecks"]
 
@@ -105,15 +107,50 @@ class CheckpointChecks:
         field = f"sums-{scale}"
         sums = array(arrays, field, ("int64",), (count, self._dimension))
         codes(field, sums, rows[:, None])
-        field = f"second-{scale}"
         if total:
-            packed = array(arrays, field, ("int64",), (self._dimension * (self._dimension + 1) // 2,))
             known = rows > 0
-            between = (sums[known].astype(np.float64) ** 2 / rows[known, None]).sum(axis=0)
-            check_values(packed, partial(self._check_moment, field, total, between))
-            if thorough and known.any():
-                self._check_scatter(field, packed, rows[known], sums[known])
+            self._check_second(arrays, scale, rows[known], sums[known], thorough)
         return rows
+
+    def _check_second(self, arrays: Arrays, scale: Scale, rows: IntArray, sums: IntArray, thorough: bool) -> None:
+        """The triangle of a scale, or the rows that it is of; all materials have rows."""
+        total, between = int(rows.sum()), (sums.astype(np.float64) ** 2 / rows[:, None]).sum(axis=0)
+        field = f"second-{scale}"
+        if field in arrays:
+            packed = array(arrays, field, ("int64",), (self._dimension * (self._dimension + 1) // 2,))
+            check_values(packed, partial(self._check_moment, field, total, between))
+            if thorough:
+                self._check_scatter(field, packed, rows, sums)
+            return
+        field = f"values-{scale}"
+        values = array(arrays, field, ("int32",), (None,))
+        count = whole(field, values.shape[0], 1, total * self._dimension)
+        check_values(values, partial(_check_ascending, field))
+        field = f"places-{scale}"
+        expect(total <= self._dimension, f"rows-{scale}", f"{self._dimension} or fewer, or a second moment", total)
+        places = array(arrays, field, ("int32",), (self._dimension, total))
+        check_values(places, partial(self._check_rows, field, count, values, between, sums.sum(axis=0)))
+        if thorough:
+            moment = SecondMoment.of_codes(rows_of(values, places), total, self._dimension)
+            self._check_scatter(field, moment.packed(), rows, sums)
+
+    def _check_rows(
+        self,
+        field: str,
+        count: int,
+        values: npt.NDArray[np.int32] | LateArray,
+        between: npt.NDArray[np.float64],
+        sums: IntArray,
+        places: npt.NDArray[np.int32],
+    ) -> None:
+        """Raise Unexpected for rows that are not of these sums, or vary less than their materials do.
+
+        count: of the values. between: as in `_check_moment`. sums: of all, (d,).
+        """
+        expect(bool(((places >= 0) & (places < count)).all()), field, f"places among {count}", "others")
+        rows = rows_of(values.read() if isinstance(values, LateArray) else values, places)
+        expect(bool((rows.sum(axis=0, dtype=np.int64) == sums).all()), field, "rows of these sums", "others")
+        self._check_diagonal(field, np.einsum("nd,nd->d", rows, rows, dtype=np.float64), between)
 
     def _check_moment(self, field: str, total: int, between: npt.NDArray[np.float64], packed: IntArray) -> None:
         """Raise Unexpected where a variance within the materials is negative: a readout of it has no answer.
@@ -123,7 +160,9 @@ class CheckpointChecks:
         most = total << 2 * BITS
         counts(field, packed, -most, most)
         places = np.cumsum(np.arange(1, self._dimension + 1)) - 1  # of the diagonal
-        diagonal = packed[places].astype(np.float64)
+        self._check_diagonal(field, packed[places].astype(np.float64), between)
+
+    def _check_diagonal(self, field: str, diagonal: npt.NDArray[np.float64], between: npt.NDArray[np.float64]) -> None:
         sound = bool((diagonal + 1e-9 * diagonal.max(initial=0) + 1 >= between).all())
         expect(sound, field, *NO_MOMENT)
 
@@ -201,6 +240,11 @@ class CheckpointChecks:
         _check_finite("tuned-bias", array(arrays, "tuned-bias", ("float64",), (len(names),)))
         for field in (field for field in arrays if field.startswith("tuned-net-")):
             _check_finite(field, array(arrays, field, ("float32",), arrays[field].shape))
+
+
+def _check_ascending(field: str, values: npt.NDArray[np.int32]) -> None:
+    codes(field, values)
+    expect(bool((np.diff(values) > 0).all()), field, "ascending values", "others")
 
 
 def _check_finite(field: str, values: npt.NDArray[np.floating]) -> None:

@@ -52,7 +52,9 @@ def load(empty: Memory, store: Store) -> Memory:
 def _loaded(memory: Memory, store: Store) -> Memory:
     memory.base = store.compacted
     # Without a sound checkpoint the base raises what is lost; without a base the journal has every row.
-    newest = store.latest(late=[LATE_ROWS, *(f"{LATE_SECOND}{scale}" for scale in memory.plan.scales)])
+    newest = store.latest(
+        late=[LATE_ROWS, *(f"{name}-{scale}" for name in LATE_SECOND for scale in memory.plan.scales)]
+    )
     start = store.base() if newest is None else newest
     if start is not None:
         memory.fill(start.arrays, start.attributes, start.last_sequence, source=0, late=start.late)

@@ -20,13 +20,13 @@ from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.readouts.likelihood import LevelArray
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
-from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.statistics.statistics import SECOND, Statistics
 from store import Head, Record
 from store.late import LateArray
 
 __all__ = ["LATE_ROWS", "LATE_SECOND", "Memory", "give_back_scratch"]
 
-LATE_ROWS, LATE_SECOND = "sample-rows", "second-"  # arrays, most of a checkpoint, that no prediction reads
+LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
 
 
 class Memory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -11,15 +12,16 @@ from scroll_tactile.blas import one_thread
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.statistics.grid import BITS, mean_code
 
-__all__ = ["MOST_ROWS", "SecondMoment", "Sums", "one_thread", "require_room", "within_scatter"]
+__all__ = ["MOST_ROWS", "Codes", "SecondMoment", "Sums", "one_thread", "require_room", "within_scatter"]
 
 IntArray = npt.NDArray[np.int64]
 FloatArray = npt.NDArray[np.float64]
+Codes = npt.NDArray[np.int32]
 Sums = npt.NDArray[np.int32] | IntArray
 
 MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass int64: 8 388 607
-BLOCK = 512  # rows that wait; below 2¹³ their product is exact in float64, and it is packed once for all of them
-FIRST = 64  # of them that there is room for at once
+BLOCK = 512  # rows whose product is packed at once; below 2¹³ it is exact in float64
+FIRST = 64  # rows that there is room for at once
 LIMB = 22  # bits
 MANY = 1024  # classes
 ROWS = 128  # of a product that are formed at once: the whole of one is 8 MB
@@ -45,69 +47,117 @@ def require_room(rows: int, more: int) -> None:
 class SecondMoment:
     """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is kept, row after row.
 
-    Rows wait in a block of at most 512, whose product is formed by BLAS in float64: products of integers below
-    2²¹ and their sums below 2⁵³ are exact there, in any order and with any number of threads. The triangle is never
-    changed in place: whoever has it keeps it as it is, and what is cut short by ctrl-C has changed nothing.
+    While there are no more rows than features, they are kept themselves: they say what A is in half the numbers or
+    less, and take a fraction of its bytes on a disk. The triangle is formed when it is asked for. Of more rows a block
+    of at most 512 waits to be added to it.
+
+    Products are formed by BLAS in float64, of 512 rows at a time: products of integers below 2²¹ and their sums below
+    2⁵³ are exact there, in any order and with any number of threads. The triangle is never changed in place: whoever
+    has it keeps it as it is, and what is cut short by ctrl-C has changed nothing.
     """
 
     def __init__(self, dimension: int) -> None:
         self.dimension = dimension
         self.rows = 0
         self._packed: IntArray | None = None
-        self._late: Callable[[], IntArray] | None = None
-        self._waiting: npt.NDArray[np.int32] | None = None
-        self._count = 0
+        self._whole = True  # whether all rows are there
+        self._late: Callable[[], IntArray | Codes] | None = None  # the first rows where it is whole, or the triangle
+        self._codes: Codes | None = None
+        self._count = 0  # of rows there
+        self._formed = 0  # of them, in the triangle
 
-    def add(self, codes: npt.NDArray[np.int32]) -> None:
+    def add(self, codes: Codes) -> None:
         """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
         require_room(self.rows, len(codes))
         for first in range(0, len(codes), BLOCK):
-            self._wait(codes[first : first + BLOCK])
-        self.rows += len(codes)
+            block = codes[first : first + BLOCK]
+            if self._whole and self.rows + len(block) > self.dimension:
+                self._give_up_rows()
+            self._wait(block)
+            self.rows += len(block)
 
-    def _wait(self, codes: npt.NDArray[np.int32]) -> None:
-        if self._count + len(codes) > BLOCK:
-            self._flush()
+    def _give_up_rows(self) -> None:
+        packed = self.packed()
+        self._packed, self._whole, self._codes, self._count, self._formed = packed, False, None, 0, 0
+
+    def _wait(self, codes: Codes) -> None:
+        if not self._whole and self._count + len(codes) > BLOCK:
+            self._form()
         last = self._count + len(codes)
-        if self._waiting is None or len(self._waiting) < last:
-            longer = np.empty((min(BLOCK, max(2 * self._count, last, FIRST)), self.dimension), dtype=np.int32)
-            if self._waiting is not None:
-                longer[: self._count] = self._waiting[: self._count]
-            self._waiting = longer
-        self._waiting[self._count : last] = codes
+        if self._codes is None or len(self._codes) < last:
+            most = self.dimension if self._whole else BLOCK
+            longer = np.empty((min(most, max(2 * self._count, last, FIRST)), self.dimension), dtype=np.int32)
+            if self._codes is not None:
+                longer[: self._count] = self._codes[: self._count]
+            self._codes = longer
+        self._codes[self._count : last] = codes
         self._count = last
 
-    def remove(self, codes: npt.NDArray[np.int32]) -> None:
+    def remove(self, codes: Codes) -> None:
         """Take rows out again that were added, shape (rows, d): as if they had never been."""
-        packed = self.packed().copy()
-        for first in range(0, len(codes), BLOCK):
-            _add_product(packed, codes[first : first + BLOCK], np.subtract)
-        self._packed, self.rows = packed, self.rows - len(codes)
+        own = self.codes()
+        left = None if own is None else _without(own, codes)
+        packed = self._packed
+        if packed is not None or left is None:
+            packed = self.packed().copy()
+            for first in range(0, len(codes), BLOCK):
+                _add_product(packed, codes[first : first + BLOCK], np.subtract)
+        count = 0 if left is None else len(left)
+        self._packed, self._whole, self._codes, self._count = packed, left is not None, left, count
+        self._formed, self.rows = 0 if packed is None else count, self.rows - len(codes)
 
-    def _flush(self) -> None:
-        if self._late is not None:
-            self._packed, self._late = self._late(), None
+    def _read(self) -> None:
+        """Read what was left for later."""
+        if self._late is None:
+            return
+        found = self._late()
+        if self._whole:
+            rows = np.concatenate([found.astype(np.int32, copy=False), *self._there()])
+            self._codes, self._count, self._late = rows, len(rows), None
+        else:
+            self._packed, self._late = found.astype(np.int64, copy=False), None
+
+    def _there(self) -> list[Codes]:
+        return [] if self._codes is None else [self._codes[: self._count]]
+
+    def _form(self) -> None:
+        """Add the rows that are not in the triangle to it."""
+        self._read()
         packed = self._packed
         if packed is None:
             packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
-        if self._count:
-            assert self._waiting is not None
-            packed = packed.copy() if packed is self._packed else packed
-            _add_product(packed, self._waiting[: self._count], np.add)
-        self._packed, self._waiting, self._count = packed, None, 0
+        for rows in self._there():
+            packed = packed.copy() if packed is self._packed and len(rows) > self._formed else packed
+            for first in range(self._formed, len(rows), BLOCK):
+                _add_product(packed, rows[first : first + BLOCK], np.add)
+        if self._whole:
+            self._packed, self._formed = packed, self._count
+        else:
+            self._packed, self._codes, self._count = packed, None, 0
 
     def packed(self) -> IntArray:
         """The lower triangle of A as it is now, row after row, shape (d·(d+1)/2,): not to be changed."""
-        self._flush()
+        self._form()
         assert self._packed is not None
         return self._packed
 
+    def codes(self) -> Codes | None:
+        """All rows, (rows, d), in an order that does not depend on the one they came in; None where they are not there.
+
+        Not to be changed.
+        """
+        if not self._whole:
+            return None
+        self._read()
+        rows = np.concatenate([np.zeros((0, self.dimension), dtype=np.int32), *self._there()])
+        return rows[sorted(range(len(rows)), key=[row.tobytes() for row in rows].__getitem__)]
+
     def undo(self) -> Callable[[], None]:
         """What takes the next `add` back, however much of it was done; it can be called again."""
-        state = self._packed, self._late, self._waiting, self._count, self.rows
+        state = self._packed, self._whole, self._late, self._codes, self._count, self._formed, self.rows
 
         def undo() -> None:
-            self._packed, self._late, self._waiting, self._count, self.rows = state
+            self._packed, self._whole, self._late, self._codes, self._count, self._formed, self.rows = state
 
         return undo
 
@@ -123,12 +173,47 @@ class SecondMoment:
         packed: or what reads the triangle, called when it is needed, and again where that failed.
         """
         moment = cls(dimension)
-        moment.rows = rows
+        moment.rows, moment._whole = rows, False
         if callable(packed):
             moment._late = packed
         else:
             moment._packed = packed
         return moment
+
+    @classmethod
+    def of_codes(cls, codes: Codes | Callable[[], Codes], rows: int, dimension: int) -> SecondMoment:
+        """A second moment of given rows, at most `dimension`, which it takes over; or of what reads them (see `of`)."""
+        moment = cls(dimension)
+        moment.rows = rows
+        if callable(codes):
+            moment._late = codes
+        else:
+            moment._codes, moment._count = codes, rows
+        return moment
+
+    def joined(self, other: SecondMoment, sign: int) -> SecondMoment:
+        """This one and another; with a sign of −1 this one without the other."""
+        rows = self.rows + sign * other.rows
+        if self._whole and other._whole and rows <= self.dimension:
+            ours, theirs = self.codes(), other.codes()
+            assert ours is not None
+            assert theirs is not None
+            both = np.concatenate([ours, theirs]) if sign > 0 else _without(ours, theirs)
+            if both is not None:
+                return SecondMoment.of_codes(both, rows, self.dimension)
+        return SecondMoment.of(self.packed() + sign * other.packed(), rows, self.dimension)
+
+
+def _without(rows: Codes, gone: Codes) -> Codes | None:
+    """Rows without some of them; None where they are not all there."""
+    left = Counter(row.tobytes() for row in gone.astype(np.int32, copy=False))
+    stay = []
+    for place, row in enumerate(rows):
+        if left[key := row.tobytes()]:
+            left[key] -= 1
+        else:
+            stay.append(place)
+    return None if +left else rows[stay]
 
 
 def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) -> None:

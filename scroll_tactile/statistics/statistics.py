@@ -1,7 +1,7 @@
 """Statistics: all that learning keeps, as exact integers with an algebra of + and −.
 
-For every scale: counts n_y and sums c_y of each material, and the second moment A of all. Sums of integers do not
-depend on order, batching or grouping, so neither does the memory.
+For every scale: counts n_y and sums c_y of each material, and the second moment A of all; of few rows, the rows
+that A is of. Sums and sets do not depend on order, batching or grouping, so neither does the memory.
 """
 
 from __future__ import annotations
@@ -18,13 +18,15 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import SecondMoment, Sums, require_room
+from scroll_tactile.statistics.tables import rows_of, table_of
 
-__all__ = ["Snapshot", "Statistics"]
+__all__ = ["SECOND", "Snapshot", "Statistics"]
 
 IntArray = npt.NDArray[np.int64]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
 
 LARGEST = 2**31 - 1  # of what is kept in int32
+SECOND = ("second", "values", "places")  # arrays of a scale: a triangle, or rows; most of a checkpoint
 
 
 class Statistics:
@@ -243,9 +245,7 @@ class Statistics:
                     joint._rows[scale][to] += weight * part._rows[scale][place]
                     joint._add_sums(scale, to, weight * part._sums[scale][place].astype(np.int64))
         for scale in self.scales:
-            ours, theirs = self._seconds[scale], other._seconds[scale]
-            packed = ours.packed() + sign * theirs.packed()
-            joint._seconds[scale] = SecondMoment.of(packed, ours.rows + sign * theirs.rows, self.dimension)
+            joint._seconds[scale] = self._seconds[scale].joined(other._seconds[scale], sign)
         if sign < 0 and not joint._sound():
             raise InputError("statistics can be taken only out of statistics that contain them")
         joint._lengths = +joint._lengths
@@ -265,7 +265,10 @@ class Statistics:
         return True
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-        """What a store keeps: arrays by name, and the materials in the order of their first axis."""
+        """What a store keeps: arrays by name, and the materials in the order of their first axis.
+
+        Of a second moment whose rows are there these, as `tables.table_of` gives them; of another its triangle.
+        """
         names = sorted(self.materials)
         places = [self._places[name] for name in names]
         lengths = np.array(sorted(self._lengths.items()), dtype=np.int64).reshape(-1, 2)
@@ -273,8 +276,11 @@ class Statistics:
         for scale in self.scales:
             arrays[f"rows-{scale}"] = self._rows[scale][places]
             arrays[f"sums-{scale}"] = self._sums[scale][places].astype(np.int64)
-            if self._seconds[scale].rows:
-                arrays[f"second-{scale}"] = self._seconds[scale].packed().copy()
+            second = self._seconds[scale]
+            if second.rows and (codes := second.codes()) is not None:
+                arrays[f"values-{scale}"], arrays[f"places-{scale}"] = table_of(codes)
+            elif second.rows:
+                arrays[f"second-{scale}"] = second.packed().copy()
         return arrays, names
 
     @classmethod
@@ -284,11 +290,11 @@ class Statistics:
         scales: Sequence[Scale],
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
-        late: Mapping[str, Callable[[], IntArray]] | None = None,
+        late: Mapping[str, Callable[[], npt.NDArray[Any]]] | None = None,
     ) -> Statistics:
         """The statistics that `to_arrays` described; the arrays are taken over or copied.
 
-        late: what reads those second moments that are not among the arrays, when they are needed.
+        late: what reads those arrays of second moments that are not among the arrays, when they are needed.
         """
         statistics = cls(dimension, scales)
         statistics._places = {name: place for place, name in enumerate(names)}
@@ -299,10 +305,26 @@ class Statistics:
             narrow = max(int(sums.max(initial=0)), -int(sums.min(initial=0))) <= LARGEST
             statistics._sums[scale] = sums.astype(np.int32) if narrow else sums
             if rows := int(statistics._rows[scale].sum()):
-                field = f"second-{scale}"
-                packed = late[field] if late and field in late else arrays[field]
-                statistics._seconds[scale] = SecondMoment.of(packed, rows, dimension)
+                statistics._seconds[scale] = _second(int(scale), rows, dimension, arrays, late or {})
         return statistics
+
+
+def _second(
+    scale: int,
+    rows: int,
+    dimension: int,
+    arrays: Mapping[str, npt.NDArray[Any]],
+    late: Mapping[str, Callable[[], npt.NDArray[Any]]],
+) -> SecondMoment:
+    """The second moment of so many rows that arrays describe, read when it is needed where all of it is late."""
+    second, values, places = (f"{name}-{scale}" for name in SECOND)
+    if second in late:
+        return SecondMoment.of(late[second], rows, dimension)
+    if second in arrays:
+        return SecondMoment.of(arrays[second], rows, dimension)
+    if places in late:
+        return SecondMoment.of_codes(lambda: rows_of(late[values](), late[places]()), rows, dimension)
+    return SecondMoment.of_codes(rows_of(arrays[values], arrays[places]), rows, dimension)
 
 
 class Snapshot:

@@ -217,7 +217,19 @@ def generation(change, *, base=False):
 
 
 def summed(name, spoil, **options):
-    return generation(lambda attributes, arrays: arrays.update({name: spoil(arrays[name])}), **options)
+    def change(attributes, arrays):
+        triangle(name, attributes, arrays)
+        arrays[name] = spoil(arrays[name])
+
+    return generation(change, **options)
+
+
+def triangle(name, attributes, arrays):
+    """The second moment of this name as its triangle, as of more rows: no array but it where it is none."""
+    what, _, scale = name.partition("-")
+    if what == "second" and name not in arrays:
+        rows = arrays.pop(f"values-{scale}")[arrays.pop(f"places-{scale}")].T
+        arrays[name] = (rows.astype(np.int64).T @ rows)[np.tril_indices(attributes["dimension"])]
 
 
 def attributed(name, value):
@@ -277,6 +289,10 @@ SUMS = {
     "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
     "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],
     "second-1048576": [lambda a: a * 0],
+    "values-15": [lambda a: a[::-1], lambda a: a + LARGE, lambda a: a[:-1], lambda a: a[:0], lambda a: a * 0],
+    "values-1048576": [lambda a: a + 1, lambda a: a.astype(np.int64), lambda a: None],
+    "places-15": [lambda a: a[:, :-1], lambda a: a[:-1], lambda a: a + 1, lambda a: a - 1, lambda a: a + 2**30],
+    "places-1048576": [lambda a: a[:, :0], lambda a: a * 0, lambda a: a[::-1], lambda a: None],
     "rows-1048576": [lambda a: a * 0, lambda a: a - 1],
     "sample-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
     "sample-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
@@ -302,7 +318,7 @@ ABOUT = {
     "tuned_last_sequence": [None, -1, 10**9, "x"],
     "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
 }
-IN_GENERATIONS = "observations|lengths|rows|sums|second|sample|kept|exemplar|retracted|excluded"
+IN_GENERATIONS = "observations|lengths|rows|sums|second|values|places|sample|kept|exemplar|retracted|excluded"
 
 
 def forged_rows():
@@ -403,6 +419,7 @@ def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
 def hollow(attributes, arrays):
     """A second moment that no rows have: its diagonal is theirs, and beside it is more."""
     dimension = attributes["dimension"]
+    triangle("second-15", attributes, arrays)
     square = np.zeros((dimension, dimension), np.int64)
     square[np.tril_indices(dimension)] = arrays["second-15"]
     square[1, 0] = int(np.sqrt(float(square[0, 0])) * np.sqrt(float(square[1, 1]))) * 2
@@ -437,6 +454,8 @@ def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
 def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
     attributes, arrays = checkpoint_of(path)
+    for scale in (1048576, 1048577):
+        triangle(f"second-{scale}", attributes, arrays)
     for name in ("observations", "rows-1048576", "rows-1048577"):
         arrays[name] = arrays[name] + 1
     arrays["lengths"][0, 1] += len(arrays["observations"])

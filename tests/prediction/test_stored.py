@@ -330,13 +330,14 @@ def test_a_reader_keeps_its_sums_where_a_writer_has_replaced_the_checkpoint(path
         assert reader.digest() == fed([*OBSERVED, ("a", 80)]).digest()
 
 
-def test_sums_that_are_damaged_after_opening_are_named_and_the_memory_can_be_repaired(path):
-    chunk = next(one for one in path.glob("checkpoints/*/second-15/c/**/*") if one.is_file())
+@pytest.mark.parametrize("array", ["second-15", "places-1048576"])
+def test_sums_that_are_damaged_after_opening_are_named_and_the_memory_can_be_repaired(path, array):
+    chunk = next(one for one in path.glob(f"checkpoints/*/{array}/c/**/*") if one.is_file())
     with opened(path) as reader:
         data = chunk.read_bytes()
         chunk.write_bytes(data[:20] + bytes([data[20] ^ 1]) + data[21:])
         for _ in range(2):
-            with pytest.raises(DamageError, match=r"array 'second-15' of checkpoint .* cannot be read"):
+            with pytest.raises(DamageError, match=rf"array '{array}' of checkpoint .* cannot be read"):
                 reader.digest()
         chunk.write_bytes(data)
         assert reader.digest() == fed(OBSERVED).digest()

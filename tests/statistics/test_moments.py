@@ -73,6 +73,75 @@ def test_what_is_added_and_removed_leaves_no_trace(kept, gone, seed):
     assert moment.packed().tobytes() == added(stay).packed().tobytes()
 
 
+@settings(max_examples=50, deadline=None)
+@given(st.data())
+def test_no_more_rows_than_features_are_kept_and_any_order_of_them_is_the_same(data):
+    batch = codes(data.draw(st.integers(0, 12)), 8, low=-1, high=0)  # some come twice
+    gone = data.draw(st.integers(0, len(batch)))
+    order = np.random.default_rng(data.draw(st.integers(0, 99))).permutation(len(batch))
+    moment = SecondMoment(8)
+    for row in order:
+        moment.add(batch[row : row + 1])
+        if data.draw(st.booleans()):
+            moment.packed()  # reading in between changes nothing
+    kept = moment.codes()
+    assert (kept is not None) == (len(batch) <= 8)
+    assert moment.packed().tolist() == truth(batch)
+    if kept is None:
+        return
+    assert kept.tobytes() == added(batch, dimension=8).codes().tobytes()
+    assert sorted(kept.tolist()) == sorted(batch.tolist())
+    read = []
+    late = SecondMoment.of_codes(lambda: read.append(1) or kept, len(kept), 8)
+    late.add(batch[:0])
+    assert not read
+    for one in (moment, late):
+        one.remove(batch[:gone])
+        assert one.codes().tobytes() == added(batch[gone:], dimension=8).codes().tobytes()
+        assert one.packed().tolist() == truth(batch[gone:])
+        one.add(batch[:gone])
+        assert one.codes().tobytes() == kept.tobytes()
+        assert one.packed().tolist() == truth(batch)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(0, 0), (3, 0), (0, 3), (3, 5), (4, 5), (9, 3), (3, 9)])
+def test_moments_are_joined_and_taken_apart_with_their_rows_or_without(ours, theirs):
+    a, b = codes(ours, 8, 1), codes(theirs, 8, 2)
+    both = added(a, dimension=8).joined(added(b, dimension=8), 1)
+    assert both.rows == ours + theirs
+    assert both.packed().tolist() == truth(np.concatenate([a, b]))
+    assert (both.codes() is None) == (ours + theirs > 8)
+    again = both.joined(added(b, dimension=8), -1)
+    assert again.rows == ours
+    assert again.packed().tolist() == truth(a)
+    if ours + theirs <= 8:
+        assert again.codes().tobytes() == added(a, dimension=8).codes().tobytes()
+
+
+def test_rows_that_were_never_added_leave_the_sums_that_are_left():
+    moment = added(codes(3, 8, 1), dimension=8)
+    moment.remove(other := codes(1, 8, 2))
+    assert moment.rows == 2
+    assert moment.codes() is None
+    assert moment.packed().tolist() == [x - y for x, y in zip(truth(codes(3, 8, 1)), truth(other), strict=True)]
+
+
+def test_an_addition_is_undone_before_and_after_the_rows_are_given_up():
+    moment, batch = SecondMoment(8), codes(20, 8)
+    for first, last in ((0, 3), (3, 8), (8, 12), (12, 20)):
+        before = None if first > 8 else moment.codes()
+        undo = moment.undo()
+        for _ in range(2):
+            moment.add(batch[first:last])
+            moment.packed()
+            undo()
+            assert moment.rows == first
+            assert (moment.codes() is None) == (before is None)
+            assert moment.packed().tolist() == truth(batch[:first])
+        moment.add(batch[first:last])
+    assert moment.packed().tolist() == truth(batch)
+
+
 def test_a_full_moment_refuses_before_anything_is_added():
     assert MOST_ROWS * EDGE**2 < 2**63
     moment = SecondMoment.of(np.arange(10, dtype=np.int64), MOST_ROWS - 2, 4)

@@ -9,10 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.pipelines.fleet import learn
-from scroll_tactile.pipelines.sources import SourceOptions
+from scroll_tactile import Scene, SourceOptions, TactileLearner, learn, sensors
 
 SCENE = Scene(sensor=sensors.BIOTAC, seed=2)
 ROBOTS = {"robot-1": range(4), "robot-2": range(3, 7)}  # the fourth touch of each material was copied to both

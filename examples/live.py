@@ -3,9 +3,8 @@
 Simulated, so that it runs anywhere: python examples/live.py
 """
 
-from scroll_tactile import TactileLearner, sensors
+from scroll_tactile import Scene, TactileLearner, sensors
 from scroll_tactile.datasets.shift import simulated_shift
-from scroll_tactile.datasets.simulator import Scene
 
 scene = Scene(sensor=sensors.BIOTAC)
 known, new = scene.materials[:4], scene.materials[4]

@@ -8,10 +8,8 @@ import tempfile
 
 import numpy as np
 
-from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile import Scene, TactileLearner, check_embedding, sensors
 from scroll_tactile.errors import EmbeddingMismatchError
-from scroll_tactile.testing import check_embedding
 
 
 class Spectrum:

@@ -5,8 +5,7 @@ Simulated, so that it runs anywhere: python examples/own_sensor.py
 
 import numpy as np
 
-from scroll_tactile import Sensor, TactileLearner
-from scroll_tactile.testing import check_learner
+from scroll_tactile import Sensor, TactileLearner, check_learner
 
 GRIPPER = Sensor(
     name="gripper",

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from examples.paper.studies.table1 import Table1, rows
-from scroll_tactile import sensors
+from scroll_tactile import Scene, Stream, sensors
 from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.simulator import Scene
-from scroll_tactile.signals.stream import Stream
 
 
 class Strengths:

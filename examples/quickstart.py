@@ -3,8 +3,7 @@
 Simulated, so that it runs anywhere: python examples/quickstart.py
 """
 
-from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile import Scene, TactileLearner, sensors
 
 scene = Scene(sensor=sensors.BIOTAC, seed=0)
 *observed, never_observed = scene.materials[:7]

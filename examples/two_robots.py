@@ -10,16 +10,14 @@ import sys
 import tempfile
 from pathlib import Path
 
-from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile import Scene, TactileLearner, sensors
 
 scene = Scene(sensor=sensors.ROBOSKIN, seed=1)
 touches = [(material, repetition) for material in scene.materials[:5] for repetition in range(4)]
 
 CUT = """
 import os, signal, sys
-from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile import Scene, TactileLearner, sensors
 scene = Scene(sensor=sensors.ROBOSKIN, seed=1)
 learner = TactileLearner.open(sys.argv[1], sensor=sensors.ROBOSKIN)
 for entry in sys.argv[2:]:

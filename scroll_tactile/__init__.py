@@ -9,7 +9,8 @@ import importlib
 import typing
 
 if typing.TYPE_CHECKING:
-    from scroll_tactile import errors, sensors
+    from scroll_tactile import errors, recordings, sensors
+    from scroll_tactile.datasets.simulator import Scene
     from scroll_tactile.embeddings.frames import Frames
     from scroll_tactile.embeddings.joined import Joined
     from scroll_tactile.embeddings.kernels import Kernels
@@ -18,33 +19,62 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.embeddings.protocol import Capabilities, Embedding
     from scroll_tactile.embeddings.vision import Vision
     from scroll_tactile.learner import TactileLearner
-    from scroll_tactile.results import Composition, Constituent, Observation, Prediction, Receipt
+    from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
+    from scroll_tactile.live.session import LiveSession
+    from scroll_tactile.pipelines.fleet import FleetReport, learn
+    from scroll_tactile.pipelines.sources import SourceOptions
+    from scroll_tactile.results import (
+        Candidates,
+        Compacted,
+        Composition,
+        Constituent,
+        Merged,
+        Observation,
+        Prediction,
+        Receipt,
+    )
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.settings import Settings
     from scroll_tactile.signals.copies import Augmented
     from scroll_tactile.signals.stream import Stream
+    from scroll_tactile.testing.embedding_checks import check_embedding
+    from scroll_tactile.testing.learner_checks import check_learner
 
 __all__ = [
     "Augmented",
+    "Candidates",
     "Capabilities",
+    "Compacted",
     "Composition",
     "Constituent",
     "Embedding",
+    "FleetReport",
     "Frames",
     "Joined",
     "Kernels",
+    "LiveReport",
+    "LiveSession",
+    "LiveState",
+    "LiveTouch",
     "Maps",
+    "Merged",
     "ModuleEmbedding",
     "Observation",
     "Prediction",
     "Receipt",
+    "Scene",
     "Sensor",
     "Settings",
+    "SourceOptions",
     "Stream",
     "TactileLearner",
     "Vision",
     "__version__",
+    "check_embedding",
+    "check_learner",
     "errors",
+    "learn",
+    "recordings",
     "sensors",
 ]
 
@@ -53,28 +83,41 @@ __version__ = "0.11.0"
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
     "Augmented": "signals.copies",
+    "Candidates": "results",
     "Capabilities": "embeddings.protocol",
+    "Compacted": "results",
     "Composition": "results",
     "Constituent": "results",
     "Embedding": "embeddings.protocol",
+    "FleetReport": "pipelines.fleet",
     "Frames": "embeddings.frames",
     "Joined": "embeddings.joined",
     "Kernels": "embeddings.kernels",
+    "LiveReport": "live.answers",
+    "LiveSession": "live.session",
+    "LiveState": "live.answers",
+    "LiveTouch": "live.answers",
     "Maps": "embeddings.maps",
+    "Merged": "results",
     "ModuleEmbedding": "embeddings.modules",
     "Observation": "results",
     "Prediction": "results",
     "Receipt": "results",
+    "Scene": "datasets.simulator",
     "Sensor": "sensors",
     "Settings": "settings",
+    "SourceOptions": "pipelines.sources",
     "Stream": "signals.stream",
     "TactileLearner": "learner",
     "Vision": "embeddings.vision",
+    "check_embedding": "testing.embedding_checks",
+    "check_learner": "testing.learner_checks",
+    "learn": "pipelines.fleet",
 }
 
 
 def __getattr__(name: str) -> typing.Any:
-    if name in ("errors", "sensors"):
+    if name in ("errors", "recordings", "sensors"):
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import api
 import pytest
 
 import scroll_tactile
@@ -75,3 +76,7 @@ def test_the_store_knows_nothing_of_touch():
 def test_the_newest_change_that_is_told_is_of_this_version():
     text = (Path(scroll_tactile.__file__).parent / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (\S+)$", text, re.MULTILINE)[0] == scroll_tactile.__version__
+
+
+def test_the_page_of_public_names_says_what_their_docstrings_say():
+    assert api.PAGE.read_text(encoding="utf-8") == api.page(), "python tests/api.py writes it"

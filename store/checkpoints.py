@@ -1,4 +1,4 @@
-"""The checkpoints of an open store: which one is read, how a new one is committed, and how a base takes rows' place."""
+"""The checkpoints of an open store: which one is read, how one is committed, and how one takes the place of rows."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ class Checkpoints:
                     logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
         return None
 
-    def base(self) -> Checkpoint | None:
+    def compaction(self) -> Checkpoint | None:
         """Return the checkpoint that stands for the compacted rows, None when there are none."""
-        while (named := self._journal.current().base) is not None:
+        while (named := self._journal.current().compaction) is not None:
             try:
                 return self._load(named)
             except DamageError:
@@ -137,7 +137,7 @@ class Checkpoints:
         return number
 
     def compact(self, draft: Draft, newest: Draft | None) -> None:
-        """Commit a base, and a log in which the rows that it stands for have no arrays; all is read back before."""
+        """Commit a compaction checkpoint and a log in which its rows have no arrays; all is read back before."""
         with self._committing:
             with self._journal.switching():
                 number = self._next(log_numbers(self._folder, unfinished=True))

@@ -6,7 +6,7 @@ Exception
     ├── NotAStoreError     the path holds no store: give another path, or an identity to create one
     ├── VersionError       a newer release wrote it: upgrade; nothing was touched
     ├── DamageError        bytes on the disk are not those that were written: repair_store keeps what verifies
-    ├── CompactedError     compaction gave up this row's arrays: resume from the base
+    ├── CompactedError     compaction gave up this row's arrays: resume from the compaction checkpoint
     ├── StoreFullError     no space is left: free some and call again; nothing acknowledged is lost
     ├── ReadOnlyError      the store, or its folder, may not be written from here
     ├── StoreClosedError   the store was closed, or belongs to the process that forked this one

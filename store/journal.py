@@ -231,7 +231,7 @@ class Journal:
         """Yield the verified rows behind `after` up to `last`, of one kind or label only where it is given.
 
         arrays: as records, one in memory at a time. Raises DamageError at the first that is not as it was written,
-        or that is missing itself where all are asked for; CompactedError where a base has the arrays' place.
+        or that is missing itself where all are asked for; CompactedError where compaction gave the arrays up.
         """
         chosen, begin = kind is not None or label is not None, after
         while after < last:
@@ -269,7 +269,7 @@ class Journal:
 
     def _require_no_gap(self, at: OpenLog, after: int, through: int, index: int) -> None:
         why = at.rows.damage.get(index)
-        # Up to the base a repair may have left some out.
+        # Up to the compaction checkpoint a repair may have left some out.
         first = 1 + (after if why is not None else max(after, at.current.compacted))
         if first > through:
             return
@@ -320,8 +320,8 @@ class Journal:
             at.keep_index()
 
     def given_up(self, sequence: int) -> CompactedError:
-        """Return the error for a row whose arrays a base stands for."""
-        with self._using("looking for a base") as at:
+        """Return the error for a row whose arrays a compaction checkpoint stands for."""
+        with self._using("looking for a compaction checkpoint") as at:
             compacted = at.current.compacted
         return CompactedError(
             f"the arrays of row {sequence} of {self.folder} were given up when rows 1 to {compacted} were compacted"

@@ -87,26 +87,26 @@ class Current:
     """What makes up a store at one moment.
 
     log: the number of the log, and log_identity what all frames of it carry. newest: the checkpoint to begin with.
-    base: the one that stands for the rows that gave up their arrays; it may be the same. None where there is none.
+    compaction: the one that stands for rows that gave up their arrays; it may be the same. None where there is none.
     last: a row that the log has had; one that ends before it was cut off. 0 where nothing is known.
     """
 
     log: int
     log_identity: bytes
     newest: NamedCheckpoint | None = None
-    base: NamedCheckpoint | None = None
+    compaction: NamedCheckpoint | None = None
     last: int = 0
 
     @property
     def checkpoints(self) -> list[NamedCheckpoint]:
-        """The newest and the base, each once."""
-        named = [named for named in (self.newest, self.base) if named is not None]
+        """The newest and the compaction checkpoint, each once."""
+        named = [named for named in (self.newest, self.compaction) if named is not None]
         return named[:1] if len(named) > 1 and named[0].number == named[1].number else named
 
     @property
     def compacted(self) -> int:
-        """The last row that gave up its arrays for the base, 0 without one."""
-        return 0 if self.base is None else self.base.last_sequence
+        """The last row that gave up its arrays for the compaction checkpoint, 0 without one."""
+        return 0 if self.compaction is None else self.compaction.last_sequence
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the file."""
@@ -114,7 +114,7 @@ class Current:
             "format": FORMAT_VERSION,
             "log": [self.log, self.log_identity.hex()],
             "newest": None if self.newest is None else self.newest.to_json(),
-            "base": None if self.base is None else self.base.to_json(),
+            "compaction": None if self.compaction is None else self.compaction.to_json(),
             "last": self.last,
         }
         return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
@@ -132,19 +132,21 @@ class Current:
                     "upgrade it, or open the store with the release that wrote it; nothing was changed"
                 )
             number, identity = known["log"]
-            newest, base = (None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES)
+            newest, compaction = (
+                None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES
+            )
             last = _count(known.get("last", 0))
-            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, base, last)
-            if current.base is not None and (
-                current.newest is None or current.newest.last_sequence < current.base.last_sequence
+            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, last)
+            if current.compaction is not None and (
+                current.newest is None or current.newest.last_sequence < current.compaction.last_sequence
             ):
-                raise ValueError("its base is newer than its newest checkpoint")
+                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
         return current
 
 
-NAMES = ("newest", "base")
+NAMES = ("newest", "compaction")
 
 
 def _not_as_written(path: Path, error: Exception) -> DamageError:

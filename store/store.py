@@ -198,13 +198,13 @@ class Store:
 
         One is in memory at a time. Raises DamageError at the first that is damaged or missing; its
         `sequence` is the `after` with which to continue behind it. Raises CompactedError where the first
-        are compacted: `base` has their place, and its `last_sequence` is the `after` to continue with.
+        are compacted: `compaction` has their place, and its `last_sequence` is the `after` to continue with.
         """
         self._check_open(after)
         if after < (compacted := self._journal.current().compacted):
             raise CompactedError(
                 f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
-                "base(), and continue behind its last_sequence"
+                "compaction(), and continue behind its last_sequence"
             )
         return cast(Iterator[Record], self._journal.rows(after, self._journal.last(), arrays=True))
 
@@ -261,17 +261,17 @@ class Store:
 
     @property
     def compacted(self) -> int:
-        """The last record that has given up its arrays for a base, 0 where none has."""
+        """The last record that has given up its arrays for a compaction checkpoint, 0 where none has."""
         self._check_open()
         return self._journal.current().compacted
 
-    def base(self) -> Checkpoint | None:
+    def compaction(self) -> Checkpoint | None:
         """Return the checkpoint that stands for the compacted records, None when there are none.
 
         Raises DamageError where it does not verify, and VersionError for a newer format.
         """
         self._check_open()
-        return self._checkpoints.base()
+        return self._checkpoints.compaction()
 
     def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, JSON] | None = None) -> int:
         """Write a checkpoint that contains the records up to `last_sequence`, make it current, return its number.
@@ -293,18 +293,19 @@ class Store:
         attributes: Mapping[str, JSON] | None = None,
         newest: tuple[Arrays, Mapping[str, JSON]] | None = None,
     ) -> None:
-        """Let a base stand for the records up to `last_sequence`: they give up their arrays and keep their heads.
+        """Let a checkpoint stand for the records up to `last_sequence`: they give up their arrays and keep their heads.
 
-        The base is a checkpoint like others, but kept until the next base; a replay of the records begins
-        with it. newest: arrays and attributes of a checkpoint that contains all records, committed beside it; without
-        it the base is the newest. A log without the arrays is written beside the one there is, all is read back, and
-        takes effect together or not at all; then the earlier log and checkpoints are removed. Nobody can append
-        meanwhile. Raises DamageError where a record behind `last_sequence` cannot be read, and as `commit`.
+        This compaction checkpoint is one like others, but kept until the next compaction; a replay of the records
+        begins with it. newest: arrays and attributes of a checkpoint that contains all records, committed beside it;
+        without it that of the compaction is the newest. A log without the arrays is written beside the one there is,
+        all is read back, and takes effect together or not at all; then the earlier log and checkpoints are removed.
+        Nobody can append meanwhile. Raises DamageError where a record behind `last_sequence` cannot be read, and as
+        `commit`.
         """
-        base = self._draft(arrays, last_sequence, attributes)
+        compaction = self._draft(arrays, last_sequence, attributes)
         last = None if newest is None else self._draft(newest[0], self._journal.last(), newest[1])
         self._idle()
-        self._checkpoints.compact(base, last)
+        self._checkpoints.compact(compaction, last)
 
     def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, JSON] | None = None) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
@@ -325,7 +326,7 @@ class Store:
         self._journal.refuse_in_batch("committing a checkpoint")
         first, last = self._journal.current().compacted, self._journal.last()
         if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
-            # Recovery could not resume before the base: the rows behind it have given up their arrays.
+            # Recovery could not resume before the compaction checkpoint: the rows behind it have given up their arrays.
             raise RecordError(
                 f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
                 f"there is, not {last_sequence!r}"

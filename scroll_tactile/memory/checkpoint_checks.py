@@ -1,4 +1,4 @@
-"""What a checkpoint, or the base that a merge brought, must be: sums that touches can have, and samples of them."""
+"""What a checkpoint, or that which a merge brought, must be: sums that touches can have, and samples of them."""
 
 from __future__ import annotations
 

@@ -186,7 +186,10 @@ class Survey:
         if self.current is None:
             aside = sorted(self.folder.glob(f"{LOG}*{DAMAGED}*"))
         else:
-            named = _or_aside(log_path(self.folder, self.current.log))
+            named = log_path(self.folder, self.current.log)
+            put_aside = named.with_name(named.name + DAMAGED)  # by an interrupted repair
+            if not named.exists() and put_aside.exists():
+                named = put_aside
             if self.files.is_packed or named.exists():
                 durable = None if self.current.newest is None else self.current.newest.place
                 return FoundLog(self.files, named, self.current.log_identity, self.progress, durable)
@@ -252,11 +255,8 @@ class Survey:
     @property
     def compaction(self) -> FoundCheckpoint | None:
         """The sound checkpoint that stands for the compacted rows."""
-        return (
-            next((found for found in self.sound if found.last_sequence == self.compacted), None)
-            if self.compacted
-            else None
-        )
+        stands = (found for found in self.sound if found.last_sequence == self.compacted)
+        return next(stands, None) if self.compacted else None
 
     def moved(self) -> bool:
         """Whether a writer has committed something since."""
@@ -312,9 +312,3 @@ class Survey:
             else:
                 continue
             yield Problem(path, what, "leftover")
-
-
-def _or_aside(path: Path) -> Path:
-    """Return a log's path, or where an interrupted repair put it."""
-    aside = path.with_name(path.name + DAMAGED)
-    return aside if not path.exists() and aside.exists() else path

@@ -22,7 +22,7 @@ from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 from store import Head, Record
-from store.late import LateArray
+from store.records import LateArray
 
 __all__ = ["LATE_ROWS", "LATE_SECOND", "Memory", "give_back_scratch"]
 

@@ -196,8 +196,8 @@ class OpenLog:
     def given_up(self, sequence: int) -> CompactedError:
         """Return the error for a row whose arrays a compaction checkpoint stands for."""
         return CompactedError(
-            f"records 1 to {self.current.compacted} of {self._files.folder} gave up their arrays when it was compacted, "
-            f"record {sequence} among them: begin with compaction(), and continue behind its last_sequence"
+            f"records 1 to {self.current.compacted} of {self._files.folder} gave up their arrays when it was compacted "
+            f"(row {sequence}, too): begin with compaction(), and continue behind its last_sequence"
         )
 
     def _not_as_written(self, index: int, error: Exception) -> DamageError:

@@ -68,8 +68,7 @@ class Files:
 
     def current(self) -> Current:
         """Return what `CURRENT` says. Raises DamageError, VersionError, and OSError where it is not there."""
-        path = self.folder / CURRENT_FILE
-        return read_current(path, self.read)
+        return read_current(self.folder / CURRENT_FILE, self.read)
 
     def close(self) -> None:
         """Release what is open."""

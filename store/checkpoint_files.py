@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import errno
+import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +13,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from store.archive import Files
-from store.chunks import LARGEST_DESCRIPTION, ArrayFiles, file_digests, most_bytes
-from store.content import GROUP_VERSION, ArrayContent, read_content
+from store.chunks import (
+    GROUP_VERSION,
+    LARGEST_DESCRIPTION,
+    ArrayContent,
+    ArrayFiles,
+    file_digests,
+    most_bytes,
+    read_content,
+)
 from store.encoding import array_digest
 from store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from store.files import remove_tree, replacing, sync_folder
-from store.late import HeldFiles, LateArray
 from store.layout import PARTIAL, checkpoint_path
-from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json, json_digest
+from store.log_file import LogFile
+from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, LateArray, from_json, json_digest
 
 if TYPE_CHECKING:
     import zarr
@@ -42,7 +50,7 @@ class Draft:
     arrays: Mapping[str, np.ndarray]
     last_sequence: int
     attributes: str
-    level: int = QUICK
+    level: int
 
 
 def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> str:
@@ -133,13 +141,13 @@ class CheckpointReader:
     """
 
     def __init__(self, path: Path, files: Files) -> None:
-        self._path, self._files, self._known = path, files, _read_description(path, files)
-        self.number: int = self._known["number"]
-        self.last_sequence: int = self._known["last_sequence"]
-        self.sha256: str = self._known["sha256"]
-        self.attributes: Mapping[str, JSON] = self._known["attributes"]
-        self.identity: Mapping[str, JSON] = self._known["identity"]
-        self._described = read_content(self._known)
+        self._path, self._files = path, files
+        known, self._described = _read_description(path, files)
+        self.number: int = known["number"]
+        self.last_sequence: int = known["last_sequence"]
+        self.sha256: str = known["sha256"]
+        self.attributes: Mapping[str, JSON] = known["attributes"]
+        self.identity: Mapping[str, JSON] = known["identity"]
         try:
             room = most_bytes(files.sizes(path))
         except OSError as error:
@@ -161,16 +169,19 @@ class CheckpointReader:
         return {name: self._late(name) for name in self._described if name in names}
 
     def _late(self, name: str) -> LateArray:
-        content, held = self._described[name], HeldFiles()
-        with self._naming(name):
+        content, held = self._described[name], dict[Path, LogFile]()
+        with self._naming(name), ExitStack() as opened:
             for _, path, _ in ArrayFiles(self._path, name, content, self._files.read).verified():
-                held.hold(path, self._files.open_log(path))
+                held[path] = self._files.open_log(path)
+                opened.callback(held[path].close)
             text = self._files.read(self._path / name / "zarr.json", LARGEST_DESCRIPTION)
 
-        def read(path: Path, limit: int) -> bytes:
-            return text if path.name == "zarr.json" else held.read(path, limit)
+            def read(path: Path, limit: int) -> bytes:
+                return text if path.name == "zarr.json" else held[path].read_whole(limit)
 
-        return LateArray(content.dtype, content.shape, lambda: self._array(name, read=read))
+            late = LateArray(content.dtype, content.shape, lambda: self._array(name, read=read))
+            weakref.finalize(late, opened.pop_all().close)
+        return late
 
     def damage(self) -> Iterator[DamageError]:
         """Yield what is wrong with the arrays, array by array; nothing where all verifies."""
@@ -220,7 +231,7 @@ def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
     return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
 
 
-def _read_description(path: Path, files: Files) -> dict[str, Any]:
+def _read_description(path: Path, files: Files) -> tuple[dict[str, Any], dict[str, ArrayContent]]:
     header = path / "zarr.json"
     try:
         known = _read_attributes(header, files)
@@ -234,7 +245,7 @@ def _read_description(path: Path, files: Files) -> dict[str, Any]:
             f"what {header} says of its checkpoint is not what was written: its sha256 differs", path=header
         )
     try:
-        read_content(known)
+        described = read_content(known)
         if known["format"] > GROUP_VERSION:
             raise VersionError(
                 f"{path} is written in format {known['format']}; this release reads checkpoints up to format "
@@ -243,7 +254,7 @@ def _read_description(path: Path, files: Files) -> dict[str, Any]:
         _require_described(known)
     except ValueError as error:
         raise _unreadable(error, f"a checkpoint in {header}", header) from error
-    return known | {"sha256": stored}
+    return known | {"sha256": stored}, described
 
 
 def _require_described(known: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The checkpoints of an open store: which one is read, how a new one is committed, and how a base takes rows' place."""
+"""The checkpoints of an open store: which one is read, how one is committed, and how one takes the place of rows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pathlib import Path
 from store.archive import Files
 from store.checkpoint_files import CheckpointReader, Draft, write_checkpoint
 from store.derived import read_derived, remove_derived, write_derived
-from store.exceptions import DamageError, StoreError, reported
+from store.encoding import check_arrays
+from store.exceptions import DamageError, RecordError, StoreError, reported
 from store.files import remove_tree
 from store.journal import Journal
 from store.layout import (
@@ -29,7 +30,7 @@ from store.layout import (
 )
 from store.log import LogReader, Place
 from store.log_writer import create_log
-from store.records import Checkpoint, to_json
+from store.records import Arrays, Attributes, Checkpoint, to_json
 from store.row_encoding import HEAD_BYTES, ROW, row_sequence
 
 __all__ = ["Checkpoints", "read_back"]
@@ -65,9 +66,9 @@ class Checkpoints:
                     logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
         return None
 
-    def base(self) -> Checkpoint | None:
+    def compaction(self) -> Checkpoint | None:
         """Return the checkpoint that stands for the compacted rows, None when there are none."""
-        while (named := self._journal.current().base) is not None:
+        while (named := self._journal.current().compaction) is not None:
             try:
                 return self._load(named)
             except DamageError:
@@ -125,6 +126,19 @@ class Checkpoints:
             self._journal.keep_index()
             return named.number
 
+    def draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int) -> Draft:
+        """Return what is to become a checkpoint, once all of it can be kept. Raises RecordError, StoreError."""
+        # The rows of a batch may yet be rolled back.
+        self._journal.refuse_in_batch("committing a checkpoint")
+        first, last = self._journal.current().compacted, self._journal.last()
+        if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
+            # Recovery could not resume among the compacted rows, which have given up their arrays.
+            raise RecordError(
+                f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
+                f"there is, not {last_sequence!r}"
+            )
+        return Draft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
+
     def _write(self, draft: Draft, place: Place) -> NamedCheckpoint:
         number = self._next(numbers(self._folder, unfinished=True))
         sha256 = write_checkpoint(self._folder, number, draft, self._journal.identity)
@@ -137,7 +151,7 @@ class Checkpoints:
         return number
 
     def compact(self, draft: Draft, newest: Draft | None) -> None:
-        """Commit a base, and a log in which the rows that it stands for have no arrays; all is read back before."""
+        """Commit a compaction checkpoint and a log in which its rows have no arrays; all is read back before."""
         with self._committing:
             with self._journal.switching():
                 number = self._next(log_numbers(self._folder, unfinished=True))

@@ -20,7 +20,7 @@ from store.files import is_real_folder, new_file, read_regular, remove_tree
 from store.layout import DERIVED, NEW
 from store.records import JSON, from_json, payload_digest
 
-__all__ = ["read_derived", "remove_derived", "write_derived"]
+__all__ = ["read_derived", "remove_derived", "without_digest", "write_derived", "write_digested"]
 
 logger = logging.getLogger(__name__)
 
@@ -38,14 +38,24 @@ def write_derived(folder: Path, name: str, follows: str, attributes: str, arrays
     """
     about = attributes.encode("ascii")
     head = HEADER.pack(MARK, bytes.fromhex(follows), len(about))
-    data = b"".join((head, about, encode_payload(arrays, sparingly=True)))
-    path = folder / DERIVED / name
+    write_digested(folder / DERIVED / name, b"".join((head, about, encode_payload(arrays, sparingly=True))))
+
+
+def write_digested(path: Path, data: bytes) -> None:
+    """Put a file with a digest behind its bytes in the place of the one before, not durably. Raises OSError."""
     path.parent.mkdir(exist_ok=True)
     draft = path.with_name(path.name + NEW)
     with new_file(draft) as file:
         file.write(data)
         file.write(payload_digest(data))
     draft.replace(path)
+
+
+def without_digest(data: bytes) -> bytes:
+    """Return the bytes before the digest; raise ValueError where that differs."""
+    if payload_digest(data[:-DIGEST_BYTES]) != data[-DIGEST_BYTES:]:
+        raise ValueError("its digest differs")
+    return data[:-DIGEST_BYTES]
 
 
 def remove_derived(folder: Path) -> None:
@@ -64,11 +74,10 @@ def read_derived(folder: Path, name: str, follows: str) -> tuple[Mapping[str, JS
         mark, of, size = HEADER.unpack_from(data)
         if mark != MARK or of.hex() != follows:
             raise ValueError("it is of another checkpoint")
-        if payload_digest(data[:-DIGEST_BYTES]) != data[-DIGEST_BYTES:]:
-            raise ValueError("its digest differs")
+        data = without_digest(data)
         begin = HEADER.size + size
         about = from_json(data[HEADER.size : begin].decode("ascii"))
-        return about, decode_payload(data[begin:-DIGEST_BYTES])
+        return about, decode_payload(data[begin:])
     except FileNotFoundError:
         return None
     except (DamageError, VersionError, OSError, ValueError, MemoryError, struct.error) as error:

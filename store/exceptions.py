@@ -6,7 +6,7 @@ Exception
     ├── NotAStoreError     the path holds no store: give another path, or an identity to create one
     ├── VersionError       a newer release wrote it: upgrade; nothing was touched
     ├── DamageError        bytes on the disk are not those that were written: repair_store keeps what verifies
-    ├── CompactedError     compaction gave up this row's arrays: resume from the base
+    ├── CompactedError     compaction gave up this row's arrays: resume from the compaction checkpoint
     ├── StoreFullError     no space is left: free some and call again; nothing acknowledged is lost
     ├── ReadOnlyError      the store, or its folder, may not be written from here
     ├── StoreClosedError   the store was closed, or belongs to the process that forked this one
@@ -121,14 +121,10 @@ def reported(path: Path, doing: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise _from_system(error, path, doing) from error
-
-
-def _from_system(error: OSError, path: Path, doing: str) -> StoreError:
-    """Return the StoreError for a failed system call."""
-    where = Path(error.filename) if isinstance(error.filename, str) else path
-    if error.errno in FULL:
-        return StoreFullError(f"no space left for {where} while {doing}: free some space and call again")
-    if error.errno in FORBIDDEN:
-        return ReadOnlyError(f"{where} is not open to this user while {doing} ({error.strerror})")
-    return StoreError(f"{where}: {error.strerror or error} while {doing}")
+        where = Path(error.filename) if isinstance(error.filename, str) else path
+        if error.errno in FULL:
+            full = f"no space left for {where} while {doing}: free some space and call again"
+            raise StoreFullError(full) from error
+        if error.errno in FORBIDDEN:
+            raise ReadOnlyError(f"{where} is not open to this user while {doing} ({error.strerror})") from error
+        raise StoreError(f"{where}: {error.strerror or error} while {doing}") from error

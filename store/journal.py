@@ -10,21 +10,15 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from store.archive import Files
-from store.encoding import decode_payload
+from store.encoding import check_arrays, encode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
 from store.files import sync_folder
 from store.layout import CURRENT_FILE, Current, log_path, write_current
 from store.log import Place
 from store.log_writer import LogWriter
 from store.open_log import OpenLog
-from store.records import JSON, Head, Record
-from store.row_encoding import (
-    ROW,
-    decode_row,
-    encode_row,
-    head_without_arrays,
-    key_prefix,
-)
+from store.records import JSON, Arrays, Attributes, Head, check_key, check_text, check_time, from_json, to_json
+from store.row_encoding import ROW, encode_row, head_without_arrays, key_prefix
 
 __all__ = ["Journal"]
 
@@ -151,10 +145,10 @@ class Journal:
     def batch(self) -> Iterator[None]:
         """Make the rows inserted in the block durable together, at its end, or none of them.
 
-        Other threads wait for the end. After a failed insert the rest of the block's are refused.
+        Other threads wait for the end. After a failed insert the rest of the block's are refused. The caller has asked
+        `refuse_in_batch`.
         """
         with self._guard:
-            self.refuse_in_batch("beginning a batch")
             at, writer = self._writing("beginning a batch")
             self._batch, self._failed = True, False
             try:
@@ -181,18 +175,25 @@ class Journal:
             assert isinstance(at.log, LogWriter), "a store that is read refuses before"
             return at, at.log
 
-    def insert(self, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes) -> int:
-        """Add a row and return its sequence once it is durable, or, in a batch, once it is written.
+    def insert(
+        self, kind: str, label: str, key: bytes, time: float, attributes: Attributes, arrays: Arrays | None
+    ) -> Head:
+        """Add a row and return its head once it is durable, or, in a batch, once it is written.
 
-        After any error the row is not there, nor any other of its batch.
+        Raises RecordError for what cannot be kept. After any other error neither the row nor any of its batch is there.
         """
+        check_text("the kind", kind)
+        check_text("the label", label)
+        check_key(key)
+        seconds, text = check_time(time), to_json("attributes", attributes)
+        payload = encode_payload(check_arrays(arrays))
         with self._guard:
             at, writer = self._writing("appending a row")
             if self._batch and self._failed:
                 raise StoreError(f"nothing more can be appended to {self.folder} in this batch: a row of it failed")
             if (sequence := at.last + 1) > LAST_SEQUENCE:
                 raise DamageError(f"{at.path} has a row, or a checkpoint, of number {at.last}", path=at.path)
-            data = encode_row(sequence, kind, label, key, time, attributes, payload, len(payload))
+            data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
             try:
                 frame = writer.stage(ROW, data)
                 at.rows.append(sequence, frame.offset, frame.size, key_prefix(key))
@@ -205,7 +206,7 @@ class Journal:
                 raise
             if not self._batch:
                 self._note_first(at)
-            return sequence
+        return Head(sequence, kind, label, key, seconds, from_json(text), len(payload))
 
     def _note_first(self, at: OpenLog) -> None:
         """Have `CURRENT` say that the log has rows, as soon as that is so: without any it would look like a new one."""
@@ -231,7 +232,7 @@ class Journal:
         """Yield the verified rows behind `after` up to `last`, of one kind or label only where it is given.
 
         arrays: as records, one in memory at a time. Raises DamageError at the first that is not as it was written,
-        or that is missing itself where all are asked for; CompactedError where a base has the arrays' place.
+        or that is missing itself where all are asked for; CompactedError where compaction gave the arrays up.
         """
         chosen, begin = kind is not None or label is not None, after
         while after < last:
@@ -243,10 +244,10 @@ class Journal:
                     if chosen:
                         at.tell_damage()
                     else:
-                        self._require_no_gap(at, after, min(found - 1, last), index)
+                        at.require_no_gap(after, min(found - 1, last), index)
                     if found > last:
                         break
-                    head = self._record(at, index) if arrays else self._head(at, index)
+                    head = at.row(index, arrays=arrays)
                 except DamageError as damage:
                     if at.drop_index():
                         continue
@@ -266,39 +267,6 @@ class Journal:
             for damage in at.rows.damage.get(len(at.rows), ()) if last >= at.last else ():
                 if damage.offset is not None and begin <= damage.offset < end:
                     raise DamageError(f"{damage}: repair the store (repair_store)", path=at.path)
-
-    def _require_no_gap(self, at: OpenLog, after: int, through: int, index: int) -> None:
-        why = at.rows.damage.get(index)
-        # Up to the base a repair may have left some out.
-        first = 1 + (after if why is not None else max(after, at.current.compacted))
-        if first > through:
-            return
-        missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
-        raise self._damage(at, f"{missing}{'' if why is None else f' ({why[0]})'} from", through)
-
-    def _head(self, at: OpenLog, index: int) -> Head:
-        sequence = at.rows.sequences[index]
-        try:
-            head = at.head(index)
-            if head.sequence != sequence:
-                raise ValueError(f"it has the number {head.sequence}")
-        except ValueError as error:
-            raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
-        return head
-
-    def _record(self, at: OpenLog, index: int) -> Record:
-        sequence = at.rows.sequences[index]
-        try:
-            row = decode_row(at.data(index))
-            if row.head.sequence != sequence:
-                raise ValueError(f"it has the number {row.head.sequence}")
-            if row.payload is None:
-                if sequence <= at.current.compacted:
-                    raise self.given_up(sequence)
-                raise ValueError("its arrays are missing")
-            return Record(**vars(row.head), arrays=decode_payload(row.payload))
-        except (DamageError, ValueError) as error:
-            raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
 
     def with_key(self, key: bytes) -> Iterator[Head]:
         """Yield the rows of a key, but for damaged ones, which a logged warning names."""
@@ -320,24 +288,9 @@ class Journal:
             at.keep_index()
 
     def given_up(self, sequence: int) -> CompactedError:
-        """Return the error for a row whose arrays a base stands for."""
-        with self._using("looking for a base") as at:
-            compacted = at.current.compacted
-        return CompactedError(
-            f"the arrays of row {sequence} of {self.folder} were given up when rows 1 to {compacted} were compacted"
-        )
-
-    @staticmethod
-    def _damage(at: OpenLog, what: str, sequence: int) -> DamageError:
-        named = next((named for named in at.current.checkpoints if named.last_sequence >= sequence), None)
-        still = "no checkpoint contains it"
-        if named is not None:
-            still = f"checkpoint {named.number} (up to row {named.last_sequence}) still contains it"
-        return DamageError(
-            f"{what} {at.path}; {still}; records(after={sequence}) continues behind it",
-            path=at.path,
-            sequence=sequence,
-        )
+        """Return the error for a row whose arrays a compaction checkpoint stands for."""
+        with self._using("looking for compacted rows") as at:
+            return at.given_up(sequence)
 
     def payloads(self, last_sequence: int) -> Iterator[bytes]:
         """Yield the bytes of each row, in order, those up to `last_sequence` without their arrays, which are not read.
@@ -349,11 +302,8 @@ class Journal:
             for damage in at.rows.damage.values():
                 raise DamageError(f"{damage[0]}: repair the store (repair_store)", path=at.path)
             for index, sequence in enumerate(at.rows.sequences):
-                head = self._head(at, index)
-                try:
-                    yield head_without_arrays(head) if sequence <= last_sequence else at.data(index)
-                except DamageError as error:
-                    raise self._damage(at, f"row {sequence} is not as it was written ({error}) in", sequence) from error
+                head = at.row(index, arrays=False)
+                yield head_without_arrays(head) if sequence <= last_sequence else at.data(index)
 
     @contextmanager
     def switching(self) -> Iterator[None]:

@@ -6,17 +6,15 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing, sync_folder
+from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
 from store.framing import IDENTITY_BYTES
-from store.lock import HOLDER_FILE, LOCK_FILE, WriterLock
 from store.log import LogReader, Place
-from store.log_writer import create_log
 from store.records import LARGEST_NUMBER, from_json, json_digest
 
 __all__ = [
@@ -24,6 +22,8 @@ __all__ = [
     "CURRENT_FILE",
     "DAMAGED",
     "DERIVED",
+    "HOLDER_FILE",
+    "LOCK_FILE",
     "LOG",
     "PARTIAL",
     "Current",
@@ -31,7 +31,6 @@ __all__ = [
     "checkpoint_path",
     "holds_store",
     "is_number",
-    "lock_to_write",
     "log_numbers",
     "log_path",
     "numbers",
@@ -48,7 +47,9 @@ LOG = "log-"
 CHECKPOINTS = "checkpoints"
 DERIVED = "derived"  # what follows from the rest, and can be deleted
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
+LOCK_FILE, HOLDER_FILE = "lock", "holder.json"
 LEGACY_FILE = "journal.sqlite"  # of releases 0.x
+OURS = (LOG, CURRENT_FILE, HOLDER_FILE)  # how the names of files begin
 
 LARGEST_CURRENT = 2**16  # bytes, of which it has some hundreds
 MOST_DIGITS = 18  # of a number in a name, so that there is room for those after it
@@ -87,26 +88,26 @@ class Current:
     """What makes up a store at one moment.
 
     log: the number of the log, and log_identity what all frames of it carry. newest: the checkpoint to begin with.
-    base: the one that stands for the rows that gave up their arrays; it may be the same. None where there is none.
+    compaction: the one that stands for rows that gave up their arrays; it may be the same. None where there is none.
     last: a row that the log has had; one that ends before it was cut off. 0 where nothing is known.
     """
 
     log: int
     log_identity: bytes
     newest: NamedCheckpoint | None = None
-    base: NamedCheckpoint | None = None
+    compaction: NamedCheckpoint | None = None
     last: int = 0
 
     @property
     def checkpoints(self) -> list[NamedCheckpoint]:
-        """The newest and the base, each once."""
-        named = [named for named in (self.newest, self.base) if named is not None]
+        """The newest and the compaction checkpoint, each once."""
+        named = [named for named in (self.newest, self.compaction) if named is not None]
         return named[:1] if len(named) > 1 and named[0].number == named[1].number else named
 
     @property
     def compacted(self) -> int:
-        """The last row that gave up its arrays for the base, 0 without one."""
-        return 0 if self.base is None else self.base.last_sequence
+        """The last row that gave up its arrays for the compaction checkpoint, 0 without one."""
+        return 0 if self.compaction is None else self.compaction.last_sequence
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the file."""
@@ -114,7 +115,7 @@ class Current:
             "format": FORMAT_VERSION,
             "log": [self.log, self.log_identity.hex()],
             "newest": None if self.newest is None else self.newest.to_json(),
-            "base": None if self.base is None else self.base.to_json(),
+            "compaction": None if self.compaction is None else self.compaction.to_json(),
             "last": self.last,
         }
         return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
@@ -132,19 +133,16 @@ class Current:
                     "upgrade it, or open the store with the release that wrote it; nothing was changed"
                 )
             number, identity = known["log"]
-            newest, base = (None if known[name] is None else NamedCheckpoint.from_json(known[name]) for name in NAMES)
+            newest, compaction = (
+                None if known[name] is None else NamedCheckpoint.from_json(known[name])
+                for name in ("newest", "compaction")
+            )
+            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
+                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
             last = _count(known.get("last", 0))
-            current = cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, base, last)
-            if current.base is not None and (
-                current.newest is None or current.newest.last_sequence < current.base.last_sequence
-            ):
-                raise ValueError("its base is newer than its newest checkpoint")
+            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, last)
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
-        return current
-
-
-NAMES = ("newest", "base")
 
 
 def _not_as_written(path: Path, error: Exception) -> DamageError:
@@ -204,19 +202,19 @@ def is_number(stem: str) -> bool:
 def log_numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
     """Return the numbers of the logs in a store's folder, ascending; finished ones unless told otherwise."""
     stems = (entry.name.removeprefix(LOG) for entry in folder.iterdir() if entry.name.startswith(LOG))
-    return sorted(
-        {int(stem) for stem in (stem.removesuffix(NEW) if unfinished else stem for stem in stems) if is_number(stem)}
-    )
+    return _numbers(stems, NEW if unfinished else "")
 
 
 def numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
     """Return the numbers of the checkpoints in a store's folder, ascending; finished ones unless told otherwise."""
     parent = folder / CHECKPOINTS
-    if not is_real_folder(parent):
-        return []
-    names = (entry.name for entry in parent.iterdir())
-    stems = {name.removesuffix(PARTIAL) if unfinished else name for name in names}
-    return sorted(int(stem) for stem in stems if is_number(stem))
+    entries = parent.iterdir() if is_real_folder(parent) else ()
+    return _numbers((entry.name for entry in entries), PARTIAL if unfinished else "")
+
+
+def _numbers(names: Iterable[str], suffix: str) -> list[int]:
+    stems = {name.removesuffix(suffix) for name in names}
+    return sorted({int(stem) for stem in stems if is_number(stem)})
 
 
 def holds_store(folder: Path) -> bool:
@@ -236,38 +234,11 @@ def holds_store(folder: Path) -> bool:
             read_current(folder / CURRENT_FILE)
             return True
         except FileNotFoundError:
-            pass
-        _refuse_foreign(folder)
-        # Another process may have made the store since.
-        return os.path.lexists(folder / CURRENT_FILE)
+            return _was_made_since(folder)
 
 
-def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
-    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
-
-    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
-    """
-    with reported(folder, "making the folder"):
-        if not folder.is_dir():
-            folder.mkdir(parents=True, exist_ok=True)
-            sync_folder(folder.parent)
-    require_unshared(folder)
-    lock = WriterLock(folder)
-    try:
-        # Asked again, under the lock: another writer may have made the store, and left, since.
-        if not holds_store(folder):
-            if identity is None:
-                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
-            with reported(folder, "making the store"):
-                write_current(folder, Current(1, create_log(log_path(folder, 1), identity.encode())))
-                sync_folder(folder.parent)
-    except BaseException:
-        lock.release()
-        raise
-    return lock
-
-
-def _refuse_foreign(folder: Path) -> None:
+def _was_made_since(folder: Path) -> bool:
+    """Return whether another process made the store meanwhile; raise where something else is in the folder."""
     if (folder / LEGACY_FILE).exists():
         raise VersionError(
             f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
@@ -278,18 +249,21 @@ def _refuse_foreign(folder: Path) -> None:
     traces += [log_path(folder, number).name for number in log_numbers(folder) if number > 1 or _has_batches(folder)]
     traces += [entry.name for entry in folder.iterdir() if DAMAGED in entry.name]
     if os.path.lexists(folder / CURRENT_FILE):
-        return
+        return True
     if traces:
         raise DamageError(
             f"{folder} has {' and '.join(sorted(traces))} but no {CURRENT_FILE}: put it back from a copy, or repair "
             "the store (repair_store), which finds what it named",
             path=folder / CURRENT_FILE,
         )
-    if foreign := sorted(entry.name for entry in folder.iterdir() if not _may_be_ours(entry.name)):
+    ours = (LOCK_FILE, CHECKPOINTS, DERIVED)
+    names = sorted(entry.name for entry in folder.iterdir())
+    if foreign := [name for name in names if not name.startswith(OURS) and name not in ours]:
         raise NotAStoreError(
             f"{folder} holds no store but other things ({', '.join(foreign[:3])}"
             f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
         )
+    return os.path.lexists(folder / CURRENT_FILE)
 
 
 def _has_batches(folder: Path) -> bool:
@@ -299,10 +273,6 @@ def _has_batches(folder: Path) -> bool:
             return any(True for _ in log.refresh())
     except DamageError:
         return True
-
-
-def _may_be_ours(name: str) -> bool:
-    return name.startswith((LOG, CURRENT_FILE, HOLDER_FILE)) or name in (LOCK_FILE, CHECKPOINTS, DERIVED)
 
 
 def unsafe_entries(folder: Path) -> Iterator[DamageError]:
@@ -325,7 +295,11 @@ def require_unshared(folder: Path) -> None:
     """Raise DamageError where a file that is written in place has another name: writing would change that too."""
     with reported(folder, "looking for what may be written"):
         for path, is_ours in _named_as_ours(folder) if folder.is_dir() else ():
-            if is_ours and path.parent == folder and _names(path) > 1:
+            try:
+                status = path.lstat()
+            except FileNotFoundError:  # another process may have written it and moved it
+                continue
+            if is_ours and path.parent == folder and stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
                 raise DamageError(
                     f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
                     'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
@@ -333,21 +307,12 @@ def require_unshared(folder: Path) -> None:
                 )
 
 
-def _names(path: Path) -> int:
-    """How many names a file has; 0 where it is none, or is gone: another process may have written it and moved it."""
-    try:
-        status = path.lstat()
-    except FileNotFoundError:
-        return 0
-    return status.st_nlink if stat.S_ISREG(status.st_mode) else 0
-
-
 def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.name in (CHECKPOINTS, DERIVED):
                 yield Path(entry.path), entry.is_dir(follow_symlinks=False)
-            elif entry.name.startswith((LOG, CURRENT_FILE, HOLDER_FILE)) or entry.name == LOCK_FILE:
+            elif entry.name.startswith(OURS) or entry.name == LOCK_FILE:
                 yield Path(entry.path), entry.is_file(follow_symlinks=False)
     if is_real_folder(folder / CHECKPOINTS):
         with os.scandir(folder / CHECKPOINTS) as entries:
@@ -361,15 +326,11 @@ def remove_unnamed(folder: Path, current: Current) -> None:
 
     What does not carry a name of ours is left alone.
     """
+    kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
+    found = [(log_path(folder, number), NEW) for number in log_numbers(folder, unfinished=True)]
+    found += [(checkpoint_path(folder, number), PARTIAL) for number in numbers(folder, unfinished=True)]
     remove_tree(folder / (CURRENT_FILE + NEW))
-    for number in log_numbers(folder, unfinished=True):
-        path = log_path(folder, number)
-        if number != current.log:
+    for path, suffix in found:
+        if path not in kept:
             remove_tree(path)
-        remove_tree(path.with_name(path.name + NEW))
-    kept = {named.number for named in current.checkpoints}
-    for number in numbers(folder, unfinished=True):
-        path = checkpoint_path(folder, number)
-        if number not in kept:
-            remove_tree(path)
-        remove_tree(path.with_name(path.name + PARTIAL))
+        remove_tree(path.with_name(path.name + suffix))

@@ -11,16 +11,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from store.exceptions import DamageError, LockedError, StoreError, reported
-from store.files import new_file, read_regular
+from store.exceptions import DamageError, LockedError, NotAStoreError, StoreError, reported
+from store.files import new_file, read_regular, sync_folder
+from store.layout import HOLDER_FILE, LOCK_FILE, Current, holds_store, log_path, require_unshared, write_current
+from store.log_writer import create_log
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-__all__ = ["HOLDER_FILE", "LOCK_FILE", "WriterLock"]
+__all__ = ["WriterLock", "lock_to_write"]
 
-LOCK_FILE = "lock"
-HOLDER_FILE = "holder.json"
 LARGEST_NOTE = 4096  # bytes
 
 WITHOUT_LOCKS = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})
@@ -88,3 +88,28 @@ class WriterLock:
             with suppress(OSError):
                 (self._folder / HOLDER_FILE).unlink(missing_ok=True)
             self._lock.release()
+
+
+def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
+    """Return the writer's lock on a folder that then holds a store, made with this identity where there was none.
+
+    Raises LockedError, NotAStoreError where there is none and no identity, and what else `Store.open` raises.
+    """
+    with reported(folder, "making the folder"):
+        if not folder.is_dir():
+            folder.mkdir(parents=True, exist_ok=True)
+            sync_folder(folder.parent)
+    require_unshared(folder)
+    lock = WriterLock(folder)
+    try:
+        # Asked again, under the lock: another writer may have made the store, and left, since.
+        if not holds_store(folder):
+            if identity is None:
+                raise NotAStoreError(f"{folder} holds no store; give an identity to make one")
+            with reported(folder, "making the store"):
+                write_current(folder, Current(1, create_log(log_path(folder, 1), identity.encode())))
+                sync_folder(folder.parent)
+    except BaseException:
+        lock.release()
+        raise
+    return lock

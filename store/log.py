@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 from store.exceptions import DamageError, StoreError, VersionError, reported
@@ -25,7 +24,7 @@ from store.framing import (
     pack_frame,
     read_frame,
 )
-from store.log_file import PART, LogFile, Window
+from store.log_file import LogFile, Window, frames_behind
 from store.records import LARGEST_NUMBER, payload_digest
 
 __all__ = ["LogReader", "Place"]
@@ -244,30 +243,17 @@ class LogReader:
                 return commit  # as it was: all of its batch is there but for this frame
             with suppress(DamageError):
                 return self._commit_before(self.durable)
-        proofs = (frame for frame in self._frames(torn.offset) if not torn.can_be_torn_before(frame))
-        self._proved = next(proofs, None)
+        behind = frames_behind(self._file, torn.offset, self._mark)
+        self._proved = next((frame for frame in behind if not torn.can_be_torn_before(frame)), None)
         return self._proved
-
-    def _frames(self, offset: int) -> Iterator[Frame]:
-        """Yield the frames of this log whose first bytes verify, found by their marks, wherever they begin."""
-        size = self._file.size()
-        while offset < size:
-            data = self._file.read(offset, PART + FRAME_BYTES - 1)
-            found = data.find(self._mark)
-            while 0 <= found < PART:
-                frame = read_frame(data[found : found + FRAME_BYTES], offset + found)
-                if frame is not None:
-                    yield frame
-                found = data.find(self._mark, found + 1)
-            offset += PART
 
     def resume(self) -> None:
         """Go on behind the damaged frame that `refresh` named, at the next that can be found; the rest is lost."""
         if (torn := self._torn) is None:
             return
         with reported(self.path, "looking for a frame behind damage"):
-            behind = (frame for frame in self._frames(torn.offset) if torn.is_before(frame))
-            if (frame := next(behind, None)) is None:
+            behind = frames_behind(self._file, torn.offset, self._mark)
+            if (frame := next(filter(torn.is_before, behind), None)) is None:
                 raise self._damage("holds no frame behind the damage", torn.offset, torn.number)
             self.place = Place(frame.offset, frame.number, frame.batch, frame.previous)
             self._last, self._torn = self._first, None
@@ -331,7 +317,5 @@ class LogReader:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

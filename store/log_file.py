@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 import threading
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 from store.encoding import RATIO, SPARE
 from store.exceptions import DamageError, StoreClosedError, reported
 from store.files import open_regular
-from store.framing import FRAME_BYTES, MARK, read_frame
+from store.framing import FRAME_BYTES, MARK, Frame, read_frame
 
-__all__ = ["PART", "LogFile", "Window", "find_identity"]
+__all__ = ["PART", "LogFile", "Window", "find_identity", "frames_behind"]
 
 PART = 2**18  # bytes that are read at once
 BLOCK = 512  # bytes, of st_blocks
@@ -49,6 +51,12 @@ class LogFile:
                 part = os.read(self.descriptor, size - len(data))
                 data += part
             return data
+
+    def read_whole(self, limit: int) -> bytes:
+        """Return all bytes, of which there are at most `limit`. Raises DamageError where there are more."""
+        if (size := self.size()) > limit:
+            raise DamageError(f"{self.path} has {size} bytes; at most {limit} are read there", path=self.path)
+        return self.read(0, size)
 
     def write(self, offset: int, data: bytes | bytearray) -> None:
         """Write all bytes at an offset, in one call unless the system takes fewer."""
@@ -107,21 +115,22 @@ class Window:
         return digest.digest()
 
 
+def frames_behind(file: LogFile, offset: int, mark: bytes = MARK) -> Iterator[Frame]:
+    """Yield the frames whose first bytes verify, found by what they begin with, wherever they are."""
+    size = file.size()
+    for start in range(offset, size, PART):
+        data = file.read(start, PART + FRAME_BYTES - 1)
+        found = data.find(mark)
+        while 0 <= found < PART:
+            if (frame := read_frame(data[found : found + FRAME_BYTES], start + found)) is not None:
+                yield frame
+            found = data.find(mark, found + 1)
+
+
 def find_identity(file: LogFile) -> bytes | None:
     """Return the identity that the frames of a log carry, by the first of them that can be found; None without one.
 
     The file is closed.
     """
-    with reported(file.path, "looking for frames"):
-        try:
-            for offset in range(0, file.size(), PART):
-                data = file.read(offset, PART + FRAME_BYTES - 1)
-                found = data.find(MARK)
-                while 0 <= found < PART:
-                    frame = read_frame(data[found : found + FRAME_BYTES], offset + found)
-                    if frame is not None:
-                        return frame.identity
-                    found = data.find(MARK, found + 1)
-        finally:
-            file.close()
-    return None
+    with closing(file), reported(file.path, "looking for frames"):
+        return next((frame.identity for frame in frames_behind(file, 0)), None)

@@ -6,13 +6,14 @@ import logging
 from bisect import bisect_right
 
 from store.archive import Files
-from store.exceptions import DamageError
+from store.encoding import decode_payload
+from store.exceptions import CompactedError, DamageError
 from store.files import sync_folder
 from store.layout import Current, log_path
 from store.log import LogReader, Place
 from store.log_writer import LogWriter
-from store.records import JSON, Head, from_json
-from store.row_encoding import decode_head
+from store.records import JSON, Head, Record, from_json
+from store.row_encoding import decode_head, decode_row
 from store.rows import EVERY, Index, Rows, head_bytes
 
 __all__ = ["OpenLog"]
@@ -156,11 +157,60 @@ class OpenLog:
             except OSError as error:
                 logger.warning("%s: the index of rows could not be written: %s", self.path, error)
 
-    def head(self, index: int) -> Head:
-        """Return the head of a row. Raises DamageError, and ValueError for what is none."""
-        size = self.rows.sizes[index]
-        return decode_head(head_bytes(self.log, self.rows.offsets[index], size), size)
-
     def data(self, index: int) -> bytes:
         """Return the bytes of a row, verified. Raises DamageError."""
-        return self.log.read(self.rows.offsets[index], self.rows.sizes[index])[1]
+        try:
+            return self.log.read(self.rows.offsets[index], self.rows.sizes[index])[1]
+        except DamageError as error:
+            raise self._not_as_written(index, error) from error
+
+    def row(self, index: int, *, arrays: bool) -> Head:
+        """Return a row, verified; arrays: as a record. Raises DamageError, and CompactedError for compacted arrays."""
+        sequence, size = self.rows.sequences[index], self.rows.sizes[index]
+        try:
+            if arrays:
+                head, payload = decode_row(self.log.read(self.rows.offsets[index], size)[1])
+            else:
+                head, payload = decode_head(head_bytes(self.log, self.rows.offsets[index], size), size), None
+            if head.sequence != sequence:
+                raise ValueError(f"it has the number {head.sequence}")
+            if not arrays:
+                return head
+            if payload is None and sequence <= self.current.compacted:
+                raise self.given_up(sequence)
+            if payload is None:
+                raise ValueError("its arrays are missing")
+            return Record(**vars(head), arrays=decode_payload(payload))
+        except (DamageError, ValueError) as error:
+            raise self._not_as_written(index, error) from error
+
+    def require_no_gap(self, after: int, through: int, index: int) -> None:
+        """Raise DamageError where rows behind `after` are missing, up to `through`, before that of an index."""
+        why = self.rows.damage.get(index)
+        # Of compacted ones a repair may have left some out.
+        first = 1 + (after if why is not None else max(after, self.current.compacted))
+        if first <= through:
+            missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
+            raise self._damage(f"{missing}{'' if why is None else f' ({why[0]})'} from", through)
+
+    def given_up(self, sequence: int) -> CompactedError:
+        """Return the error for a row whose arrays a compaction checkpoint stands for."""
+        return CompactedError(
+            f"records 1 to {self.current.compacted} of {self._files.folder} gave up their arrays when it was compacted "
+            f"(row {sequence}, too): begin with compaction(), and continue behind its last_sequence"
+        )
+
+    def _not_as_written(self, index: int, error: Exception) -> DamageError:
+        sequence = self.rows.sequences[index]
+        return self._damage(f"row {sequence} is not as it was written ({error}) in", sequence)
+
+    def _damage(self, what: str, sequence: int) -> DamageError:
+        named = next((named for named in self.current.checkpoints if named.last_sequence >= sequence), None)
+        still = "no checkpoint contains it"
+        if named is not None:
+            still = f"checkpoint {named.number} (up to row {named.last_sequence}) still contains it"
+        return DamageError(
+            f"{what} {self.path}; {still}; records(after={sequence}) continues behind it",
+            path=self.path,
+            sequence=sequence,
+        )

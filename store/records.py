@@ -5,23 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from store.exceptions import RecordError
 
-if TYPE_CHECKING:
-    from store.late import LateArray
-
 __all__ = [
     "JSON",
     "LARGEST_JSON",
     "LARGEST_NUMBER",
+    "Arrays",
+    "Attributes",
     "Checkpoint",
     "Head",
+    "LateArray",
     "Record",
     "check_key",
     "check_text",
@@ -33,6 +33,8 @@ __all__ = [
 ]
 
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
+Arrays: TypeAlias = Mapping[str, np.ndarray]
+Attributes: TypeAlias = Mapping[str, JSON] | None
 
 # Texts that are read as JSON. A value of three characters takes up to 90 bytes of memory: these at most 200 MB.
 LARGEST_JSON, MOST_VALUES = 64 * 2**20, 2**21
@@ -64,6 +66,27 @@ class Record(Head):
     """One durable row of the journal, with its arrays: fresh copies, the caller's to change."""
 
     arrays: Mapping[str, np.ndarray]
+
+
+class LateArray:
+    """An array whose files were verified; they are read, verified again and decompressed when it is needed.
+
+    read: returns the array, or raises DamageError. check: is called with it, and raises what is wrong with its values.
+    """
+
+    def __init__(self, dtype: np.dtype, shape: tuple[int, ...], read: Callable[[], np.ndarray]) -> None:
+        self.dtype, self.shape, self._read = dtype, shape, read
+        self.check: Callable[[np.ndarray], None] | None = None
+
+    def __deepcopy__(self, memo: object) -> LateArray:
+        return self  # it never changes, and its files are open once
+
+    def read(self) -> np.ndarray:
+        """Return the array, the caller's own. Raises DamageError."""
+        array = self._read()
+        if self.check is not None:
+            self.check(array)
+        return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +137,7 @@ def check_time(time: float) -> float:
     return float(time)
 
 
-def to_json(what: str, value: Mapping[str, JSON] | None) -> str:
+def to_json(what: str, value: Attributes) -> str:
     """Return `value` as compact JSON with sorted keys, in ASCII; None counts as empty.
 
     Raises RecordError, naming the place, for what would not come back equal: NaN and infinities, keys

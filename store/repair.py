@@ -57,8 +57,8 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     Recovery resumes from the newest checkpoint whose checksums verify, whatever is wrong with the rows that it
     contains. Behind it rows are kept up to the first that is damaged or missing. Those behind that one are
     dropped even where they verify: nobody knows what it did; it may have retracted one of them, or they one
-    that is gone. If rows that the checkpoint contains are damaged, it becomes the base: all of them give up
-    their arrays, so none can be retracted any more, and rows that cannot be read are left out.
+    that is gone. If rows that the checkpoint contains are damaged, it becomes the compaction checkpoint: all of them
+    give up their arrays, so none can be retracted any more, and rows that cannot be read are left out.
 
     Where nothing is damaged nothing is written. Otherwise the damaged log and damaged checkpoints stay
     beside the new ones, under names with "damaged" in them. Killed at any instant it can be started again.
@@ -91,14 +91,14 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
 
 @dataclass(frozen=True)
 class _Plan:
-    """Rows 1 to `kept` stay, those up to `base` without arrays.
+    """Rows 1 to `kept` stay, those up to `compacted` without arrays.
 
-    `start` is the checkpoint to begin with, `stand_in` the one that stands for the rows up to `base`; `fresh` tells
-    whether that is another than before.
+    `start` is the checkpoint to begin with, `stand_in` the one that stands for the rows up to `compacted`; `fresh`
+    tells whether that is another than before.
     """
 
     kept: int
-    base: int
+    compacted: int
     fresh: bool
     start: FoundCheckpoint | None
     stand_in: FoundCheckpoint | None
@@ -107,15 +107,15 @@ class _Plan:
     def of(cls, survey: Survey) -> _Plan:
         start = survey.sound[0] if survey.sound else None
         newest = 0 if start is None else start.last_sequence
-        has_base = not survey.compacted or survey.base is not None
-        standing = survey.compacted if has_base else 0
-        # Up to `compacted` no row has arrays; without the base that stood for them they are as good as damaged.
+        is_known = not survey.compacted or survey.compaction is not None
+        standing = survey.compacted if is_known else 0
+        # Up to `compacted` no row has arrays; without the checkpoint that stood for them they are as good as damaged.
         fresh = bool(survey.faulty(standing + 1, newest)) or (standing < survey.compacted and newest > 0)
         behind = survey.faulty(newest + 1, survey.last)
         kept = behind[0][0] - 1 if behind else survey.last
         if survey.compacted > newest:
             kept = newest
-        return cls(kept, newest if fresh else standing, fresh, start, start if fresh else survey.base)
+        return cls(kept, newest if fresh else standing, fresh, start, start if fresh else survey.compaction)
 
 
 def _lost(survey: Survey, plan: _Plan) -> list[str]:
@@ -127,13 +127,13 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
     ]
     if plan.fresh:
         lost.append(
-            f"rows 1 to {plan.base} give up their arrays, {which} stands for them: none of them can be retracted any "
-            f"more{_counts_again(survey, plan)}"
+            f"rows 1 to {plan.compacted} give up their arrays, {which} stands for them: none of them can be retracted "
+            f"any more{_counts_again(survey, plan)}"
         )
     if plan.kept < survey.last:
         behind = survey.faulty(newest + 1, survey.last)
         first, last, fault = behind[0] if behind else (0, 0, None)
-        why = fault.describe(first, last) if fault else "the base that they continue is lost"
+        why = fault.describe(first, last) if fault else "the compaction checkpoint that they continue is lost"
         lost.append(
             f"rows {plan.kept + 1} to {survey.last} are dropped, also those that verify: {why}, and nobody knows what "
             "that did to the others"
@@ -147,8 +147,8 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
 
 
 def _counts_again(survey: Survey, plan: _Plan) -> str:
-    """Return in words which rows, behind a base that is new, can have taken back one that it contains."""
-    behind = [sequence for sequence, _ in survey.log.rows if plan.base < sequence <= plan.kept]
+    """Return in words which rows behind a new compaction checkpoint can have taken back one that it contains."""
+    behind = [sequence for sequence, _ in survey.log.rows if plan.compacted < sequence <= plan.kept]
     if not behind:
         return ""
     kinds = Counter(survey.log.head(sequence).kind for sequence in behind)
@@ -191,7 +191,7 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
         if sequence > plan.kept:
             return
         survey.progress("rows written", sequence, plan.kept)
-        if sequence > plan.base:
+        if sequence > plan.compacted:
             try:
                 yield ROW, survey.log.data(sequence)
             except DamageError as error:
@@ -206,14 +206,14 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
 
 
 def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
-    """Return the newest checkpoint and the base, with places in the new log, which is read back. Raises DamageError."""
+    """Return the newest and the compaction checkpoint, with places in the new log, which is read back."""
     found = [plan.start, plan.stand_in]
     places = read_back(path, [0 if each is None else each.last_sequence for each in found])
-    newest, base = (
+    newest, compaction = (
         None if each is None or each.named is None else replace(each.named, place=place)
         for each, place in zip(found, places, strict=True)
     )
-    return newest, base
+    return newest, compaction
 
 
 def _move_aside(survey: Survey, new: Path) -> Path | None:

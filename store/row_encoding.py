@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json, payload_digest, to_json
 
@@ -31,8 +31,7 @@ DIGEST_BYTES = 16
 HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A record's head, and the payload of its arrays; None where compaction gave that up."""
 
     head: Head
@@ -55,11 +54,15 @@ def head_without_arrays(head: Head) -> bytes:
     return encode_row(head.sequence, head.kind, head.label, head.key, head.time, text, None, head.size)
 
 
-def row_sequence(data: bytes) -> int:
-    """Return the sequence of a row, of which these are the first HEAD_BYTES or more; raise ValueError for none."""
+def _fields(data: bytes) -> tuple[Any, ...]:
     if len(data) < HEAD_BYTES:
         raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
-    sequence: int = FIELDS.unpack_from(data)[0]
+    return FIELDS.unpack_from(data)
+
+
+def row_sequence(data: bytes) -> int:
+    """Return the sequence of a row, of which these are the first HEAD_BYTES or more; raise ValueError for none."""
+    sequence: int = _fields(data)[0]
     if not 1 <= sequence <= LARGEST_NUMBER:
         raise ValueError(f"a row has the sequence {sequence}")
     return sequence
@@ -80,9 +83,7 @@ def head_size(data: bytes, whole: int) -> int:
 
     whole: the bytes of the row.
     """
-    if len(data) < HEAD_BYTES:
-        raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
-    _, _, size, kept, *lengths = FIELDS.unpack_from(data)
+    _, _, size, kept, *lengths = _fields(data)
     end: int = HEAD_BYTES + sum(lengths)
     if end + (size if kept else 0) != whole or kept > 1:
         raise ValueError(f"a row of {whole} bytes says that it has {end} and {size}")

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from store.derived import without_digest, write_digested
 from store.exceptions import DamageError
-from store.files import new_file, read_regular, remove_tree
+from store.files import read_regular, remove_tree
 from store.framing import Frame
-from store.layout import DERIVED, NEW
+from store.layout import DERIVED
 from store.log import LogReader, Place
-from store.records import payload_digest
 from store.row_encoding import HEAD_BYTES, ROW, head_size, key_prefix, prefix_in, row_sequence, verified_size
 
 __all__ = ["Index", "Rows", "head_bytes"]
@@ -31,7 +31,6 @@ COLUMNS = ("sequences", "offsets", "sizes", "keys")
 # of a frame and the checksum before it; the count of its rows. Behind it the columns, and a digest of all.
 HEADER = struct.Struct("<8s8sQQ16sQQ16sQ")
 MARK = b"\x89ARROW\x01\n"
-DIGEST_BYTES = 16
 EVERY = 4096  # rows that are read again rather than kept in a file
 LARGEST_INDEX = 2**33  # bytes
 
@@ -170,10 +169,9 @@ class Index:
         return self._folder / f"rows-{begin.number:012d}"
 
     def _decoded(self, path: Path, data: bytes) -> tuple[_Segment, Rows]:
-        if payload_digest(data[:-DIGEST_BYTES]) != data[-DIGEST_BYTES:]:
-            raise ValueError("its digest differs")
+        data = without_digest(data)
         mark, identity, *places, count = HEADER.unpack_from(data)
-        if mark != MARK or identity != self._identity or len(data) != HEADER.size + 32 * count + DIGEST_BYTES:
+        if mark != MARK or identity != self._identity or len(data) != HEADER.size + 32 * count:
             raise ValueError("it is of another log")
         begin, end = (Place(places[i], places[i + 1], places[i + 1], places[i + 2]) for i in (0, 3))
         rows = Rows()
@@ -192,13 +190,8 @@ class Index:
         count = len(rows) - first
         places = (begin.offset, begin.number, begin.previous, end.offset, end.number, end.previous)
         columns = (getattr(rows, name)[first:].tobytes() for name in COLUMNS)
-        data = b"".join((HEADER.pack(MARK, self._identity, *places, count), *columns))
-        self._folder.mkdir(exist_ok=True)
         path = self._path(begin)
-        draft = path.with_name(path.name + NEW)
-        with new_file(draft) as file:
-            file.write(data + payload_digest(data))
-        draft.replace(path)
+        write_digested(path, b"".join((HEADER.pack(MARK, self._identity, *places, count), *columns)))
         self._segments, self.end = [*kept, _Segment(path, begin, end, count)], end
         mine = {segment.path for segment in self._segments}
         for entry in self._folder.glob("rows-*"):

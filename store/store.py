@@ -8,47 +8,29 @@ import time as clock
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Self, cast
-
-import numpy as np
 
 from store.archive import files_of
 from store.backup import back_up
 from store.checkpoint_files import QUICK, THOROUGH, Draft
 from store.checkpoints import Checkpoints
-from store.encoding import check_arrays, encode_payload
-from store.exceptions import (
-    CompactedError,
-    NotAStoreError,
-    ReadOnlyError,
-    RecordError,
-    StoreClosedError,
-    StoreError,
-    reported,
-)
+from store.exceptions import NotAStoreError, ReadOnlyError, RecordError, StoreClosedError, StoreError, reported
 from store.files import is_file, store_folder
 from store.found_log import Progress
 from store.journal import Journal
-from store.layout import CHECKPOINTS, holds_store, lock_to_write
-from store.lock import WriterLock
-from store.records import JSON, Checkpoint, Head, Record, check_key, check_text, check_time, from_json, to_json
+from store.layout import CHECKPOINTS, holds_store
+from store.lock import WriterLock, lock_to_write
+from store.records import JSON, Arrays, Attributes, Checkpoint, Head, Record, check_key, check_text, to_json
 
 __all__ = ["Store"]
-
-Arrays = Mapping[str, np.ndarray]
 
 
 class Store:
     """A folder of records that survive a power cut, and of arrays that are replaced as a whole.
 
-    Open it with `Store.open`. One Store may write a folder at a time, any number may read it. The
-    methods may be called from any thread, but not in a forked child.
+    Open it with `Store.open`. One Store may write a folder at a time, any number may read it. The methods may be called
+    from any thread, but not in a forked child.
     """
-
-    path: Path
-    identity: Mapping[str, JSON]
-    mode: Literal["write", "read"]
 
     @classmethod
     def open(
@@ -60,13 +42,13 @@ class Store:
     ) -> Self:
         """Open the store at `path`, a folder, or to read also a packed one, see `write_archive`.
 
-        To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it
-        for good; an existing store keeps its own, and the caller compares. To read, it makes and changes
-        nothing, and each call sees what is committed at that moment.
+        To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it for good; an
+        existing store keeps its own, and the caller compares. To read, it makes and changes nothing, and each call sees
+        what is committed at that moment.
 
-        Raises NotAStoreError when there is no store and none may be made (no identity, mode "read", a
-        file, a folder of other things), LockedError for a second writer, VersionError for a newer
-        format, DamageError, ReadOnlyError, StoreFullError, and RecordError for another mode or an identity not in JSON.
+        Raises NotAStoreError when there is no store and none may be made (no identity, mode "read", a file, a folder of
+        other things), LockedError for a second writer, VersionError for a newer format, DamageError, ReadOnlyError,
+        StoreFullError, and RecordError for another mode or an identity not in JSON.
         """
         if mode not in ("write", "read"):
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
@@ -94,12 +76,12 @@ class Store:
             undo.callback(files.close)
             self._journal = Journal(files, write=mode == "write")
             undo.callback(self._journal.close)
-            self.identity = self._journal.identity
+            self.identity: Mapping[str, JSON] = self._journal.identity
             self._checkpoints = Checkpoints(files, self._journal)
             self._files = files
             if mode == "write":
                 self._checkpoints.remove_unnamed()
-            undo.pop_all()
+            self._held = undo.pop_all()
 
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
@@ -133,33 +115,26 @@ class Store:
         label: str,
         key: bytes,
         *,
-        attributes: Mapping[str, JSON] | None = None,
+        attributes: Attributes = None,
         arrays: Arrays | None = None,
         time: float | None = None,
     ) -> Head:
         """Add a record and return its head once it is durable; in a batch, once it is written.
 
-        `time` is in Unix seconds, now when not given. Raises RecordError for what cannot be kept,
-        StoreFullError, ReadOnlyError or another StoreError; after any of them the store can be used on.
+        `time` is in Unix seconds, now when not given. Raises RecordError for what cannot be kept, StoreFullError,
+        ReadOnlyError or another StoreError; after any of them the store can be used on.
         """
         self._check_open(write=True)
-        check_text("the kind", kind)
-        check_text("the label", label)
-        check_key(key)
-        seconds = check_time(clock.time() if time is None else time)
-        text = to_json("attributes", attributes)
-        payload = encode_payload(check_arrays(arrays))
-        sequence = self._journal.insert(kind, label, key, seconds, text, payload)
-        return Head(sequence, kind, label, key, seconds, from_json(text), len(payload))
+        return self._journal.insert(kind, label, key, clock.time() if time is None else time, attributes, arrays)
 
     @contextmanager
     def batch(self) -> Iterator[None]:
         """Make the records appended in the block durable together, when it ends, or none of them.
 
-        They wait for the disk once, not once each. After an exception in the block, or an append that
-        failed on the disk, none is kept; a record refused with RecordError was never part of it. Other
-        threads that append or read wait meanwhile. In the block, committing, flushing, closing and beginning
-        another batch raise StoreError. Raises StoreFullError, ReadOnlyError or another StoreError.
+        They wait for the disk once, not once each. After an exception in the block, or an append that failed on the
+        disk, none is kept; a record refused with RecordError was never part of it. Other threads that append or read
+        wait meanwhile. In the block, committing, flushing, closing and beginning another batch raise StoreError. Raises
+        StoreFullError, ReadOnlyError or another StoreError.
         """
         self._check_open(write=True)
         self._journal.refuse_in_batch("beginning a batch")
@@ -170,9 +145,9 @@ class Store:
     def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
         """Yield the records behind sequence `after` without their arrays, up to the last at the start.
 
-        `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those
-        that a repair named as lost. Raises DamageError at the first that is damaged or, without `kind` and
-        `label`, missing; with them, a record whose kind or label is damaged is passed over.
+        `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those that a
+        repair named as lost. Raises DamageError at the first that is damaged or, without `kind` and `label`, missing;
+        with them, a record whose kind or label is damaged is passed over.
         """
         self._check_open(after)
         for what, text in (("the kind", kind), ("the label", label)):
@@ -196,16 +171,13 @@ class Store:
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
 
-        One is in memory at a time. Raises DamageError at the first that is damaged or missing; its
-        `sequence` is the `after` with which to continue behind it. Raises CompactedError where the first
-        are compacted: `base` has their place, and its `last_sequence` is the `after` to continue with.
+        One is in memory at a time. Raises DamageError at the first that is damaged or missing; its `sequence` is the
+        `after` with which to continue behind it. Raises CompactedError where the first are compacted: `compaction` has
+        their place, and its `last_sequence` is the `after` to continue with.
         """
         self._check_open(after)
-        if after < (compacted := self._journal.current().compacted):
-            raise CompactedError(
-                f"records 1 to {compacted} of {self.path} gave up their arrays when it was compacted: begin with "
-                "base(), and continue behind its last_sequence"
-            )
+        if after < self._journal.current().compacted:
+            raise self._journal.given_up(after + 1)
         return cast(Iterator[Record], self._journal.rows(after, self._journal.last(), arrays=True))
 
     def with_key(self, key: bytes) -> Iterator[Head]:
@@ -222,8 +194,8 @@ class Store:
         only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
         over. With none it is the checkpoint's attributes, in well below a millisecond. late: names of arrays of which
         the files are verified and stay open; they are decompressed when they are needed, whatever happens to the store.
-        A logged warning names the file and the array of each checkpoint that it passes over.
-        Raises VersionError for a checkpoint of a newer format.
+        A logged warning names the file and the array of each checkpoint that it passes over. Raises VersionError for a
+        checkpoint of a newer format.
         """
         self._check_open()
         return self._checkpoints.latest(only, late)
@@ -237,14 +209,7 @@ class Store:
         self._check_open()
         return self._checkpoints.derived(name)
 
-    def keep_derived(
-        self,
-        name: str,
-        arrays: Arrays,
-        *,
-        last_sequence: int,
-        attributes: Mapping[str, JSON] | None = None,
-    ) -> None:
+    def keep_derived(self, name: str, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
         """Keep under a name what follows from the newest checkpoint; nothing where that is not up to the same row.
 
         It takes the place of what was kept before, is not made durable, and is not part of copies. Raises
@@ -261,25 +226,25 @@ class Store:
 
     @property
     def compacted(self) -> int:
-        """The last record that has given up its arrays for a base, 0 where none has."""
+        """The last record that has given up its arrays for a compaction checkpoint, 0 where none has."""
         self._check_open()
         return self._journal.current().compacted
 
-    def base(self) -> Checkpoint | None:
+    def compaction(self) -> Checkpoint | None:
         """Return the checkpoint that stands for the compacted records, None when there are none.
 
         Raises DamageError where it does not verify, and VersionError for a newer format.
         """
         self._check_open()
-        return self._checkpoints.base()
+        return self._checkpoints.compaction()
 
-    def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, JSON] | None = None) -> int:
+    def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> int:
         """Write a checkpoint that contains the records up to `last_sequence`, make it current, return its number.
 
-        The checkpoint with the highest `last_sequence` is current, and of several with the same the last committed.
-        It waits for a background commit first, and raises its failure here in place of committing.
-        Raises RecordError for arrays, attributes or a `last_sequence` that cannot be kept, StoreFullError,
-        ReadOnlyError or another StoreError; the checkpoint before then stays current.
+        The checkpoint with the highest `last_sequence` is current, and of several with the same the last committed. It
+        waits for a background commit first, and raises its failure here in place of committing. Raises RecordError for
+        arrays, attributes or a `last_sequence` that cannot be kept, StoreFullError, ReadOnlyError or another
+        StoreError; the checkpoint before then stays current.
         """
         draft = self._draft(arrays, last_sequence, attributes)
         self._idle()
@@ -290,47 +255,37 @@ class Store:
         arrays: Arrays,
         *,
         last_sequence: int,
-        attributes: Mapping[str, JSON] | None = None,
+        attributes: Attributes = None,
         newest: tuple[Arrays, Mapping[str, JSON]] | None = None,
     ) -> None:
-        """Let a base stand for the records up to `last_sequence`: they give up their arrays and keep their heads.
+        """Let a checkpoint stand for the records up to `last_sequence`: they give up their arrays and keep their heads.
 
-        The base is a checkpoint like others, but kept until the next base; a replay of the records begins
-        with it. newest: arrays and attributes of a checkpoint that contains all records, committed beside it; without
-        it the base is the newest. A log without the arrays is written beside the one there is, all is read back, and
-        takes effect together or not at all; then the earlier log and checkpoints are removed. Nobody can append
-        meanwhile. Raises DamageError where a record behind `last_sequence` cannot be read, and as `commit`.
+        This compaction checkpoint is one like others, but kept until the next compaction; a replay of the records
+        begins with it. newest: arrays and attributes of a checkpoint that contains all records, committed beside it;
+        without it that of the compaction is the newest. A log without the arrays is written beside the one there is,
+        all is read back, and takes effect together or not at all; then the earlier log and checkpoints are removed.
+        Nobody can append meanwhile. Raises DamageError where a record behind `last_sequence` cannot be read, and as
+        `commit`.
         """
-        base = self._draft(arrays, last_sequence, attributes)
+        compaction = self._draft(arrays, last_sequence, attributes)
         last = None if newest is None else self._draft(newest[0], self._journal.last(), newest[1])
         self._idle()
-        self._checkpoints.compact(base, last)
+        self._checkpoints.compact(compaction, last)
 
-    def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, JSON] | None = None) -> None:
+    def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
         """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
 
-        While one is being written, only the newest of those handed over waits. A failure is logged and
-        raised, once, by the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`.
-        What cannot be kept is refused at once, with RecordError.
+        While one is being written, only the newest of those handed over waits. A failure is logged and raised, once, by
+        the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`. What cannot be kept is
+        refused at once, with RecordError.
         """
         draft = self._draft(arrays, last_sequence, attributes, QUICK)
         self._checkpoints.raise_failure()
         self._checkpoints.commit_later(draft)
 
-    def _draft(
-        self, arrays: Arrays, last_sequence: int, attributes: Mapping[str, JSON] | None, level: int = THOROUGH
-    ) -> Draft:
+    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int = THOROUGH) -> Draft:
         self._check_open(write=True)
-        # The rows of a batch may yet be rolled back.
-        self._journal.refuse_in_batch("committing a checkpoint")
-        first, last = self._journal.current().compacted, self._journal.last()
-        if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
-            # Recovery could not resume before the base: the rows behind it have given up their arrays.
-            raise RecordError(
-                f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
-                f"there is, not {last_sequence!r}"
-            )
-        return Draft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
+        return self._checkpoints.draft(arrays, last_sequence, attributes, level)
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
@@ -345,8 +300,8 @@ class Store:
     def backup(self, destination: str | os.PathLike[str], *, progress: Progress | None = None) -> None:
         """Copy the store to the new folder `destination`, also while it is written, from here or elsewhere.
 
-        The copy is the store as it was at one moment since the call: all records durable then, and the checkpoints.
-        It appears there verified, complete and durable, or not at all; a power cut may leave a folder named
+        The copy is the store as it was at one moment since the call: all records durable then, and the checkpoints. It
+        appears there verified, complete and durable, or not at all; a power cut may leave a folder named
         `destination`.….partial. Nobody who writes waits for it. `progress` is called as by `check_store`.
 
         Raises NotAStoreError where something is at `destination` or it lies inside the store, DamageError where the
@@ -375,21 +330,14 @@ class Store:
                 return
             self._checkpoints.close()
             self._closed = True
-            try:
-                self._journal.close()
-            finally:
-                self._files.close()
-                if self._lock is not None:
-                    self._lock.release()
+            self._held.close()
         self._checkpoints.raise_failure()
 
     def __enter__(self) -> Self:
         self._check_open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
         try:
             self.close()
         except StoreError:

@@ -102,7 +102,7 @@ class FoundCheckpoint:
     number: int
     folder: Path
     named: NamedCheckpoint | None
-    is_base: bool
+    is_compaction: bool
     damage: list[DamageError]
     identity: dict[str, JSON] | None
 
@@ -120,9 +120,9 @@ class FoundCheckpoint:
 class Survey:
     """All that is found of a store, and whether it verifies.
 
-    `current` is None where `CURRENT` is lost; `identity` where that is. `compacted` is the last row whose arrays a base
-    stands for, whether that base is sound or not. `sound` are the checkpoints that recovery can resume from, the newest
-    first. `last` is the last sequence of which there is any sign; `faults` are
+    `current` is None where `CURRENT` is lost; `identity` where that is. `compacted` is the last row whose arrays
+    compaction gave up, whether its checkpoint is sound or not. `sound` are the checkpoints that recovery can resume
+    from, the newest first. `last` is the last sequence of which there is any sign; `faults` are
     the rows that do not verify, as (first, last, fault), ascending. A writer may be at work meanwhile. Raises
     VersionError for a newer format, and StoreError for a file that cannot be read for a reason that says nothing
     against it.
@@ -161,8 +161,8 @@ class Survey:
 
     def _examine(self, number: int, named: NamedCheckpoint | None) -> FoundCheckpoint:
         path = checkpoint_path(self.folder, number)
-        base = None if self.current is None else self.current.base
-        is_base = base is not None and base.number == number
+        compaction = None if self.current is None else self.current.compaction
+        is_compaction = compaction is not None and compaction.number == number
         try:
             reader = CheckpointReader(path, self.files)
             found = NamedCheckpoint(reader.number, reader.last_sequence, reader.sha256, NOWHERE)
@@ -173,9 +173,9 @@ class Survey:
                     "than was written there",
                     path=path / "zarr.json",
                 )
-            return FoundCheckpoint(number, path, expected, is_base, list(reader.damage()), dict(reader.identity))
+            return FoundCheckpoint(number, path, expected, is_compaction, list(reader.damage()), dict(reader.identity))
         except DamageError as wrong:
-            return FoundCheckpoint(number, path, named, is_base, [wrong], None)
+            return FoundCheckpoint(number, path, named, is_compaction, [wrong], None)
 
     def _found_log(self) -> FoundLog:
         """Return the log that counts; where that is gone, or nobody knows which it was, the one that tells most.
@@ -186,7 +186,10 @@ class Survey:
         if self.current is None:
             aside = sorted(self.folder.glob(f"{LOG}*{DAMAGED}*"))
         else:
-            named = _or_aside(log_path(self.folder, self.current.log))
+            named = log_path(self.folder, self.current.log)
+            put_aside = named.with_name(named.name + DAMAGED)  # by an interrupted repair
+            if not named.exists() and put_aside.exists():
+                named = put_aside
             if self.files.is_packed or named.exists():
                 durable = None if self.current.newest is None else self.current.newest.place
                 return FoundLog(self.files, named, self.current.log_identity, self.progress, durable)
@@ -227,7 +230,7 @@ class Survey:
         self._note_gap(before, self.last)
 
     def _note_gap(self, before: int, last: int) -> None:
-        """Note rows that are missing; before the base a repair may have left some out, where nothing is damaged."""
+        """Note rows that are missing; of compacted ones a repair may have left some out, where nothing is damaged."""
         first = before + 1 if before in self.log.torn else max(before, self.compacted) + 1
         if first <= last:
             self._note(first, last, Fault.MISSING)
@@ -250,13 +253,10 @@ class Survey:
         self.sound = sorted(found, key=lambda found: (found.last_sequence, found.number), reverse=True)
 
     @property
-    def base(self) -> FoundCheckpoint | None:
+    def compaction(self) -> FoundCheckpoint | None:
         """The sound checkpoint that stands for the compacted rows."""
-        return (
-            next((found for found in self.sound if found.last_sequence == self.compacted), None)
-            if self.compacted
-            else None
-        )
+        stands = (found for found in self.sound if found.last_sequence == self.compacted)
+        return next(stands, None) if self.compacted else None
 
     def moved(self) -> bool:
         """Whether a writer has committed something since."""
@@ -288,7 +288,7 @@ class Survey:
         """Return whether the state that a checkpoint holds can be had without it."""
         last_sequence = self.last if checkpoint.named is None else checkpoint.last_sequence
         last_sequences = [other.last_sequence for other in self.sound if other is not checkpoint]
-        if checkpoint.is_base and last_sequence == self.compacted:
+        if checkpoint.is_compaction and last_sequence == self.compacted:
             return last_sequence in last_sequences
         starts = [start for start in [*last_sequences, *([0] if not self.compacted else [])] if start >= self.compacted]
         return any(start >= last_sequence or not self.faulty(start + 1, last_sequence) for start in starts)
@@ -312,9 +312,3 @@ class Survey:
             else:
                 continue
             yield Problem(path, what, "leftover")
-
-
-def _or_aside(path: Path) -> Path:
-    """Return a log's path, or where an interrupted repair put it."""
-    aside = path.with_name(path.name + DAMAGED)
-    return aside if not path.exists() and aside.exists() else path

@@ -84,7 +84,7 @@ def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) ->
     data, places = log_bytes(bytes.fromhex(current["log"][1]), header, [[(ROW, row)] for row in rows])
     log_of(path).write_bytes(data)
     sequences = [int.from_bytes(row[:8], "little") for row in rows]
-    for named in filter(None, (current["newest"], current["base"])):
+    for named in filter(None, (current["newest"], current["compaction"])):
         behind = [i for i, sequence in enumerate(sequences) if sequence > named["last_sequence"]]
         named["place"] = as_place(places[min(behind, default=len(rows))])
     set_current(path, **current)
@@ -217,10 +217,10 @@ def raw(name: str, array: np.ndarray) -> Packed:
 
 
 def named_in(path: Path) -> list[dict[str, Any]]:
-    """The newest checkpoint and the base, as `CURRENT` names them, each once."""
+    """The newest checkpoint and the compaction checkpoint, as `CURRENT` names them, each once."""
     current = get_current(path)
-    newest, base = current["newest"], current["base"]
-    return [named for named in (newest, None if base == newest else base) if named is not None]
+    newest, compaction = current["newest"], current["compaction"]
+    return [named for named in (newest, None if compaction == newest else compaction) if named is not None]
 
 
 def group_of(path: Path, number: int) -> Path:
@@ -241,7 +241,7 @@ def seal(path: Path, number: int, known: Mapping[str, Any]) -> None:
     group = json.loads(header.read_text(encoding="utf-8")) | {"attributes": known}
     header.write_text(json.dumps(group), encoding="utf-8")
     current = get_current(path)
-    for named in filter(None, (current["newest"], current["base"])):
+    for named in filter(None, (current["newest"], current["compaction"])):
         if named["number"] == number:
             named |= {name: known.get(name) for name in ("number", "last_sequence", "sha256")}
     set_current(path, **current)
@@ -330,10 +330,10 @@ def checkpoint_of(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         return dict(newest.attributes), dict(newest.arrays)
 
 
-def put_checkpoint(path: Path, attributes: Any, arrays: Mapping[str, np.ndarray], *, base: bool = False) -> None:
-    """Make this the newest checkpoint, or the base of all rows."""
+def put_checkpoint(path: Path, attributes: Any, arrays: Mapping[str, np.ndarray], *, compaction: bool = False) -> None:
+    """Make this the newest checkpoint, or the compaction checkpoint of all rows."""
     with Store.open(path) as store:
-        if base:
+        if compaction:
             store.compact(arrays, last_sequence=store.last, attributes=attributes)
         else:
             store.commit(arrays, last_sequence=store.last, attributes=attributes)

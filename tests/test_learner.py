@@ -472,7 +472,7 @@ def test_a_memory_can_be_opened_without_naming_its_sensor_and_with_either_readou
         assert answers(learner) == answers(learner_of())
 
 
-def test_a_generation_is_written_while_observing(tmp_path, monkeypatch):
+def test_a_checkpoint_is_written_while_observing(tmp_path, monkeypatch):
     monkeypatch.setattr("scroll_tactile.memory.open_memory.SNAPSHOT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)

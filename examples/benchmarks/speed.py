@@ -41,7 +41,7 @@ Sides = dict[str, Path]
 MEGABYTE = 1e6
 SKIN = Sensor(name="skin", channels=8, rate=100.0, low=-1.0, high=1.0, unit="1", duration=1.0)
 SHORT = SKIN.model_copy(update={"name": "short-skin", "duration": 0.1})
-REPLAYED = 255  # observations that no close and no generation follows: one more, and a generation is written
+REPLAYED = 255  # observations that no close and no checkpoint follows: one more, and a checkpoint is written
 TOGETHER = 1000  # touches in a batch
 SCENE = 3  # materials
 

@@ -1,4 +1,4 @@
-"""The buffer of exemplars, read from where their readings lie: the journal, its base, or the memory itself."""
+"""The buffer of exemplars, read from where they lie: the journal, its compaction checkpoint, or the memory itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.replaying import require_base
+from scroll_tactile.memory.replaying import require_compaction
 from scroll_tactile.memory.rows import OBSERVE, only_readings
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.signals.windows import Scale
@@ -42,8 +42,8 @@ def exemplar_candidates(memory: Memory, store: Store | None) -> list[Exemplar]:
     for material, key, source in memory.exemplars or ():
         if isinstance(source, Exemplar):
             found[material, key] = source
-        else:  # the base holds what was compacted
-            wanted.setdefault(source if source > memory.base else 0, []).append((material, key))
+        else:  # the compaction checkpoint holds what was compacted
+            wanted.setdefault(source if source > memory.compacted else 0, []).append((material, key))
     for sequence, streams in sorted(wanted.items()):
         assert store is not None
         held = {(exemplar.material, exemplar.key): exemplar for exemplar in _exemplars_in(memory, store, sequence)}
@@ -54,9 +54,9 @@ def exemplar_candidates(memory: Memory, store: Store | None) -> list[Exemplar]:
 
 
 def _exemplars_in(memory: Memory, store: Store, sequence: int) -> list[Exemplar]:
-    """The exemplars that a row of the journal holds; 0: those of the base."""
-    require_base(memory, store)
-    row = store.record(sequence) if sequence else store.base()
+    """The exemplars that a row of the journal holds; 0: those of the compaction checkpoint."""
+    require_compaction(memory, store)
+    row = store.record(sequence) if sequence else store.compaction()
     if isinstance(row, Record) and row.kind == OBSERVE:
         columns, codes = memory.codes(row)
         readings, stages = only_readings(row.arrays), memory.plan.scored_stages(columns)

@@ -1,4 +1,4 @@
-"""What a checkpoint, or the base that a merge brought, must be: sums that touches can have, and samples of them."""
+"""What a checkpoint, or that which a merge brought, must be: sums that touches can have, and samples of them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
 from scroll_tactile.statistics.tables import rows_of
-from store.late import LateArray
+from store.records import LateArray
 
 __all__ = ["CheckpointChecks"]
 

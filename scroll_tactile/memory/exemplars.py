@@ -147,7 +147,7 @@ class Exemplar:
 
 
 Source = int | Exemplar
-"""Where a candidate's readings lie: in this row of the journal, or in the base that stands for it; 0: in the base.
+"""Where a candidate's readings lie: in this row of the journal; 0, or a compacted row: in the compaction checkpoint.
 
 Without a journal it is the exemplar itself.
 """
@@ -194,7 +194,7 @@ class ExemplarSample(Sample[Source]):
 
 
 def exemplars_to_arrays(exemplars: Sequence[Exemplar]) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """What a base keeps: the readings lie one behind another on the time axis, exemplar-lengths many of each."""
+    """What a compaction checkpoint keeps: readings one behind another in time, exemplar-lengths many of each."""
     readings = [exemplar.readings for exemplar in exemplars]
     arrays: dict[str, npt.NDArray[Any]] = {
         "exemplar-keys": _keys([exemplar.key for exemplar in exemplars]),

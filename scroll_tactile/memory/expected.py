@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.settings import require_name, require_source
 from scroll_tactile.statistics.grid import BITS
-from store.late import LateArray
+from store.records import LateArray
 
 __all__ = [
     "KEY_BYTES",

@@ -158,10 +158,10 @@ class MemoryStore(Store):
         newest = super().latest(late=() if self.gate.thorough else late)
         return None if newest is None else self.gate.checkpoint(newest)
 
-    def base(self) -> Checkpoint | None:
-        """As `Store.base`."""
-        base = super().base()
-        return None if base is None else self.gate.checkpoint(base)
+    def compaction(self) -> Checkpoint | None:
+        """As `Store.compaction`."""
+        found = super().compaction()
+        return None if found is None else self.gate.checkpoint(found)
 
 
 def open_store(
@@ -227,7 +227,7 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
 
 
 def _in_checkpoints(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
-    for read in (store.latest, store.base):
+    for read in (store.latest, store.compaction):
         try:
             if (checkpoint := read()) is not None:
                 require_counted(store.path, checkpoint, heads)

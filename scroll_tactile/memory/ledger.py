@@ -141,7 +141,7 @@ class Ledger(OpenMemory):
     def _retract(self, store: Store, records: list[Record], material: str) -> None:
         # In the memory first: it reads rows again that may be damaged, and after a retraction is in the journal every
         # opening would have to read them.
-        store.base()
+        store.compaction()
         memory, sequences = self._memory, spans(record.sequence for record in records)
         before = memory.sample, memory.kept, memory.exemplars, memory.tuned
 
@@ -167,7 +167,7 @@ class Ledger(OpenMemory):
             record = observation_of(store, self.memory, receipt)
             if record.label == material:
                 raise InputError(f"observation {record.sequence} of {store.path} is called {material!r} already")
-            store.base()  # a damaged one has what the retraction needs
+            store.compaction()  # a damaged one has what the retraction needs
             memory = self._memory
             with self._mutation(), store.batch():
                 removed = memory.retract(record)
@@ -234,18 +234,18 @@ class Ledger(OpenMemory):
             last_sequence = compaction_point(store, memory, keep)
             before = sum(store.size().values())
             self.require_writing()
-            if last_sequence > memory.base:
-                store.base()  # a damaged one has what the new one needs
-                # With the tuned model, which the base may lack.
+            if last_sequence > memory.compacted:
+                store.compaction()  # a damaged one has what the new one needs
+                # With the tuned model, which the compaction checkpoint may lack.
                 newest = memory.to_arrays() if last_sequence < memory.sequence else None
-                base = until(memory, store, last_sequence) if last_sequence < memory.sequence else memory
-                arrays, attributes = base.to_arrays(last_sequence, exemplar_candidates(base, store))
+                kept = until(memory, store, last_sequence) if last_sequence < memory.sequence else memory
+                arrays, attributes = kept.to_arrays(last_sequence, exemplar_candidates(kept, store))
                 with self._mutation():
                     store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
                     self._saved = memory.sequence
-                    memory.compacted(last_sequence)
+                    memory.note_compaction(last_sequence)
                 give_back_scratch()
-            return Compacted(memory.base, before, sum(store.size().values()))
+            return Compacted(memory.compacted, before, sum(store.size().values()))
 
     def keep_tuned(self, tuned: Tuned, made_from: Memory, last_sequence: int, retractions: int) -> None:
         """Keep the tuned model, durably. Raises FineTuneError where something was retracted since its training began.

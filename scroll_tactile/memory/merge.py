@@ -48,14 +48,14 @@ class MergeRules:
 class MergePlan:
     """What another memory would bring: rows to be appended, in order.
 
-    rows: heads of its journal. base: what stands for those that it compacted. shared: streams that both observed, and
-    that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are there
-    under another name, and why that is refused. descriptions: by material, those that we have not. said: see
+    rows: heads of its journal. compaction: what stands for those that it compacted. shared: streams that both observed,
+    and that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are
+    there under another name, and why that is refused. descriptions: by material, those that we have not. said: see
     `MergeRules`. newest: what a packed memory sums up.
     """
 
     source: MemoryStore
-    base: Checkpoint | None
+    compaction: Checkpoint | None
     rows: list[Head]
     shared: int
     left_out: list[Head]
@@ -80,15 +80,17 @@ class MergePlan:
         stream that is not what its key says, here or there.
         """
         _require_mergeable(ours, memory, theirs)
-        base, found, heads = theirs.compacted, theirs.base(), list(theirs.heads())
+        compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
         if found is not None:
             require_counted(theirs.path, found, heads)
         incoming = active_rows(heads)
         both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
-        refused, again = _by_first_names(incoming, contents, base, rules.clipped) if rules.one_name else ([], set())
+        refused, again = (
+            _by_first_names(incoming, contents, compacted, rules.clipped) if rules.one_name else ([], set())
+        )
         out = {*(both if rules.once else ()), *again, *(head.sequence for head, _ in refused)}
         if fixed := [
-            head for head in incoming if head.sequence in out and (head.sequence <= base or head.kind == MEMBER)
+            head for head in incoming if head.sequence in out and (head.sequence <= compacted or head.kind == MEMBER)
         ]:
             raise _cannot_be_left_out(theirs, fixed, refused)
         rows = [head for head in incoming if head.sequence not in out]
@@ -116,19 +118,19 @@ class MergePlan:
         The caller opens a batch around it, and where a row does not pass the gate none of them is kept. each: called
         with (rows done, rows in all).
         """
-        base = self.base
-        # A base comes in as one row, and the merges before it are a part of it.
+        compaction = self.compaction
+        # A compaction checkpoint comes in as one row, and the merges before it are a part of it.
         part = (
             0
-            if base is None
-            else sum(head.kind == MERGE and head.sequence <= base.last_sequence for head in self.rows) - 1
+            if compaction is None
+            else sum(head.kind == MERGE and head.sequence <= compaction.last_sequence for head in self.rows) - 1
         )
         total = len(self.rows) - part
         for material, description in self.descriptions.items():
             head = ours.append(DESCRIBE, material, b"", attributes={"constituents": description})
             replay(memory, Record(**vars(head), arrays={}), ours)
         sums = self._sums(memory)
-        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(base), start=1):
+        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(compaction), start=1):
             head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
             if kind != MEMBER and sums is None:
                 replay(memory, Record(**vars(head), arrays=arrays), ours)
@@ -149,15 +151,17 @@ class MergePlan:
             return None
         return sums_without(source, self.newest, memory, {head.sequence for head in self.left_out})
 
-    def _rows_to_append(self, base: Checkpoint | None) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
-        if base is not None:
+    def _rows_to_append(
+        self, compaction: Checkpoint | None
+    ) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
+        if compaction is not None:
             left_out = ("tuned", "descriptions")  # the tuned model stays there; descriptions come as rows of their own
-            attributes = {name: value for name, value in base.attributes.items() if not name.startswith(left_out)}
-            arrays = {name: array for name, array in base.arrays.items() if not name.startswith("tuned")}
+            attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
+            arrays = {name: array for name, array in compaction.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
         for head in self.rows:
-            if base is not None and head.sequence <= base.last_sequence:
-                if head.kind != MERGE:  # a merge before the base is a part of it
+            if compaction is not None and head.sequence <= compaction.last_sequence:
+                if head.kind != MERGE:  # a merge before the compaction checkpoint is a part of it
                     kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
                     yield MEMBER, head.label, head.key, kept, None, head.time
             else:
@@ -175,7 +179,7 @@ def _row(contents: Contents | StoredContents, head: Head) -> int | None:
 
 
 def _by_first_names(
-    incoming: Sequence[Head], contents: Contents | StoredContents, base: int, clipped: Collection[bytes]
+    incoming: Sequence[Head], contents: Contents | StoredContents, compacted: int, clipped: Collection[bytes]
 ) -> tuple[list[tuple[Head, str]], set[int]]:
     """The touches that are there, or came just before, under another name, and why each is refused.
 
@@ -191,7 +195,7 @@ def _by_first_names(
         names = known or [came.setdefault(head.key, head.label)]
         if (why := refusal(names, head.label, head.key in clipped)) is not None:
             refused.append((head, why))
-        elif before and head.kind == OBSERVE and head.sequence > base:
+        elif before and head.kind == OBSERVE and head.sequence > compacted:
             again.add(head.sequence)
     return refused, again
 
@@ -211,11 +215,11 @@ def _cannot_be_left_out(
 
 
 def _descriptions(
-    ours: Store, memory: Memory, theirs: MemoryStore, base: Checkpoint | None, choice: Choice
+    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
     """Those of their descriptions that come in."""
-    theirs_now = dict(cast(dict[str, Description], {} if base is None else base.attributes["descriptions"]))
-    for head in theirs.heads(0 if base is None else base.last_sequence):
+    theirs_now = dict(cast(dict[str, Description], {} if compaction is None else compaction.attributes["descriptions"]))
+    for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions
     new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}

@@ -23,10 +23,10 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
         raise ObservationError(f"{store.path} has rows 1 to {store.last}; there is no observation {sequence!r}")
     if sequence in memory.retracted:
         raise ObservationError(f"observation {sequence} of {store.path} was retracted already")
-    if sequence <= memory.base:
+    if sequence <= memory.compacted:
         raise ObservationError(
-            f"observation {sequence} of {store.path} cannot be retracted: rows 1 to {memory.base} were compacted, and "
-            "their features given up"
+            f"observation {sequence} of {store.path} cannot be retracted: rows 1 to {memory.compacted} were compacted, "
+            "and their features given up"
         )
     record = store.record(sequence)
     if record.kind != OBSERVE:
@@ -52,7 +52,7 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
         )
     found = [head.sequence for head in _retractable(store, memory, material)]
     if len(found) != count:
-        for _ in store.heads(memory.base):  # one that is damaged was passed over
+        for _ in store.heads(memory.compacted):  # one that is damaged was passed over
             pass
         raise ObservationError(
             f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
@@ -63,7 +63,7 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
 
 def _retractable(store: Store, memory: Memory, material: str | None = None) -> list[Head]:
     """The observations whose arrays the journal still holds, of one material or all, in order; no damaged ones."""
-    rows = store.heads(memory.base, kind=OBSERVE, label=material)
+    rows = store.heads(memory.compacted, kind=OBSERVE, label=material)
     return [head for head in rows if head.sequence not in memory.retracted]
 
 
@@ -124,4 +124,4 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
     if keep == 0:
         return store.last
     sequences = [head.sequence for head in _retractable(store, memory)]
-    return memory.base if len(sequences) <= keep else sequences[-keep] - 1
+    return memory.compacted if len(sequences) <= keep else sequences[-keep] - 1

@@ -166,18 +166,18 @@ class OpenMemory:
             memory, store = self.memory, self.store
             if store is None or store.mode == "write":
                 return False
-            if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.base):
+            if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.compacted):
                 return False
             try:
                 # A checkpoint that came between the reads may be of rows behind these, and hold a tuned model from
                 # before them.
                 for _ in range(LOOKS):
-                    if store.compacted != memory.base or store.last - memory.sequence > SNAPSHOT_EVERY:
+                    if store.compacted != memory.compacted or store.last - memory.sequence > SNAPSHOT_EVERY:
                         break
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     with self._mutation():
                         self._changed(apply_appended(memory, store, records))
-                    if store.newest == memory.checkpoint and store.compacted == memory.base:
+                    if store.newest == memory.checkpoint and store.compacted == memory.compacted:
                         return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass

@@ -28,7 +28,7 @@ def pack_memory(
     """Write all that a memory learned as a packed memory; the arguments are those of `TactileLearner.pack`."""
     found = active_rows(store.heads())
     heads = [head for head in found if head.kind != MERGE]
-    with_rows = rows and readings and not memory.base and len(heads) == len(found)
+    with_rows = rows and readings and not memory.compacted and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
     packed = copy(memory)
     packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()

@@ -28,7 +28,7 @@ from scroll_tactile.memory.rows import (
 from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from store import CompactedError, DamageError, Head, Record, Store
 
-__all__ = ["apply_appended", "apply_description", "load", "refill", "replay", "require_base", "until"]
+__all__ = ["apply_appended", "apply_description", "load", "refill", "replay", "require_compaction", "until"]
 
 logger = logging.getLogger(__name__)
 
@@ -50,12 +50,12 @@ def load(empty: Memory, store: Store) -> Memory:
 
 
 def _loaded(memory: Memory, store: Store) -> Memory:
-    memory.base = store.compacted
-    # Without a sound checkpoint the base raises what is lost; without a base the journal has every row.
+    memory.compacted = store.compacted
+    # Where no checkpoint is sound, that of a compaction raises what is lost; without one the journal has every row.
     newest = store.latest(
         late=[LATE_ROWS, *(f"{name}-{scale}" for name in LATE_SECOND for scale in memory.plan.scales)]
     )
-    start = store.base() if newest is None else newest
+    start = store.compaction() if newest is None else newest
     if start is not None:
         memory.fill(start.arrays, start.attributes, start.last_sequence, source=0, late=start.late)
     memory.checkpoint = None if newest is None else newest.number
@@ -85,9 +85,9 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         changed = [(record.label, codes, 1)]
     elif record.kind == RETRACT:
         gone = unspanned(record.attributes["sequences"])
-        changed = [_retracted(memory, record, sequence, store) for sequence in gone if sequence > memory.base]
-        for sequence in sorted({sequence for sequence in gone if sequence <= memory.base} - memory.excluded):
-            logger.warning(  # a repair made the base: `compact` would have left it out
+        changed = [_retracted(memory, record, sequence, store) for sequence in gone if sequence > memory.compacted]
+        for sequence in sorted({sequence for sequence in gone if sequence <= memory.compacted} - memory.excluded):
+            logger.warning(  # a repair made the compaction checkpoint: `compact` would have left it out
                 "%s: observation %d was retracted by row %d, but still counts: its features were lost to damage. Only "
                 "a copy from before the damage can leave it out",
                 store.path,
@@ -121,7 +121,7 @@ def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> A
 
 
 def _join(memory: Memory, record: Record) -> None:
-    """Add another memory of the same making: a row that holds the arrays and attributes of its base."""
+    """Add another memory of the same making: a row with the arrays and attributes of its compaction checkpoint."""
     other = memory.empty_like().fill(record.arrays, record.attributes, source=record.sequence)
     memory.join(other, exemplars="exemplar-readings" in record.arrays)
 
@@ -157,22 +157,22 @@ def refill(memory: Memory, store: Store) -> None:
 
 
 def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
-    """The memory of the observations up to a row that are not retracted: what a base at that row holds."""
+    """The memory of the observations up to a row that are not retracted: what a compaction at that row keeps."""
     made, later = _chosen(memory, store, last_sequence), memory.empty_like()
-    for head in store.heads(memory.base):  # whoever compacts has read all
+    for head in store.heads(memory.compacted):  # whoever compacts has read all
         if head.sequence <= last_sequence:
             apply_description(made.descriptions, head)
         elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             replay(later, store.record(head.sequence), store)
     made.statistics = memory.statistics - later.statistics
-    made.base, made.sequence, made.tuned = memory.base, last_sequence, None
+    made.compacted, made.sequence, made.tuned = memory.compacted, last_sequence, None
     made.retracted = set(memory.retracted)
     return made
 
 
 def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
     """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
-    fresh, heads = _base_samples(memory, store), _behind_base(memory, store, last_sequence)
+    fresh, heads = _compaction_samples(memory, store), _behind_compaction(memory, store, last_sequence)
     for head in heads:
         if head.kind == MERGE:
             _join(fresh, store.record(head.sequence))
@@ -181,14 +181,14 @@ def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
     return fresh
 
 
-def _behind_base(memory: Memory, store: Store, last_sequence: int) -> list[Head]:
+def _behind_compaction(memory: Memory, store: Store, last_sequence: int) -> list[Head]:
     """The rows up to one from which samples are chosen.
 
     A damaged row may be of any kind: without it other touches would be chosen, and be saved as if they were the right
     ones. So DamageError is raised; only who reads, and saves nothing, gets what is left, with a warning.
     """
     try:
-        return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.base)))
+        return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
     except DamageError as damage:
         if store.mode == "write":
             raise DamageError(
@@ -198,17 +198,17 @@ def _behind_base(memory: Memory, store: Store, last_sequence: int) -> list[Head]
                 sequence=damage.sequence,
             ) from damage
         logger.warning("%s; samples of touches are chosen without it, others than there were", damage)
-    left = (head for kind in (MERGE, OBSERVE) for head in store.heads(memory.base, kind=kind))
+    left = (head for kind in (MERGE, OBSERVE) for head in store.heads(memory.compacted, kind=kind))
     return [head for head in left if head.sequence <= last_sequence]
 
 
-def _base_samples(memory: Memory, store: Store) -> Memory:
-    """A memory with what the base holds; an empty one without a base."""
+def _compaction_samples(memory: Memory, store: Store) -> Memory:
+    """A memory with what the compaction checkpoint holds; an empty one without any."""
     fresh = memory.empty_like()
-    require_base(memory, store)
+    require_compaction(memory, store)
     try:
-        if (base := store.base()) is not None:
-            fresh.fill(base.arrays, base.attributes, source=0)
+        if (compaction := store.compaction()) is not None:
+            fresh.fill(compaction.arrays, compaction.attributes, source=0)
     except DamageError as damage:
         # The statistics are whole without it; a memory that did not open would lose them too.
         logger.warning(
@@ -230,15 +230,16 @@ def _base_samples(memory: Memory, store: Store) -> Memory:
 
 
 def _counted(memory: Memory, store: Store) -> Counter[tuple[str, bytes]]:
-    """How often each stream was observed, by material and key, up to the base and without what was retracted.
+    """How often each stream was observed, by material and key, among the compacted and without what was retracted.
 
-    The base was made without what a later row retracts of it, and a retraction may have been lost to damage since.
+    The compaction checkpoint was made without what a later row retracts of it, and a retraction may have been lost to
+    damage since.
     """
-    rows = active_rows(head for head in store.heads() if head.sequence <= memory.base)
+    rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
     return Counter((head.label, head.key) for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence))
 
 
-def require_base(memory: Memory, store: Store) -> None:
+def require_compaction(memory: Memory, store: Store) -> None:
     """Raise CompactedError where the store was compacted since this memory was read."""
-    if store.compacted != memory.base:
+    if store.compacted != memory.compacted:
         raise CompactedError(f"{store.path} was compacted since it was read: read it again")

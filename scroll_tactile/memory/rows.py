@@ -42,7 +42,7 @@ __all__ = [
 
 OBSERVE = "observe"  # a stream was observed; see below
 RETRACT = "retract"  # observations were retracted; the attribute "sequences" holds [first, last] pairs
-MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its base
+MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its compaction checkpoint
 MEMBER = "member"  # a stream that such a memory had observed: its name and hash alone
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
 SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
@@ -104,7 +104,7 @@ def _counts(readings: Readings) -> tuple[int, npt.NDArray[np.integer]] | None:
 
 
 def unpack_readings(arrays: Arrays) -> Readings | None:
-    """The readings that `pack_readings` packed, or that lie in a base as they are; None without any."""
+    """The readings that `pack_readings` packed, or that a compaction checkpoint has as they are; None without any."""
     if "readings" in arrays:
         return arrays["readings"]
     if REST in arrays:

@@ -22,7 +22,7 @@ from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
 from store import Head, Record
-from store.late import LateArray
+from store.records import LateArray
 
 __all__ = ["LATE_ROWS", "LATE_SECOND", "Memory", "give_back_scratch"]
 
@@ -49,9 +49,9 @@ class Memory:
     Where it stands in the journal:
 
     - sequence: the last row that it holds.
-    - base: the last row whose arrays were compacted; 0 before any compaction.
-    - retracted: the retracted sequences after `base`.
-    - excluded: the retracted sequences up to `base`, which the base was made without.
+    - compacted: the last row whose arrays were compacted; 0 before any compaction.
+    - retracted: the retracted sequences after `compacted`.
+    - excluded: the retracted sequences up to `compacted`, which the compaction checkpoint was made without.
     - retractions: how many observations were retracted since the memory was loaded.
     - checkpoint, saved: the checkpoint that it was loaded from, and the last row in that; None and 0 without one.
     - stale: whether sample, kept touches or exemplars held what was retracted since they were chosen.
@@ -77,7 +77,7 @@ class Memory:
         self.tuned_last_sequence = 0
         self.retracted: set[int] = set()
         self.excluded: set[int] = set()
-        self.base = 0
+        self.compacted = 0
         self.checkpoint: int | None = None
         self.saved = 0
         self.sequence = 0
@@ -201,9 +201,9 @@ class Memory:
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes)
 
-    def compacted(self, last: int) -> None:
-        """Let a base stand for the rows up to one: what was retracted of them is out of it for good."""
-        self.base = last
+    def note_compaction(self, last: int) -> None:
+        """Have a compaction checkpoint stand for rows up to one: what was retracted of them is out of it for good."""
+        self.compacted = last
         self.excluded |= {sequence for sequence in self.retracted if sequence <= last}
         self.retracted = {sequence for sequence in self.retracted if sequence > last}
 
@@ -217,12 +217,12 @@ class Memory:
             self.exemplars.update(other.exemplars)
 
     def to_arrays(
-        self, base_at: int | None = None, candidates: list[Exemplar] | None = None
+        self, compaction_at: int | None = None, candidates: list[Exemplar] | None = None
     ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
         """Arrays and attributes of a checkpoint.
 
-        base_at: of a base, whose rows can no longer be retracted. candidates: those for exemplars, with their readings,
-        for a base and for what leaves the journal behind.
+        compaction_at: of a compaction checkpoint, whose rows can no longer be retracted. candidates: those for
+        exemplars, with their readings, for a compaction checkpoint and for what leaves the journal behind.
         """
         arrays, names = self.statistics.to_arrays()
         sampled, materials = self.sample.to_arrays()
@@ -239,10 +239,10 @@ class Memory:
         if self.kept is not None:
             levels, attributes["kept"] = self.kept.to_arrays()
             arrays |= levels
-        # The rows after a base are replayed, and say themselves which of them were retracted.
-        retracted = sorted(self.retracted if base_at is None else ())
-        base = self.base if base_at is None else base_at
-        excluded = sorted(row for row in self.retracted | self.excluded if row <= base)
+        # The rows after a compaction checkpoint are replayed, and say themselves which of them were retracted.
+        retracted = sorted(self.retracted if compaction_at is None else ())
+        compacted = self.compacted if compaction_at is None else compaction_at
+        excluded = sorted(row for row in self.retracted | self.excluded if row <= compacted)
         arrays["retracted"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         if self.exemplars is not None:
             own, attributes["exemplars"] = (
@@ -266,7 +266,8 @@ class Memory:
         """This memory, empty before, filled with what `to_arrays` gave; the arrays are taken over.
 
         sequence: the last row that they hold. source: the row that has the readings of exemplars for which the arrays
-        name none, 0 for the base; None where the arrays have them. late: arrays that are read when they are needed.
+        name none, 0 for the compaction checkpoint; None where the arrays have them. late: arrays that are read when
+        they are needed.
         """
         self.sequence = sequence
         names, scales, reads = attributes["materials"], self.plan.scales, dict(late or {})

@@ -185,7 +185,7 @@ zarr.core.sync._get_loop = cut
 """
 
 
-def test_an_interrupt_while_a_generation_is_written(path):
+def test_an_interrupt_while_a_checkpoint_is_written(path):
     _, errors = begun(CUT_SHORT, "memory", "compact", path, "--yes").communicate(timeout=60)
     assert errors.splitlines() == [
         "Interrupted. What was observed is kept where there is a memory; start again to go on."

@@ -115,8 +115,10 @@ def _fill(rng: random.Random, row: dict[str, Any], path: Path, scene: Scene) -> 
     if row["kind"] == "member" and way != "sound":
         way = "attributes"
     if row["kind"] == "merge":
-        bases = [(other, base["number"]) for other in scene.others if (base := get_current(other)["base"])]
-        attributes = described(*bases[0])["attributes"] if bases else {}
+        compactions = [
+            (other, compaction["number"]) for other in scene.others if (compaction := get_current(other)["compaction"])
+        ]
+        attributes = described(*compactions[0])["attributes"] if compactions else {}
         payload = scene.codes["merge"]
     told = way
     arrays = decode_payload(payload)
@@ -190,7 +192,7 @@ def forged_checkpoint(rng: random.Random, path: Path, scene: Scene) -> str:
 def forged_current(rng: random.Random, path: Path, scene: Scene) -> str:
     """A `CURRENT` that verifies, and names something else."""
     current = get_current(path)
-    named = [name for name in ("newest", "base") if current[name]]
+    named = [name for name in ("newest", "compaction") if current[name]]
     way = rng.choice(("place", "place", "number", "swap", "log", "json")) if named else rng.choice(("log", "json"))
     name = rng.choice(named) if named else ""
     told = name
@@ -208,8 +210,13 @@ def forged_current(rng: random.Random, path: Path, scene: Scene) -> str:
         current[name][key] = rng.choice((*NUMBERS, "0" * 64, None, 1, 2, 3, 4, 5))
         told += f" {key} {current[name][key]}"
     elif way == "swap":
-        current["newest"], current["base"] = rng.choice(
-            ((None, current["newest"]), (current["newest"],) * 2, (current["base"], current["newest"]), (None, None))
+        current["newest"], current["compaction"] = rng.choice(
+            (
+                (None, current["newest"]),
+                (current["newest"],) * 2,
+                (current["compaction"], current["newest"]),
+                (None, None),
+            )
         )
     elif way == "log":
         current["log"] = rng.choice(

@@ -333,12 +333,12 @@ def prepared(home: Path) -> tuple[list[Memory], dict[str, Any]]:
         touch = learner._codes_of(stream((5, 30)).astype("float32"))
         payloads = {"readings": encode_payload(dict(store.record(1).arrays))}
     with opened(home / "corpus" / "compacted", "read") as learner:
-        base = learner._ledger.store.base()
-        payloads["base"] = encode_payload(dict(base.arrays))
+        compaction = learner._ledger.store.compaction()
+        payloads["compaction"] = encode_payload(dict(compaction.arrays))
     payloads["codes"] = encode_payload(pack_codes(touch))
     watched = home / "watched"
     (watched / "12345").mkdir(parents=True)
     (watched / "12345" / "data").write_text("precious")
     (watched / "file").write_text("precious")
     shutil.copytree(memories[2].path, watched / "memory")
-    return memories, {"touch": touch, "merge": payloads["base"], "payloads": payloads}
+    return memories, {"touch": touch, "merge": payloads["compaction"], "payloads": payloads}

@@ -9,8 +9,8 @@ Of a memory that was closed, and of one left as after a crash. Each flip, on a c
 
 Never may it open and be wrong in silence, nor raise anything else; and what was noticed `check_store` must find. Damage
 in the very last batch of the log looks as a power cut does (FORMAT.md): where the memory is then as it was before that,
-without a word, that is counted apart. An f* in a damaged checkpoint is gone, with the warning, where the base is taken;
-and with a damaged base, with a warning, exemplars are those that are left.
+without a word, that is counted apart. An f* in a damaged checkpoint is gone, with the warning, where that of a
+compaction is taken; and with a damaged compaction checkpoint, with a warning, exemplars are those that are left.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ def prepared(home: Path, others: dict[str, Other]) -> list[Memory]:
 
 def roles_of(path: Path) -> dict[str, str]:
     """Folder of a checkpoint → what it is to the memory."""
-    newest, base = named_in(path)
-    return {f"{base['number']:08d}": "base", f"{newest['number']:08d}": "newest checkpoint"}
+    newest, compaction = named_in(path)
+    return {f"{compaction['number']:08d}": "compaction checkpoint", f"{newest['number']:08d}": "newest checkpoint"}
 
 
 def kind_of(file: Path, roles: dict[str, str]) -> str:
@@ -198,7 +198,7 @@ class Flipping:
         differ = {key for key in found if found[key] != told[key]}
         if warned and differ == {"tuned"}:
             return "warned, and f* is gone", None
-        if warned and differ <= {"exemplars", "pool"} and kind.startswith("base"):
+        if warned and differ <= {"exemplars", "pool"} and kind.startswith("compaction checkpoint"):
             return "warned, and samples could not be chosen again", None
         if kind == "log" and found == expected(memory.earlier[-1]):
             return "the last batch dropped" + (", warned" if warned else ", in silence"), None

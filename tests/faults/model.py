@@ -112,7 +112,7 @@ class Other:
 
 @dataclass(frozen=True)
 class State:
-    """All that a memory holds. last: its rows. base: the last that was compacted. tuned: what f* was made from.
+    """All that a memory holds. last: its rows. compacted: the last that was compacted. tuned: what f* was made from.
 
     said: materials with what they are made of, in alphabetical order. embedding: its name. brought: whether a memory
     came in without its rows. packed: what it was packed as, by the name of the file.
@@ -120,7 +120,7 @@ class State:
 
     observed: tuple[Observation, ...] = ()
     last: int = 0
-    base: int = 0
+    compacted: int = 0
     tuned: Pairs | None = None
     tuned_last_sequence: int = 0
     said: tuple[tuple[str, Constituents], ...] = ()
@@ -236,9 +236,9 @@ def _merge(
 def _compact(state: State, _: Any, keep: int) -> tuple[State, Any]:
     loose = state.loose
     last_sequence = state.last if keep == 0 else loose[-keep].sequence - 1 if len(loose) > keep else 0
-    last_sequence = max(last_sequence, state.base)
+    last_sequence = max(last_sequence, state.compacted)
     observed = tuple(replace(one, fixed=one.fixed or one.sequence <= last_sequence) for one in state.observed)
-    return replace(state, observed=observed, base=last_sequence), last_sequence
+    return replace(state, observed=observed, compacted=last_sequence), last_sequence
 
 
 def _fine_tune(state: State, _: Any) -> tuple[State, Any]:
@@ -254,7 +254,7 @@ def _backup(state: State, _: Any) -> tuple[State, Any]:
 
 def _pack(state: State, _: Any, name: str, rows: bool) -> tuple[State, Any]:
     """Rows stay behind where any are missing."""
-    whole = rows and not (state.base or state.brought)
+    whole = rows and not (state.compacted or state.brought)
     pairs = tuple(one.pair for one in state.observed)
     other = Other(pairs, 0 if whole else len(pairs), not whole, state.said, state.embedding)
     return replace(state, packed=(*state.packed, (name, other))), None
@@ -262,7 +262,7 @@ def _pack(state: State, _: Any, name: str, rows: bool) -> tuple[State, Any]:
 
 def _reembed(state: State, _: Any, embedding: str) -> tuple[State, Any]:
     """Nothing is lost but f*."""
-    if state.base or state.brought:
+    if state.compacted or state.brought:
         return state, "MismatchError"
     return replace(state, embedding=embedding, tuned=None, tuned_last_sequence=0), None
 
@@ -369,7 +369,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
         "pool": _pool(learner),
         "kept": _kept(learner),
         "last": memory.sequence,
-        "base": memory.base if store is None else store.compacted,
+        "compacted": memory.compacted if store is None else store.compacted,
     }
 
 
@@ -398,7 +398,13 @@ def expected(state: State) -> dict[str, Any]:
     for one in sorted(state.observed, key=lambda one: one.sequence):
         if one.touch in DRAWN and one.material not in names.setdefault(str(one.touch), []):
             names[str(one.touch)].append(one.material)
-    told = {"materials": counted, "tuned": tuned, "last": state.last, "base": state.base, "descriptions": said}
+    told = {
+        "materials": counted,
+        "tuned": tuned,
+        "last": state.last,
+        "compacted": state.compacted,
+        "descriptions": said,
+    }
     return _observed(state.pairs, state.embedding) | told | {"names": names}
 
 

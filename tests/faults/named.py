@@ -234,7 +234,7 @@ def currents() -> dict[str, Named]:
         "a checkpoint of another number": newest_is(number=7),
         "a checkpoint up to 2^62": newest_is(last_sequence=2**62),
         "no checkpoint": change(newest=None),
-        "a base": lambda path, _: set_current(path, base=get_current(path)["newest"]),
+        "a compaction checkpoint": lambda path, _: set_current(path, compaction=get_current(path)["newest"]),
         "rows that come twice": doubled,
         "a text": change(newest="x"),
         "a number that is none": newest_is(last_sequence=True),

@@ -39,9 +39,9 @@ def prepare(home: Path) -> dict[str, Other]:
                 learner.compact(keep=keep)
             fixed = 0 if keep is None else max(0, len(left) - keep)
             said = {"plain": (), "taken": (("b", SAID[1]),), "compacted": (("a", SAID[1]), ("ü", SAID[3]))}[name]
-            for material, constituents in said:  # of one that was compacted behind its base
+            for material, constituents in said:  # of one that was compacted behind its compaction checkpoint
                 learner.describe(material, dict(constituents))
-            others[name] = Other(left, fixed, learner._ledger.memory.base > 0, said)
+            others[name] = Other(left, fixed, learner._ledger.memory.compacted > 0, said)
     return others
 
 

@@ -52,17 +52,17 @@ def _compaction_drops_a_row(patch: Patches) -> None:
     patch(journal.Journal, "payloads", make)
 
 
-def _base_with_a_retracted_touch(patch: Patches) -> None:
+def _compaction_with_a_retracted_touch(patch: Patches) -> None:
     def make(until: Any) -> Any:
         def spoilt(memory: Any, given: Any, last_sequence: int) -> Any:
-            base = until(memory, given, last_sequence)
+            made = until(memory, given, last_sequence)
             for sequence in sorted(memory.retracted):
-                if memory.base < sequence <= last_sequence:
+                if memory.compacted < sequence <= last_sequence:
                     record = given.record(sequence)
                     columns, codes = memory.codes(record)
-                    base.statistics.add(record.label, codes, columns)
+                    made.statistics.add(record.label, codes, columns)
                     break
-            return base
+            return made
 
         return spoilt
 
@@ -145,7 +145,7 @@ COUNTS: dict[str, Callable[[Patches], None]] = {
     "a checkpoint says one row too many": _one_row_too_many,
     "numbers of rows are given out again": _numbers_given_out_again,
     "compaction drops the last row": _compaction_drops_a_row,
-    "a base has a retracted touch": _base_with_a_retracted_touch,
+    "a compaction checkpoint has a retracted touch": _compaction_with_a_retracted_touch,
     "excluded rows are forgotten": _excluded_forgotten,
     "kept touches are not retracted": _kept_not_retracted,
     "a retraction is lost in a merge": _retraction_lost_in_a_merge,

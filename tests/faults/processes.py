@@ -204,7 +204,7 @@ class Written:
         for number, state in enumerate(self.states):
             if state.last == found["last"]:
                 told = expected(state)
-                differ[number] = [key for key in found if key != "base" and found[key] != told[key]]
+                differ[number] = [key for key in found if key != "compacted" and found[key] != told[key]]
         return (
             f"saw row {found['last']}, when {acknowledged} operations were acknowledged, {begun} begun, and {earliest} "
             f"seen; states with that row differ in {differ}"
@@ -212,7 +212,7 @@ class Written:
 
 
 def _alike(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return all(one[key] == other[key] for key in one if key != "base")
+    return all(one[key] == other[key] for key in one if key != "compacted")
 
 
 def under_a_writer(home: Path, zygote: Zygote, count: int, seconds: float, seed: int, failures: list[str]) -> Any:

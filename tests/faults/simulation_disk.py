@@ -24,7 +24,7 @@ from faults import shim as watch
 from faults.disks import STYLES, Disk, Event, Folder, _apply, _rebuild, events
 from faults.shim import Shim
 from store.checkpoint_files import Draft
-from store.content import ArrayContent
+from store.chunks import ArrayContent
 
 AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
 EVERY = 4  # rows that are put into an index

@@ -211,7 +211,7 @@ class OneMemory(World):
         def do(learner: Any) -> str:
             def between() -> None:
                 learner.observe(material, stream(touch), again=True)
-                learner._ledger.require_writing()  # passes over the failure of an earlier generation
+                learner._ledger.require_writing()  # passes over the failure of an earlier checkpoint
                 learner._ledger._snapshot()
 
             with interleaved(place, between):

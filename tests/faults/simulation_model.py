@@ -23,13 +23,13 @@ LISTED = ("observe", "member")
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of a memory. base: those up to it were compacted; stands: what was left of these, as pairs.
+    """The rows of a memory. compacted: those up to it were compacted; stands: what was left of these, as pairs.
 
     embedding: its name. unlisted: rows whose heads a repair left out.
     """
 
     rows: tuple[Row, ...] = ()
-    base: int = 0
+    compacted: int = 0
     stands: tuple[Pair, ...] = ()
     embedding: str = "own"
     unlisted: frozenset[int] = frozenset()
@@ -52,7 +52,7 @@ class Rows:
         """All that counts."""
         found = list(self.stands)
         for sequence, row in self.standing:
-            if sequence > self.base:
+            if sequence > self.compacted:
                 found += row[1] if row[0] == "merge" else [row[1:]] if row[0] == "observe" else []
         return tuple(sorted(found))
 
@@ -72,7 +72,7 @@ class Rows:
     @property
     def loose(self) -> list[int]:
         """What can still be retracted."""
-        return [sequence for sequence, row in self.standing if row[0] == "observe" and sequence > self.base]
+        return [sequence for sequence, row in self.standing if row[0] == "observe" and sequence > self.compacted]
 
     @property
     def listed(self) -> list[tuple[int, Pair]]:
@@ -82,7 +82,7 @@ class Rows:
     @property
     def whole(self) -> bool:
         """Whether every touch has its row, with its arrays."""
-        return not self.base and all(row[0] != "merge" for row in self.rows)
+        return not self.compacted and all(row[0] != "merge" for row in self.rows)
 
     def plus(self, *rows: Row) -> Rows:
         """With these rows behind."""
@@ -92,13 +92,13 @@ class Rows:
         """The first rows alone."""
         return replace(self, rows=self.rows[:count])
 
-    def based(self, last_sequence: int) -> Rows:
+    def compact(self, last_sequence: int) -> Rows:
         """Compacted up to a row."""
         pairs = list(self.stands)
         for sequence, row in self.standing:
-            if self.base < sequence <= last_sequence:
+            if self.compacted < sequence <= last_sequence:
                 pairs += row[1] if row[0] == "merge" else [row[1:]] if row[0] == "observe" else []
-        return replace(self, base=last_sequence, stands=tuple(sorted(pairs)))
+        return replace(self, compacted=last_sequence, stands=tuple(sorted(pairs)))
 
 
 Then = tuple[Rows, Any]
@@ -151,9 +151,9 @@ def describe(ours: Rows, material: str, said: Any) -> Then:
 def compact(ours: Rows, keep: int) -> Then:
     """As `TactileLearner.compact`."""
     loose = ours.loose
-    last_sequence = len(ours.rows) if keep == 0 else loose[-keep] - 1 if len(loose) > keep else ours.base
-    last_sequence = max(last_sequence, ours.base)
-    return (ours.based(last_sequence) if last_sequence > ours.base else ours), last_sequence
+    last_sequence = len(ours.rows) if keep == 0 else loose[-keep] - 1 if len(loose) > keep else ours.compacted
+    last_sequence = max(last_sequence, ours.compacted)
+    return (ours.compact(last_sequence) if last_sequence > ours.compacted else ours), last_sequence
 
 
 def packed(ours: Rows, rows: bool) -> Rows:
@@ -179,20 +179,20 @@ def merge(ours: Rows, theirs: Rows, once: bool, choice: str, one_name: bool) -> 
         before = touch in came
         if material not in (names.get(touch) or [came.setdefault(touch, material)]):
             refused.add(sequence)
-        elif before and sequence > theirs.base and theirs.rows[sequence - 1][0] == "observe":
+        elif before and sequence > theirs.compacted and theirs.rows[sequence - 1][0] == "observe":
             again.add(sequence)
     out = (both if once else set()) | refused | again
-    if any(sequence <= theirs.base or theirs.rows[sequence - 1][0] == "member" for sequence in out):
+    if any(sequence <= theirs.compacted or theirs.rows[sequence - 1][0] == "member" for sequence in out):
         return ours, "ObservationError"
     new = {name: said for name, said in theirs.said.items() if repr(ours.said.get(name)) != repr(said)}
     if choice == "same" and new.keys() & ours.said.keys():
         return ours, "MismatchError"
     new = {name: said for name, said in sorted(new.items()) if choice != "ours" or name not in ours.said}
     added: list[Row] = [("describe", name, tuple(said.items())) for name, said in new.items()]
-    added += [("merge", theirs.stands)] if theirs.base else []
+    added += [("merge", theirs.stands)] if theirs.compacted else []
     coming = [(sequence, row) for sequence, row in theirs.standing if sequence not in out]
     for sequence, row in coming:
-        if sequence > theirs.base:
+        if sequence > theirs.compacted:
             added.append(row)
         elif row[0] != "merge":
             added.append(("member", *row[1:]))
@@ -207,7 +207,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
     assert store is not None
     return {
         "last": ledger.memory.sequence,
-        "base": store.compacted,
+        "compacted": store.compacted,
         "listed": [(each.sequence, each.material, each.key, each.state) for each in learner.observations()],
         "materials": learner.materials,
         "descriptions": repr(sorted(learner.descriptions.items())),
@@ -240,12 +240,12 @@ class Expected:
         listed = []
         for sequence, row in enumerate(ours.rows, 1):
             if row[0] in LISTED and sequence not in ours.unlisted:
-                fixed = sequence <= ours.base or row[0] == "member"
+                fixed = sequence <= ours.compacted or row[0] == "member"
                 state = "retracted" if sequence in ours.retracted else "compacted" if fixed else "kept"
                 listed.append((sequence, row[1], self._key(row[2]), state))
         return {
             "last": len(ours.rows),
-            "base": ours.base,
+            "compacted": ours.compacted,
             "listed": listed,
             "materials": dict(sorted(Counter(name for name, _ in ours.pairs).items())),
             "descriptions": repr(sorted(ours.said.items())),

@@ -37,12 +37,12 @@ class Rotting(Carrying):
         whole = machine.rows
         allowed = [whole]
         if hurt.name.startswith("log-") and machine.begins:
-            allowed.append(whole.cut(max(machine.begins[-1], whole.base)))
+            allowed.append(whole.cut(max(machine.begins[-1], whole.compacted)))
         machine.candidates = allowed
         self.warned.clear()
 
         def look(learner: Any, where: str, *, settle: bool = False) -> None:
-            # Of a damaged base a warning tells that nothing can take the place of what is retracted.
+            # Of a damaged compaction checkpoint a warning tells that nothing can take the place of what is retracted.
             named = any("no other touch can take the place" in text for text in self.warned)
             self.look(machine, learner, f"{where} after a bit of {hurt.name} changed", settle=settle, but=KEPT * named)
 
@@ -111,7 +111,7 @@ class Rotting(Carrying):
         rows = whole.cut(repair.kept)
         if not repair.lost and repair.kept < len(whole.rows):
             raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows, and tells of no loss")
-        if repair.kept < whole.base:  # the base is lost: with it all that it stood for
+        if repair.kept < whole.compacted:  # the compaction checkpoint is lost: with it all that it stood for
             self._replace(machine)
             return
         if repair.kept < len(whole.rows) and (not hurt.name.startswith("log-") or repair.kept < contained):
@@ -120,20 +120,22 @@ class Rotting(Carrying):
             learner = self._open(machine, machine.path, [rows], "read")
         except StoreError as error:
             raise Wrong(f"repaired after {hurt.name}, and not opened: {error!r}") from error
-        base = learner._ledger.store.compacted
+        compacted = learner._ledger.store.compacted
         listed = {each.sequence for each in learner.observations()}
         heads = sum(1 for _ in learner._ledger.store.heads())
         learner.close()
-        if base < rows.base:
-            raise Wrong(f"a repair of {hurt.name} left the base at {base}, which was {rows.base}")
-        if base > rows.base:
+        if compacted < rows.compacted:
+            raise Wrong(
+                f"a repair of {hurt.name} left the compaction checkpoint at {compacted}, which was {rows.compacted}"
+            )
+        if compacted > rows.compacted:
             # What a later row took back of those counts again: a warning tells of it at each opening.
-            rows = replace(rows, base=base, stands=rows.cut(base).based(base).stands)
-        unlisted = {sequence for sequence, _ in rows.listed if sequence <= base and sequence not in listed}
+            rows = replace(rows, compacted=compacted, stands=rows.cut(compacted).compact(compacted).stands)
+        unlisted = {sequence for sequence, _ in rows.listed if sequence <= compacted and sequence not in listed}
         if len(unlisted) > 1:
             raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
         # A row of another kind may be left out, too, such as one that took another back.
-        if unlisted or base > whole.base or heads < len(rows.rows):
+        if unlisted or compacted > whole.compacted or heads < len(rows.rows):
             self._with_less(machine, rows)
             return
         machine.candidates, machine.begins = [rows], []

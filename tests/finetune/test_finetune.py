@@ -112,11 +112,11 @@ def test_what_f_star_does_not_know_or_is_too_short_for_is_answered_by_f():
 def test_exemplars_and_f_star_are_there_again_after_opening(tmp_path, kind):
     learner = learned(kind, path=tmp_path / "m")
     digest = learner.fine_tune(epochs=1).digest
-    for i in range(6, 8):  # after the generation: in the journal alone
+    for i in range(6, 8):  # after the checkpoint: in the journal alone
         learner.observe(NAMES[0], SCENE.touch(NAMES[0], i))
     expected = (learner.exemplars, learner.digest(), digest)
     answer = kept(learner).predict(SCENE.touch(NAMES[1], 70), tuned=True)
-    learner._ledger.store.close()  # as if the power failed: no generation is written
+    learner._ledger.store.close()  # as if the power failed: no checkpoint is written
     for _ in range(2):
         with TactileLearner.open(tmp_path / "m", embedding=EMBEDDINGS[kind]()) as again:
             assert (again.exemplars, again.digest(), again.tuned_digest()) == expected

@@ -36,19 +36,19 @@ def test_the_same_twice_changes_nothing_and_one_is_not_true(path):
         require_same(learner, OBSERVED, SAID | {"b": {"silk": True}})
 
 
-def test_a_base_that_all_is_begun_from_again_has_what_was_said_until_then(path):
+def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_until_then(path):
     learner, _ = told(path)
     learner.compact(keep=4)  # what was said comes behind it
     learner.describe("a", None)
     store = learner._ledger.store
     learner._ledger._snapshot()
-    base = store.base().number
+    compaction = store.compaction().number
     store.close()  # as if the power failed
     for folder in (path / "checkpoints").iterdir():
-        if int(folder.name) != base:
+        if int(folder.name) != compaction:
             spoil(path, int(folder.name))
     with TactileLearner.open(path, **SETTINGS) as again:
-        assert again.memory.checkpoint == base
+        assert again.memory.checkpoint == compaction
         require_same(again, OBSERVED, {name: one for name, one in SAID.items() if name != "a"})
 
 

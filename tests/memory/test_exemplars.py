@@ -222,7 +222,7 @@ def test_a_restarted_sample_goes_on_and_one_of_fewer_is_the_beginning_of_it(ours
 
 @few
 @given(streams)
-def test_a_base_gives_exemplars_back_and_says_that_it_has_them(observed):
+def test_a_compaction_checkpoint_gives_exemplars_back_and_says_that_it_has_them(observed):
     kept = [exemplar(*stream) for stream in sorted(set(observed))]
     arrays, about = exemplars_to_arrays(kept)
     again = exemplars_from_arrays(arrays, about)

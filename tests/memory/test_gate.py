@@ -35,7 +35,7 @@ STORED = SETTINGS | {"embedding": Inexact(seed=0, dimension=64)}
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A memory with a generation, one as if its power had failed, one with codes in its rows, and a compacted one."""
+    """A memory with a checkpoint, one as if its power had failed, one with codes in its rows, and a compacted one."""
     folder = tmp_path_factory.mktemp("made")
     for name, settings_ in (("whole", {}), ("coded", STORED), ("compacted", {}), ("other", {})):
         learner, _ = (
@@ -207,11 +207,13 @@ def deep(depth):
     return change
 
 
-def generation(change, *, base=False):
+def checkpoint(change, *, compaction=False):
     def put(path):
         attributes, arrays = checkpoint_of(path)
         change(attributes, arrays)
-        put_checkpoint(path, attributes, {name: one for name, one in arrays.items() if one is not None}, base=base)
+        put_checkpoint(
+            path, attributes, {name: one for name, one in arrays.items() if one is not None}, compaction=compaction
+        )
 
     return put
 
@@ -221,7 +223,7 @@ def summed(name, spoil, **options):
         triangle(name, attributes, arrays)
         arrays[name] = spoil(arrays[name])
 
-    return generation(change, **options)
+    return checkpoint(change, **options)
 
 
 def triangle(name, attributes, arrays):
@@ -233,7 +235,7 @@ def triangle(name, attributes, arrays):
 
 
 def attributed(name, value):
-    return generation(lambda attributes, arrays: attributes.update({name: value}))
+    return checkpoint(lambda attributes, arrays: attributes.update({name: value}))
 
 
 def pairs(values_by_name):
@@ -337,7 +339,7 @@ def forged_rows():
     said = r"row 14 .* key: expected the content hash of its readings"
     yield "another touch's key", under_anothers_key, said, DamageError
     yield "another key, retracted", of_another_key_and_retracted, said, DamageError
-    nobodys = generation(lambda attributes, _: attributes.update(sample=["nobody"] * len(attributes["sample"])))
+    nobodys = checkpoint(lambda attributes, _: attributes.update(sample=["nobody"] * len(attributes["sample"])))
     yield "a sample of nobody's", nobodys, "sample: expected materials that were observed", DamageError
 
 
@@ -353,7 +355,10 @@ def forged_memories():
         yield f"codes-{scale} {name}", "coded", codes(f"codes-{scale}", f"codes-{scale}", spoil), match, DamageError
     yield "a scale less", "coded", codes("codes-37", "codes-37", lambda _: None), "scales", DamageError
     yield "a scale more", "coded", codes("codes-38", "codes-37", np.copy), "scales", DamageError
-    others, said = summed("exemplar-keys", np.flipud, base=True), "exemplar-keys: expected the content hashes of their"
+    others, said = (
+        summed("exemplar-keys", np.flipud, compaction=True),
+        "exemplar-keys: expected the content hashes of their",
+    )
     yield "exemplars under other keys", "compacted", others, said, DamageError
     for field, value in pairs(IDENTITIES):
         yield f"{field} {value}", "whole", identity(field, value), f"identity of .*{field}", DamageError
@@ -386,7 +391,7 @@ def test_what_no_memory_holds_is_refused(made, tmp_path, source, do, match, expe
 
 @pytest.mark.parametrize("where", ["here", "there"])
 def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
-    """Row 1 lies under a generation: opening does not read it, but a touch is left out for its key."""
+    """Row 1 lies under a checkpoint: opening does not read it, but a touch is left out for its key."""
     theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
     theirs.close()
     attributes, arrays = row_of(path, 1)
@@ -439,7 +444,7 @@ def test_what_a_merge_leaves_out_is_looked_at_where_it_is_there(made, tmp_path, 
 def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
     attributes, arrays = checkpoint_of(path)
-    put_checkpoint(path, attributes, hollow(attributes, arrays), base=True)
+    put_checkpoint(path, attributes, hollow(attributes, arrays), compaction=True)
     others = copied(made / "other", tmp_path / "other")
     with opened(others) as target:
         before = contents(target)
@@ -459,13 +464,13 @@ def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
     for name in ("observations", "rows-1048576", "rows-1048577"):
         arrays[name] = arrays[name] + 1
     arrays["lengths"][0, 1] += len(arrays["observations"])
-    put_checkpoint(path, attributes, arrays, base=True)
+    put_checkpoint(path, attributes, arrays, compaction=True)
     assert any("its journal names 4" in found for found in check_memory(path))
     with opened(copied(made / "other", tmp_path / "other")) as target, pytest.raises(DamageError, match="names 4"):
         target.merge(path, shared="twice")
 
 
-def test_what_a_base_brings_is_looked_at_again_when_it_is_read(made, tmp_path):
+def test_what_a_compaction_checkpoint_brings_is_looked_at_again_when_it_is_read(made, tmp_path):
     others = copied(made / "other", tmp_path / "other")
     with opened(others) as target:
         target.merge(made / "compacted", shared="twice")
@@ -558,11 +563,11 @@ def test_a_row_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_fa
 
 @LIMITS
 @given(st.data())
-def test_a_generation_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+def test_a_checkpoint_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
     source = data.draw(st.sampled_from(["whole", "compacted"]))
-    path = copied(made / source, tmp_path_factory.mktemp("generation") / "m")
+    path = copied(made / source, tmp_path_factory.mktemp("checkpoint") / "m")
     attributes, arrays = data.draw(changed(*checkpoint_of(path)))
-    put_checkpoint(path, attributes, arrays, base=source == "compacted")
+    put_checkpoint(path, attributes, arrays, compaction=source == "compacted")
     require_typed_or_equal(path)
 
 

@@ -129,7 +129,7 @@ def test_every_kind_of_row_and_checkpoint_is_in_it(golden):
         assert {head.kind for head in held.heads()} == {"observe", "retract", "merge", "member", "describe"}
         assert 0 < held.compacted < held.latest().last_sequence < held.last
         assert {"sample", "kept", "exemplars", "descriptions", "tuned"} <= set(held.latest().attributes)
-        assert len(held.base().arrays["exemplar-readings"])
+        assert len(held.compaction().arrays["exemplar-readings"])
 
 
 @pytest.mark.parametrize("how", [opened, TactileLearner.open])
@@ -171,7 +171,7 @@ def test_it_is_what_this_version_writes(golden, tmp_path):
             arrays = [sorted(record.arrays) for record in held.records(held.compacted)]
             points = [
                 (point.last_sequence, sorted(point.arrays), sorted(point.attributes))
-                for point in (held.latest(), held.base())
+                for point in (held.latest(), held.compaction())
             ]
             written.append((held.identity, rows, arrays, points))
             assert held.identity == Identity.read(held).to_json()

@@ -306,9 +306,9 @@ class TestRefresh:
             require_same(reader, without(0))
 
 
-def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
+def test_a_compaction_checkpoint_is_gone_on_from_where_all_else_is_lost(path):
     learner, receipts = filled(path)
-    learner.retract(receipts[1])  # before the base
+    learner.retract(receipts[1])  # before the compaction checkpoint
     learner.retract(receipts[10])  # behind it
     learner.compact(keep=4)
     learner.retract(receipts[11])
@@ -317,11 +317,11 @@ def test_a_base_is_gone_on_from_where_all_else_is_lost(path):
     require_same(learner, expected)
     learner._ledger.store.close()  # as if the power failed
     with Store.open(path) as store:
-        newest, base = store.newest, store.base().number
-    assert newest != base
+        newest, compaction = store.newest, store.compaction().number
+    assert newest != compaction
     spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:
-        assert learner.memory.checkpoint == base
+        assert learner.memory.checkpoint == compaction
         require_same(learner, expected)
         learner.retract(later)
         require_same(learner, expected[:-1])
@@ -348,18 +348,18 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     assert "observation 1 was retracted by row 13, but still counts" in caplog.text
 
 
-def test_a_base_of_a_base_still_knows_what_both_left_out(path, caplog):
+def test_a_compaction_of_a_compaction_still_knows_what_both_left_out(path, caplog):
     learner, receipts = filled(path)
-    learner.retract(receipts[0])  # row 13, behind both bases
+    learner.retract(receipts[0])  # row 13, behind both compaction checkpoints
     learner.compact(keep=8)
     learner.compact(keep=5)
     learner._ledger.store.close()  # as if the power failed
     with Store.open(path) as store:
-        newest, base = store.newest, store.base().number
-    if newest != base:
+        newest, compaction = store.newest, store.compaction().number
+    if newest != compaction:
         spoil(path, newest)
     with TactileLearner.open(path, **SETTINGS) as learner:
-        assert learner.memory.checkpoint == base
+        assert learner.memory.checkpoint == compaction
         require_same(learner, without(0))
     assert "still counts" not in caplog.text
 
@@ -386,12 +386,12 @@ def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkey
         require_same(learner, without(11))
 
 
-def test_with_a_damaged_base_nothing_is_retracted(path):
+def test_with_a_damaged_compaction_checkpoint_nothing_is_retracted(path):
     learner, receipts = filled(path)
     with learner:
         learner.compact(keep=6)
-        base = learner._ledger.store.base().number
-        spoil(path, base)
+        compaction = learner._ledger.store.compaction().number
+        spoil(path, compaction)
         for call in (lambda: learner.retract(receipts[-1]), lambda: learner.forget("a")):
             with pytest.raises((DamageError, ObservationError)):
                 call()
@@ -403,14 +403,14 @@ def test_with_a_damaged_base_nothing_is_retracted(path):
         require_same(again, [*OBSERVED, ("a", (9, 60))], exemplars=False)
 
 
-def test_a_base_damaged_since_keeps_nobody_from_opening(path, caplog):
+def test_a_compaction_checkpoint_damaged_since_keeps_nobody_from_opening(path, caplog):
     learner, receipts = filled(path)
     learner.compact(keep=6)
     learner.retract(receipts[-1])
     learner.retract(receipts[-4])
-    base = learner._ledger.store.base().number
+    compaction = learner._ledger.store.compaction().number
     learner._ledger.store.close()  # as if the power failed: the retractions are to be replayed
-    spoil(path, base)
+    spoil(path, compaction)
     with TactileLearner.open(path, **SETTINGS) as again:
         whole = fed(without(11, 8))
         assert again.digest() == whole.digest()

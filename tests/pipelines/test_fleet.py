@@ -49,7 +49,7 @@ def run(destination, sources, options=BY_FOLDER, client=None, **settings):
 
 
 def require_learned(destination, touches=TOUCHES, **settings):
-    """The memory is that of one process, to the byte, now and when its generation is lost; each touch says its file."""
+    """The memory is that of one process, to the byte, now and when its checkpoint is lost; each touch says its file."""
     with TactileLearner.open(destination) as learner:
         require_same(learner, set(touches), **settings)
         assert sum(learner.materials.values()) == len(set(touches))

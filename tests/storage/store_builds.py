@@ -41,7 +41,7 @@ def commit(call, last_sequence, **options):
 
 
 def build(path, *, compacted=False, last=LAST):
-    """Twenty rows, a checkpoint up to row 15, and, where compacted, a base up to row 6 beside it."""
+    """Twenty rows, a checkpoint up to row 15, and, where compacted, a compaction checkpoint up to row 6 beside it."""
     with Store.open(path, identity=IDENTITY) as opened:
         for number in range(1, last + 1):
             add(opened, number)
@@ -74,8 +74,8 @@ def newest(path):
     return checkpoint_path(path, read_current(path / "CURRENT").newest.number)
 
 
-def base(path):
-    return checkpoint_path(path, read_current(path / "CURRENT").base.number)
+def compaction(path):
+    return checkpoint_path(path, read_current(path / "CURRENT").compaction.number)
 
 
 def flip(file, place=-9, bit=2):
@@ -132,7 +132,7 @@ def write_log(path, payloads, *, header=None, kind=ROW):
             at += 1
         return named and replace(named, place=places[at][1])
 
-    write_current(path, replace(current, newest=placed(current.newest), base=placed(current.base)))
+    write_current(path, replace(current, newest=placed(current.newest), compaction=placed(current.compaction)))
 
 
 def change_rows(path, change):

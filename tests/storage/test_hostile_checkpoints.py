@@ -196,18 +196,18 @@ OWN = {
 SAID = {name: {"arrays": arrays} for name, arrays in ARRAYS_SAID.items()} | OWN
 
 
-@pytest.mark.parametrize("is_base", [False, True])
+@pytest.mark.parametrize("is_compaction", [False, True])
 @pytest.mark.parametrize("said", SAID.values(), ids=SAID)
-def test_what_a_checkpoint_never_says_of_itself_is_damage(path, said, is_base):
+def test_what_a_checkpoint_never_says_of_itself_is_damage(path, said, is_compaction):
     describe_again(path, **said)
-    if is_base:
-        put_current(path, base=known_current(path)["newest"])
+    if is_compaction:
+        put_current(path, compaction=known_current(path)["newest"])
     with Store.open(path, mode="read") as opened:
         assert opened.latest() is None
         assert opened.latest(only=()) is None
-        if is_base:
+        if is_compaction:
             with pytest.raises(DamageError, match="checkpoint"):
-                opened.base()
+                opened.compaction()
     assert check_store(path)
 
 

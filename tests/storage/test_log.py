@@ -221,17 +221,17 @@ def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):
     assert found == [payload(index) for index in range(8) if inserted or index != lost]
 
 
-def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy):
+def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy, monkeypatch):
     with LogWriter(copy) as writer, LogReader(copy) as log:
-        frames = log._frames
+        frames = store.log.frames_behind
 
-        def later(offset):
+        def later(file, offset, mark):
             if writer.place.number == 14:
                 append(writer, [b"1"])
                 append(writer, [b"2"])
-            return frames(offset)
+            return frames(file, offset, mark)
 
-        log._frames = later
+        monkeypatch.setattr(store.log, "frames_behind", later)
         assert rest(log) == [*BATCHES, [b"1"], [b"2"]]
 
 

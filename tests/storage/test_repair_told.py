@@ -10,7 +10,7 @@ from store import Store, repair_store
     ("behind", "said"),
     [((), "any more"), (("retract",), "row 16 (1 retract)"), (("b", "c", "b"), "rows 16 to 18 (2 b, 1 c)")],
 )
-def test_rows_behind_a_new_base_that_took_back_one_before_it_are_named(tmp_path, behind, said):
+def test_rows_behind_a_new_compaction_checkpoint_that_took_back_one_before_it_are_named(tmp_path, behind, said):
     path = build(tmp_path / "s", last=15)
     with Store.open(path) as opened:
         for kind in behind:

@@ -42,7 +42,7 @@ def same_store(found, expected):
         assert list(ours.heads()) == list(theirs.heads())
         for mine, other in zip(ours.records(ours.compacted), theirs.records(theirs.compacted), strict=True):
             assert same_arrays(mine.arrays, other.arrays)
-        for mine, other in ((ours.latest(), theirs.latest()), (ours.base(), theirs.base())):
+        for mine, other in ((ours.latest(), theirs.latest()), (ours.compaction(), theirs.compaction())):
             assert (mine is None) == (other is None)
             assert mine is None or same_arrays(mine.arrays, other.arrays)
     return True

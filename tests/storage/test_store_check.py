@@ -10,8 +10,8 @@ from store_builds import (
     IDENTITY,
     LAST,
     add,
-    base,
     commit,
+    compaction,
     contents,
     damage,
     flip,
@@ -59,7 +59,7 @@ def test_the_only_copy_of_a_state_is_lost(plain):
 
 def test_a_checkpoint_in_anothers_place_is_found(compacted):
     shutil.rmtree(newest(compacted))
-    shutil.copytree(base(compacted), newest(compacted))
+    shutil.copytree(compaction(compacted), newest(compacted))
     assert "another than was written there" in found(compacted)
 
 

@@ -1,4 +1,4 @@
-"""Compaction: a base stands for rows that have given up their arrays, in a log that takes the other's place."""
+"""Compaction: a checkpoint stands for rows that have given up their arrays, in a log that takes the other's place."""
 
 import errno
 import os
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from store_builds import as_after_a_crash, base, damage, flip_row, folders, log_of
+from store_builds import as_after_a_crash, compaction, damage, flip_row, folders, log_of
 
 import store.checkpoints
 import store.files
@@ -69,7 +69,7 @@ def agrees(opened, compacted, last=LAST):
     for after in range(compacted):
         with pytest.raises(CompactedError, match=f"records 1 to {compacted}"):
             opened.records(after)
-    found = opened.base()
+    found = opened.compaction()
     if compacted:
         assert (found.last_sequence, found.arrays["sum"]) == (compacted, sums(compacted)["sum"])
     else:
@@ -88,7 +88,7 @@ def test_the_space_is_given_back_to_the_disk(opened):
 
 
 @pytest.mark.parametrize("last_sequence", [4, -1, LAST + 1, True, 5.0])
-def test_there_is_no_way_back_before_the_base(opened, last_sequence):
+def test_there_is_no_way_back_before_the_compaction_checkpoint(opened, last_sequence):
     compact(opened, 5)
     for call in (opened.commit, opened.commit_later, opened.compact):
         with pytest.raises(RecordError, match=f"last_sequence must be a sequence from 5, .* to {LAST}"):
@@ -96,11 +96,11 @@ def test_there_is_no_way_back_before_the_base(opened, last_sequence):
     assert agrees(opened, 5)
 
 
-def test_a_damaged_base_is_named_and_the_newest_checkpoint_gone_on_from(opened, caplog):
+def test_a_damaged_compaction_checkpoint_is_named_and_the_newest_checkpoint_gone_on_from(opened, caplog):
     compact(opened, 5)
-    spoil(base(opened.path))
+    spoil(compaction(opened.path))
     with pytest.raises(DamageError, match="array 'bulk' of checkpoint 2"):
-        opened.base()
+        opened.compaction()
     assert opened.latest().last_sequence == LAST
     # It is kept all the same, for a repair to decide.
     for number in range(LAST + 1, LAST + 4):
@@ -110,14 +110,14 @@ def test_a_damaged_base_is_named_and_the_newest_checkpoint_gone_on_from(opened, 
     assert caplog.records == []
 
 
-def test_a_damaged_row_behind_the_base_is_named_and_nothing_is_given_up(opened):
+def test_a_damaged_row_behind_the_compaction_checkpoint_is_named_and_nothing_is_given_up(opened):
     flip_row(opened.path, 7, arrays=True)
     before = log_of(opened.path).read_bytes()
     with pytest.raises(DamageError, match="row 7 is not as it was written") as caught:
         compact(opened, 5)
     assert caught.value.sequence == 7
     assert log_of(opened.path).read_bytes() == before
-    # Where the base stands for it, its arrays are given up anyway.
+    # Where the compaction checkpoint stands for it, its arrays are given up anyway.
     compact(opened, 7)
     assert agrees(opened, 7)
 

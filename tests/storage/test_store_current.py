@@ -37,10 +37,10 @@ def is_whole(path, compacted, latest=15):
         assert (opened.identity, opened.last, opened.compacted) == (IDENTITY, LAST, compacted)
         assert [head.label for head in opened.heads()] == [f"row {number}" for number in range(1, LAST + 1)]
         assert len(list(opened.records(compacted))) == LAST - compacted
-        found, base = opened.latest(), opened.base()
+        found, compaction = opened.latest(), opened.compaction()
         assert found.last_sequence == latest
         assert same_arrays(found.arrays, state(latest))
-        assert (base.last_sequence if base else 0) == compacted
+        assert (compaction.last_sequence if compaction else 0) == compacted
     assert damage(path) == []
     return True
 
@@ -109,8 +109,8 @@ FORGED = {
     "an last_sequence in words": lambda path: {"newest": named(path, last_sequence="15")},
     "a number above any": lambda path: {"newest": named(path, number=2**64)},
     "a sha256 in capitals": lambda path: {"newest": named(path, sha256="AB" * 32)},
-    "a base without a newest": lambda path: {"newest": None, "base": named(path)},
-    "a base newer than the newest": lambda path: {"base": named(path, last_sequence=16)},
+    "a compaction checkpoint without a newest": lambda path: {"newest": None, "compaction": named(path)},
+    "a compaction checkpoint newer than the newest": lambda path: {"compaction": named(path, last_sequence=16)},
     "a place in no frame": lambda path: placed(path, offset=named(path)["place"][0] + 1),
     "a place beyond the end": lambda path: placed(path, offset=2**40),
     "a place at the last byte of all": lambda path: placed(path, offset=2**63 - 1),
@@ -164,18 +164,18 @@ def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, curren
     assert is_whole(plain, 0)
 
 
-@pytest.mark.parametrize("which_one", ["newest", "base"])
+@pytest.mark.parametrize("which_one", ["newest", "compaction"])
 @pytest.mark.parametrize("change", [{"number": 9}, {"sha256": "0" * 64}, {"last_sequence": 14}])
 def test_a_checkpoint_that_is_another_than_the_one_named_is_not_believed(compacted, which_one, change):
     known = known_current(compacted)[which_one]
-    change = change | ({"last_sequence": 5} if "last_sequence" in change and which_one == "base" else {})
+    change = change | ({"last_sequence": 5} if "last_sequence" in change and which_one == "compaction" else {})
     put_current(compacted, **{which_one: known | change})
     with Store.open(compacted, mode="read") as opened:
         if which_one == "newest":
             assert opened.latest().last_sequence == 6
         else:
             with pytest.raises(DamageError, match="checkpoint"):
-                opened.base()
+                opened.compaction()
             assert opened.latest().last_sequence == 15
     assert damage(compacted)
     repair_store(compacted)

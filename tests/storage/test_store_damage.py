@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from store_builds import (
     LAST,
-    base,
     change_rows,
+    compaction,
     flip,
     flip_row,
     folders,
@@ -121,7 +121,7 @@ SPOIL = {
 
 @pytest.mark.parametrize(("harm", "said"), SPOIL.values(), ids=SPOIL)
 @pytest.mark.parametrize("mode", ["read", "write"])
-def test_a_spoilt_checkpoint_is_named_and_the_base_taken(compacted, harm, said, mode, caplog):
+def test_a_spoilt_checkpoint_is_named_and_the_compaction_checkpoint_taken(compacted, harm, said, mode, caplog):
     folder = newest(compacted)
     harm(folder)
     problems = check_store(compacted)
@@ -137,14 +137,14 @@ def test_a_spoilt_checkpoint_is_named_and_the_base_taken(compacted, harm, said, 
 
 
 @pytest.mark.parametrize(("harm", "said"), SPOIL.values(), ids=SPOIL)
-def test_a_spoilt_base_is_lost(compacted, harm, said):
-    harm(base(compacted))
+def test_a_spoilt_compaction_checkpoint_is_lost(compacted, harm, said):
+    harm(compaction(compacted))
     problems = check_store(compacted)
     assert said in " ".join(problem.what for problem in problems)
     assert {problem.kind for problem in problems} == {"lost"}
     with Store.open(compacted, mode="read") as opened:
         with pytest.raises(DamageError, match="checkpoint"):
-            opened.base()
+            opened.compaction()
         assert opened.latest().last_sequence == 15
 
 

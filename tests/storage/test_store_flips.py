@@ -22,7 +22,7 @@ def content(path):
             "heads": list(opened.heads()),
             "rows": [(row.sequence, row.label, row.arrays["x"].tobytes()) for row in opened.records(opened.compacted)],
             "latest": sound(opened.latest()),
-            "base": sound(opened.base()),
+            "compaction": sound(opened.compaction()),
         }
 
 
@@ -39,12 +39,12 @@ def is_a_state_there_has_been(found, whole, kept):
     assert (found["identity"], found["last"]) == (IDENTITY, kept)
     before = {head.sequence: head for head in whole["heads"]}
     assert all(before[head.sequence] == head for head in found["heads"])
-    # A head is lost only where a base stands for it.
+    # A head is lost only where a compaction checkpoint stands for it.
     behind = [head.sequence for head in found["heads"] if head.sequence > found["compacted"]]
     assert behind == list(range(found["compacted"] + 1, kept + 1))
     rows = [(number, f"row {number}", values(number).tobytes()) for number in range(found["compacted"] + 1, kept + 1)]
     assert found["rows"] == rows
-    assert found["base"] == found["compacted"]
+    assert found["compaction"] == found["compacted"]
     return True
 
 

@@ -21,7 +21,7 @@ class Undone(Exception):
 
 
 class History(RuleBasedStateMachine):
-    """The model: every row that was acknowledged, the checkpoint that is current, and the base."""
+    """The model: every row that was acknowledged, the checkpoint that is current, and the compaction checkpoint."""
 
     def __init__(self):
         super().__init__()
@@ -29,7 +29,7 @@ class History(RuleBasedStateMachine):
         self.lives = 0
         self.rows: list[tuple[str, bytes]] = []
         self.current: tuple[int, int, bytes] | None = None  # last_sequence, number, content
-        self.base: tuple[int, int, bytes] | None = None
+        self.compaction: tuple[int, int, bytes] | None = None
 
     @initialize()
     def create(self):
@@ -37,7 +37,7 @@ class History(RuleBasedStateMachine):
 
     @property
     def compacted(self):
-        return self.base[0] if self.base else 0
+        return self.compaction[0] if self.compaction else 0
 
     def put(self, label, array):
         assert self.store.append("a", label, b"key", arrays={"x": array}).sequence == len(self.rows) + 1
@@ -62,7 +62,7 @@ class History(RuleBasedStateMachine):
 
     def numbered(self, last_sequence, array):
         """A checkpoint has the number behind those that are kept."""
-        kept = [made[1] for made in (self.current, self.base) if made]
+        kept = [made[1] for made in (self.current, self.compaction) if made]
         return last_sequence, 1 + max(kept, default=0), array.tobytes()
 
     @rule(where=st.floats(0, 1), value=st.integers(0, 255), later=st.booleans())
@@ -81,7 +81,7 @@ class History(RuleBasedStateMachine):
         self.store.compact(
             {"x": array}, last_sequence=last_sequence, newest=({"x": array}, {}) if with_newest else None
         )
-        self.current = self.base = self.numbered(last_sequence, array)
+        self.current = self.compaction = self.numbered(last_sequence, array)
         if with_newest:
             self.current = self.numbered(len(self.rows), array)
 
@@ -129,7 +129,7 @@ class History(RuleBasedStateMachine):
         flip_row(copy, lost, arrays=arrays)
         assert repair_store(copy).kept == lost - 1
         if not self.compacted:
-            self.base = None  # one that stands for no rows
+            self.compaction = None  # one that stands for no rows
         self.rows = self.rows[: lost - 1]
         self.store = Store.open(copy)
 
@@ -149,7 +149,7 @@ class History(RuleBasedStateMachine):
                 assert [head.label for head in opened.heads()] == [label for label, _ in self.rows]
                 assert (opened.last, opened.identity) == (len(self.rows), {"lives": 9})
                 assert opened.compacted == self.compacted
-            latest, base, newest = reader.latest(), reader.base(), reader.newest
+            latest, compaction, newest = reader.latest(), reader.compaction(), reader.newest
             if self.compacted:
                 try:
                     reader.record(self.compacted)
@@ -158,7 +158,9 @@ class History(RuleBasedStateMachine):
                 else:
                     raise AssertionError("not compacted")
         assert (latest and (latest.last_sequence, latest.number, latest.arrays["x"].tobytes())) == self.current
-        assert (base and (base.last_sequence, base.number, base.arrays["x"].tobytes())) == self.base
+        assert (
+            compaction and (compaction.last_sequence, compaction.number, compaction.arrays["x"].tobytes())
+        ) == self.compaction
         assert newest == (self.current and self.current[1])
 
     def teardown(self):

@@ -183,7 +183,7 @@ def test_a_mode_is_read_or_write(tmp_path):
         Store.open(tmp_path, identity={}, mode="append")
 
 
-@pytest.mark.parametrize("died", ["os.replace", "store.layout.write_current", "store.files.sync_file"])
+@pytest.mark.parametrize("died", ["os.replace", "store.lock.write_current", "store.files.sync_file"])
 def test_an_interrupted_creation_is_finished_by_the_next(tmp_path, monkeypatch, died):
     path = tmp_path / "s"
     with monkeypatch.context() as broken, pytest.raises(KeyboardInterrupt):

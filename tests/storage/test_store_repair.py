@@ -11,9 +11,9 @@ from store_builds import (
     LAST,
     add,
     as_after_a_crash,
-    base,
     change_rows,
     commit,
+    compaction,
     contents,
     cut_rows,
     damage,
@@ -47,21 +47,21 @@ from store.layout import log_path
 from store.row_encoding import decode_row, head_without_arrays
 
 
-def agrees(path, *, kept, base=0, latest=None, lost=()):
-    """A store of rows 1 to `kept`, of which those up to `base` have no arrays and those in `lost` are not there."""
+def agrees(path, *, kept, compacted=0, latest=None, lost=()):
+    """A store of rows 1 to `kept`, of which those up to `compacted` have no arrays and `lost` are not there."""
     assert damage(path) == []
     for mode in ("read", "write"):
         with Store.open(path, mode=mode) as opened:
-            assert (opened.identity, opened.last, opened.compacted) == (IDENTITY, kept, base)
+            assert (opened.identity, opened.last, opened.compacted) == (IDENTITY, kept, compacted)
             rows = [(row.sequence, row.label, row.key, row.attributes) for row in opened.heads()]
             expected = [n for n in range(1, kept + 1) if n not in lost]
             assert rows == [(n, f"row {n}", bytes([n]), {"n": n}) for n in expected]
-            rows = [(row.sequence, row.arrays["x"].tobytes()) for row in opened.records(base)]
-            assert rows == [(n, values(n).tobytes()) for n in range(base + 1, kept + 1)]
-            for number in range(1, base + 1):
+            rows = [(row.sequence, row.arrays["x"].tobytes()) for row in opened.records(compacted)]
+            assert rows == [(n, values(n).tobytes()) for n in range(compacted + 1, kept + 1)]
+            for number in range(1, compacted + 1):
                 with pytest.raises(CompactedError):
                     opened.record(number)
-            for found, last_sequence in ((opened.latest(), latest), (opened.base(), base or None)):
+            for found, last_sequence in ((opened.latest(), latest), (opened.compaction(), compacted or None)):
                 assert (found and found.last_sequence) == last_sequence
                 if found:
                     assert found.attributes == {"n": last_sequence}
@@ -76,7 +76,7 @@ def goes_on(path):
         assert add(opened, number).sequence == number
         commit(opened.commit, number)
         commit(opened.compact, number)
-        assert opened.base().last_sequence == number
+        assert opened.compaction().last_sequence == number
     assert damage(path) == []
     return True
 
@@ -130,13 +130,13 @@ def test_a_lost_row_is_found_and_stays_in_its_checkpoint_or_ends_the_store(eithe
         assert done.kept == 17
         (lost,) = done.lost
         assert lost.startswith(f"rows 18 to 20 are dropped, also those that verify: {said}")
-        assert agrees(either, kept=17, base=6 if which else 0, latest=15)
+        assert agrees(either, kept=17, compacted=6 if which else 0, latest=15)
     else:
         assert done.kept == LAST
         assert said in done.lost[0]
         assert f"in checkpoint {number}, but can no longer be retracted" in done.lost[0]
         assert f"rows 1 to 15 give up their arrays, checkpoint {number} stands for them" in done.lost[-1]
-        assert agrees(either, kept=LAST, base=15, latest=15, lost=range(8, 8 + gone))
+        assert agrees(either, kept=LAST, compacted=15, latest=15, lost=range(8, 8 + gone))
     assert goes_on(either)
 
 
@@ -147,23 +147,26 @@ def test_a_lost_head_of_a_compacted_row_is_left_out_and_no_more(compacted):
         list(opened.heads())
     done = repair_store(compacted)
     assert [lost.split(";")[0] for lost in done.lost] == ["row 3 is missing", "row 5 is missing"]
-    assert agrees(compacted, kept=LAST, base=6, latest=15, lost=[3, 5])
+    assert agrees(compacted, kept=LAST, compacted=6, latest=15, lost=[3, 5])
     # They are named as lost once; another one that goes is damage.
     flip_row(compacted, 4)
     with Store.open(compacted, mode="read") as opened, pytest.raises(DamageError, match="rows 4 to 5 are missing"):
         list(opened.heads(3))
     repair_store(compacted)
-    assert agrees(compacted, kept=LAST, base=6, latest=15, lost=[3, 4, 5])
+    assert agrees(compacted, kept=LAST, compacted=6, latest=15, lost=[3, 4, 5])
     assert goes_on(compacted)
 
 
 CHECKPOINTS = {
-    # compacted, checkpoints spoilt, rows lost: kept, base, latest, what is said of rows
+    # compacted, checkpoints spoilt, rows lost: kept, compacted, latest, what is said of rows
     "the newest": ((False, [newest], []), (LAST, 0, None, [])),
     "the newest, and rows": ((False, [newest], [4, 12]), (3, 0, None, ["rows 4 to 20 are dropped"])),
-    "the base": ((True, [base], []), (LAST, 15, 15, ["rows 1 to 15 give up their arrays, checkpoint 2 stands for"])),
-    "the newest beside a base": ((True, [newest], []), (LAST, 6, 6, [])),
-    "both": ((True, [newest, base], []), (0, 0, None, ["rows 1 to 20 are dropped"])),
+    "the compaction checkpoint": (
+        (True, [compaction], []),
+        (LAST, 15, 15, ["rows 1 to 15 give up their arrays, checkpoint 2 stands for"]),
+    ),
+    "the newest beside a compaction checkpoint": ((True, [newest], []), (LAST, 6, 6, [])),
+    "both": ((True, [newest, compaction], []), (0, 0, None, ["rows 1 to 20 are dropped"])),
 }
 
 
@@ -181,7 +184,7 @@ def test_damaged_checkpoints_are_put_aside_and_the_next_best_gone_on_from(stores
     assert (done.kept, done.aside) == (kept, log.with_name(f"{log.name}.damaged"))
     said = [*said, *(f"checkpoint {folder.name.lstrip('0')}: array 'rows'" for folder in spoilt)]
     assert [text[: len(begin)] for text, begin in zip(done.lost, said, strict=True)] == said
-    assert agrees(path, kept=kept, base=last_sequence, latest=latest)
+    assert agrees(path, kept=kept, compacted=last_sequence, latest=latest)
     assert [contents(folder.with_name(f"{folder.name}.damaged")) for folder in spoilt] == before
     assert goes_on(path)
 
@@ -190,7 +193,7 @@ def test_an_identity_that_a_checkpoint_knows_is_not_lost(either, which):
     flip(log_of(either), FRAME_BYTES + 2)
     done = repair_store(either)
     assert done.lost == []
-    assert agrees(either, kept=LAST, base=6 if which else 0, latest=15)
+    assert agrees(either, kept=LAST, compacted=6 if which else 0, latest=15)
 
 
 @pytest.mark.parametrize("first", [2, 7, 11, 15, 18])
@@ -201,7 +204,7 @@ def test_a_log_that_was_cut_off_gives_what_it_still_has(plain, first):
     with Store.open(plain) as opened:
         at = opened.compacted
     assert at == (15 if first <= 15 else 0)
-    assert agrees(plain, kept=done.kept, base=at, latest=15, lost=range(first, 16))
+    assert agrees(plain, kept=done.kept, compacted=at, latest=15, lost=range(first, 16))
     assert goes_on(plain)
 
 
@@ -235,12 +238,12 @@ def test_without_a_log_all_the_rest_is_checked_and_the_newest_checkpoint_gone_on
     assert done.aside == (file.with_name(f"{file.name}.damaged") if "is gone" not in said else None)
     if rows_verify:  # and a checkpoint knows the identity
         assert done.lost == []
-        assert agrees(either, kept=LAST, base=6 if which else 0, latest=15)
+        assert agrees(either, kept=LAST, compacted=6 if which else 0, latest=15)
         return
     assert done.kept == 15
     assert "are missing" in done.lost[0]
     assert "the rows behind 15, if there were any, are lost" in done.lost[-1]
-    assert agrees(either, kept=15, base=15, latest=15, lost=range(1, 16))
+    assert agrees(either, kept=15, compacted=15, latest=15, lost=range(1, 16))
     assert goes_on(either)
 
 
@@ -328,19 +331,19 @@ def steps_of(monkeypatch, last):
     return count
 
 
-@pytest.mark.parametrize("how", ["row", "row and base", "no log", "no CURRENT", "checkpoint", "all"])
+@pytest.mark.parametrize("how", ["row", "row and compaction checkpoint", "no log", "no CURRENT", "checkpoint", "all"])
 def test_killed_at_any_step_it_can_be_begun_again(stores, tmp_path, monkeypatch, how):
-    source = shutil.copytree(stores["base" in how or how == "all"], tmp_path / "source")
+    source = shutil.copytree(stores["compaction" in how or how == "all"], tmp_path / "source")
     log = log_of(source)
     if how == "no log":
         log.unlink()
-    if how in ("row", "row and base", "all"):
+    if how in ("row", "row and compaction checkpoint", "all"):
         flip_row(source, 8)
         flip_row(source, 18, arrays=True)
     if how == "checkpoint":
         spoil(newest(source))
-    if how in ("row and base", "all"):
-        spoil(base(source))
+    if how in ("row and compaction checkpoint", "all"):
+        spoil(compaction(source))
     if how in ("no CURRENT", "all"):
         (source / "CURRENT").unlink()
     whole = shutil.copytree(source, tmp_path / "whole")

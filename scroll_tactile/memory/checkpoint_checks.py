@@ -186,7 +186,7 @@ class CheckpointChecks:
         order = np.diff(pairs[:, 0] * MOST_STAGES + pairs[:, 1])
         order[np.cumsum(sizes)[:-1] - 1] = 1  # from one touch to the next
         expect(bool((order > 0).all()), "sample-pairs", "stages and scales in order", pairs)
-        rows = array(arrays, "sample-rows", ("int32",), (len(pairs), self._dimension if len(pairs) else None))
+        rows = array(arrays, "sample-rows", ("int32",), (self._dimension if len(pairs) else None, len(pairs)))
         check_values(rows, partial(codes, "sample-rows"))
 
     def _check_kept(self, arrays: Arrays, materials: list[str]) -> None:

@@ -459,9 +459,10 @@ def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
 def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
     path = copied(made / "compacted", tmp_path / "m")
     attributes, arrays = checkpoint_of(path)
-    for scale in (1048576, 1048577):
+    views = (1048576, 1048577, 1048578)
+    for scale in views:
         triangle(f"second-{scale}", attributes, arrays)
-    for name in ("observations", "rows-1048576", "rows-1048577"):
+    for name in ("observations", *(f"rows-{scale}" for scale in views)):
         arrays[name] = arrays[name] + 1
     arrays["lengths"][0, 1] += len(arrays["observations"])
     put_checkpoint(path, attributes, arrays, compaction=True)

@@ -12,12 +12,12 @@ from typing import Any, Self, cast
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.kept import Keeping, KeptTouches
 from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.readouts.likelihood import LevelArray
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics

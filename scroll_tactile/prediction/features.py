@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_competing, embed_windows, require_rest
 from scroll_tactile.errors import EmbeddingError
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.rows import Codes
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented

@@ -15,20 +15,20 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.deviation import recall_of
+from scroll_tactile.matching.likelihood import MISSING, LevelArray
+from scroll_tactile.matching.match import Kept, Recollection
+from scroll_tactile.matching.matcher import Recall
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
-from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
-from scroll_tactile.readouts.deviation import recall_of
 from scroll_tactile.readouts.held_out import HeldOut, held_out
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
-from scroll_tactile.readouts.likelihood import MISSING, LevelArray
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept, Recollection
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch

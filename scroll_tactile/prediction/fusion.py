@@ -22,11 +22,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import CLEAN
+from scroll_tactile.matching.match import Recollection
+from scroll_tactile.matching.matcher import Recall
 from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
 from scroll_tactile.readouts.held_out import HeldOut
-from scroll_tactile.readouts.likelihood import CLEAN
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Recollection
 
 __all__ = [
     "USUAL",

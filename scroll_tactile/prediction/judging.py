@@ -1,7 +1,7 @@
 """A touch judged: by the readouts, and beside kept touches where it is not as those that were learned.
 
 A touch that the readouts know well is theirs alone. One that lies far from all that was learned, that they are not sure
-of, or that has another length than those learned, is compared with kept touches as well (see `readouts.recall`): with
+of, or that has another length than those learned, is compared with kept touches as well (see `matching.matcher`): with
 their beginnings, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by its
 own row of the table (see `prediction.fusion`), and they weigh exp(COUNTED e), e the evidence for each, per value.
 Channels that never change are filled in with what the kept touches have there, and the touch is judged again. Of noise
@@ -19,12 +19,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import LevelArray, levels_of
+from scroll_tactile.matching.match import Recollection
+from scroll_tactile.matching.matcher import Recall
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fusion import USUAL, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
-from scroll_tactile.readouts.likelihood import LevelArray, levels_of
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Recollection
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.stream import Stream
 

@@ -12,16 +12,16 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.matcher import Recall
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.fusion import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
-from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.leave_one_out import LeftOut
 from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
-from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch

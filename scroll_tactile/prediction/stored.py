@@ -21,17 +21,17 @@ from scroll_tactile import __version__
 from scroll_tactile.embeddings.banks import MOST_CHANNELS, ROUND, THRESHOLDS, Bank, bank_size
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.likelihood import LEVELS, Likelihood
+from scroll_tactile.matching.match import Kept, Measured
+from scroll_tactile.matching.matcher import Recall
 from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.fusion import Fusion, Moment, Trajectories
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import Calibration
-from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.likelihood import LEVELS, Likelihood
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept, Measured
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
 from store import Checkpoint

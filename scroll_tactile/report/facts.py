@@ -18,12 +18,12 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
+from scroll_tactile.matching.match import Kept
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.drawing import as_counted
 from scroll_tactile.report.growing import Growing, Soon, chosen, growing, soon
 from scroll_tactile.report.knowledge import MOST_NEAR, Mistake, Trust, mistakes, separations, trust_in

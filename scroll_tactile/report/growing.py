@@ -11,13 +11,13 @@ import numpy as np
 from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule
+from scroll_tactile.matching.match import Kept
 from scroll_tactile.prediction.answer import answer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.unseen import UnseenTouch
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.readouts.leave_one_out import rows_at
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.statistics.moments import one_thread

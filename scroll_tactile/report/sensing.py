@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.match import Kept
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, Channel, channels_of
 from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
 from scroll_tactile.report.page import Card, name_of, note, table

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.match import Kept
 from scroll_tactile.memory.rows import DESCRIBE, OBSERVE, RETRACT, unspanned
-from scroll_tactile.readouts.conformal import Conformal
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 

@@ -8,9 +8,9 @@ from touches import OBSERVED, PAD, Windowed, contents, fed, filled, kept_of, req
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.kept import Keeping, KeptTouches, usual_kept
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
 from store import Store
 

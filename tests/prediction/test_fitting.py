@@ -7,12 +7,12 @@ import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace
 from scroll_tactile.prediction.judging import judged
 from scroll_tactile.prediction.unseen import unseen_touches
 from scroll_tactile.readouts.calibration import FEWEST
-from scroll_tactile.readouts.likelihood import MISSING
 from scroll_tactile.report.growing import _without
 from scroll_tactile.statistics.moments import one_thread
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from scroll_tactile.matching.deviation import recall_of
+from scroll_tactile.matching.likelihood import CLEAN
+from scroll_tactile.matching.match import Kept, Recollection
 from scroll_tactile.prediction.fusion import ODD, Judged, Moment, chosen_of, fuse, match_of, moments_of, tempered
 from scroll_tactile.readouts.calibration import FEWEST, Calibration
-from scroll_tactile.readouts.deviation import recall_of
 from scroll_tactile.readouts.held_out import HeldOut
-from scroll_tactile.readouts.likelihood import CLEAN
-from scroll_tactile.readouts.recollection import Kept, Recollection
 
 NAMES = [f"m{i}" for i in range(5)]
 C = len(NAMES)

@@ -11,9 +11,9 @@ from touches import PAD, SMALL
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live import session
+from scroll_tactile.matching.likelihood import Likelihood, Noise
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.readouts.likelihood import Likelihood, Noise
 from scroll_tactile.statistics.sample import TouchSample
 from store import StoreClosedError
 

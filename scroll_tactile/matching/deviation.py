@@ -10,9 +10,9 @@ from collections.abc import Iterable, Sized
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, Likelihood
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept, Measured, independent
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, Likelihood
+from scroll_tactile.matching.match import Kept, Measured, independent
+from scroll_tactile.matching.matcher import Recall
 
 __all__ = ["recall_of", "spaced"]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LEVELS, LevelArray, Likelihood, Noise
+from scroll_tactile.matching.likelihood import LEVELS, LevelArray, Likelihood, Noise
 from scroll_tactile.sensors import Sensor
 
 __all__ = ["Kept", "Measured", "Recollection", "by_chance", "independent", "shape_of", "trust_in", "without_zero"]

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.deviation import recall_of
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.deviation import recall_of
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
+from scroll_tactile.matching.match import Kept
+from scroll_tactile.matching.matcher import Recall
 from scroll_tactile.sensors import Sensor
 
 CHANNELS, READINGS, MATERIALS = 8, 120, 5

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, MOST_TABLES, UNIT, Likelihood, Noise, levels_of
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, MOST_TABLES, UNIT, Likelihood, Noise, levels_of
 from scroll_tactile.sensors import Sensor
 
 NOISES = [CLEAN, Noise(400), Noise(784), Noise(920), Noise(12, True), Noise(34, True)]

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.match import Kept
 
 __all__ = ["Conformal", "Typicality"]
 

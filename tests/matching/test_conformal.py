@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.conformal import APART, Conformal
-from scroll_tactile.readouts.likelihood import MISSING
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.conformal import APART, Conformal
+from scroll_tactile.matching.likelihood import MISSING
+from scroll_tactile.matching.match import Kept
 
 CHANNELS, COLUMNS = 3, 40
 

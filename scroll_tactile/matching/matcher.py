@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
-from scroll_tactile.readouts.recollection import (
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
+from scroll_tactile.matching.match import (
     Kept,
     Measured,
     Recollection,

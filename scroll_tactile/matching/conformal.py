@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.matching.match import Kept
+from scroll_tactile.matching.match import KeptTouch
 
 __all__ = ["Conformal", "Typicality"]
 
@@ -60,7 +60,7 @@ class Conformal:
     nobody asks: otherwise a copy does.
     """
 
-    def __init__(self, touches: Sequence[Kept]) -> None:
+    def __init__(self, touches: Sequence[KeptTouch]) -> None:
         longest = max(touch.levels.shape[1] for touch in touches)
         self._set_up(len(touches[0].levels), longest, [], np.empty(0, np.intp))
         self.follow(touches, set())
@@ -83,7 +83,9 @@ class Conformal:
         return {"steps": self._steps.astype(np.uint8), "own": own, "other": other}
 
     @classmethod
-    def from_arrays(cls, touches: Sequence[Kept], arrays: Mapping[str, npt.NDArray[Any]], longest: int) -> Conformal:
+    def from_arrays(
+        cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
+    ) -> Conformal:
         """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
         conformal = cls.__new__(cls)
         lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
@@ -105,7 +107,7 @@ class Conformal:
         """What is kept, by material and key, in its order."""
         return self._touches
 
-    def follow(self, added: Sequence[Kept], removed: AbstractSet[tuple[str, bytes]]) -> None:
+    def follow(self, added: Sequence[KeptTouch], removed: AbstractSet[tuple[str, bytes]]) -> None:
         """Take in touches no longer than the longest that were kept, and let others go, by material and key."""
         if removed:
             staying = [i for i, touch in enumerate(self._touches) if touch not in removed]

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, Likelihood
-from scroll_tactile.matching.match import Kept, Measured, independent
-from scroll_tactile.matching.matcher import Recall
+from scroll_tactile.matching.match import KeptTouch, NaturalDeviation, independent
+from scroll_tactile.matching.matcher import TouchMatcher
 
-__all__ = ["recall_of", "spaced"]
+__all__ = ["matcher_of", "spaced"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,32 +27,32 @@ ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardly any value was read
 
 
-def recall_of(touches: Iterable[Kept]) -> Recall:
+def matcher_of(touches: Iterable[KeptTouch]) -> TouchMatcher:
     """All that can be asked of kept touches, measured by these touches.
 
     Raises InputError for touches of different channels, and for none.
     """
     level = np.ones(LEVELS)
-    recall = Recall(touches, Measured(Likelihood(level, level), *ASSUMED))
-    recall.measured = Measured(_likelihood(recall), *ASSUMED)
-    recall.measured = _measured(recall)
-    return recall
+    matcher = TouchMatcher(touches, NaturalDeviation(Likelihood(level, level), *ASSUMED))
+    matcher.measured = NaturalDeviation(_likelihood(matcher), *ASSUMED)
+    matcher.measured = _measured(matcher)
+    return matcher
 
 
-def spaced(recall: Sized, count: int) -> list[int]:
+def spaced(matcher: Sized, count: int) -> list[int]:
     """Places of at most so many touches, spread evenly over their keys: at random, but the same of the same set."""
-    return list(range(0, len(recall), max(1, -(-len(recall) // count))))
+    return list(range(0, len(matcher), max(1, -(-len(matcher) // count))))
 
 
-def _likelihood(recall: Recall) -> Likelihood:
+def _likelihood(matcher: TouchMatcher) -> Likelihood:
     """The tables of the spread by level: the mean deviation from the nearest touch, over levels half to twice as high.
 
     The mean deviation, and not the standard deviation, which is a quarter more: kept touches that are likelier come
     nearer than the nearest by all values does.
     """
     counts, deviations = np.zeros(LEVELS), np.zeros(LEVELS)
-    for row in spaced(recall, PAIRS):
-        pair = recall.nearest(row)
+    for row in spaced(matcher, PAIRS):
+        pair = matcher.nearest(row)
         if pair is None:
             continue
         both = (pair[0] != MISSING) & (pair[1] != MISSING)
@@ -73,13 +73,13 @@ def _between(values: FloatArray, least: npt.NDArray[np.int_], most: npt.NDArray[
     return np.asarray(sums[most] - sums[least])
 
 
-def _measured(recall: Recall) -> Measured:
-    rows = spaced(recall, LEFT_OUT)
-    if len(recall) < 2 or len(rows) < FEWEST:
-        return recall.measured
-    shapes = [recall.apart(row) for row in rows]
+def _measured(matcher: TouchMatcher) -> NaturalDeviation:
+    rows = spaced(matcher, LEFT_OUT)
+    if len(matcher) < 2 or len(rows) < FEWEST:
+        return matcher.measured
+    shapes = [matcher.apart(row) for row in rows]
     natural = float(np.median([coherence for _, coherence in shapes]))
     noise = [independent(energy, coherence, natural) for energy, coherence in shapes]
     most = EVEN**2 * float(np.quantile(noise, USUAL))
     energy = float(np.quantile([energy for energy, _ in shapes], USUAL))
-    return Measured(recall.measured.likelihood, natural, max(most, ROUNDING), max(energy, ROUNDING))
+    return NaturalDeviation(matcher.measured.likelihood, natural, max(most, ROUNDING), max(energy, ROUNDING))

@@ -10,13 +10,13 @@ import numpy.typing as npt
 from scroll_tactile.matching.likelihood import LEVELS, LevelArray, Likelihood, Noise
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["Kept", "Measured", "Recollection", "by_chance", "independent", "shape_of", "trust_in", "without_zero"]
+__all__ = ["KeptTouch", "Match", "NaturalDeviation", "by_chance", "independent", "shape_of", "trust_in", "without_zero"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Kept:
+class KeptTouch:
     """A kept touch: its material, its content hash, and its levels, uint8 of shape (C, T)."""
 
     material: str
@@ -25,7 +25,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Measured:
+class NaturalDeviation:
     """What a set of kept touches says of itself.
 
     likelihood: its tables. coherence: how much larger the deviation of a channel's mean from a kept touch's
@@ -41,10 +41,10 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Recollection:
+class Match:
     """What kept touches say of a touch.
 
-    scores: log-likelihood of each material, in the order of `Recall.materials`, shape (M,).
+    scores: log-likelihood of each material, in the order of `TouchMatcher.materials`, shape (M,).
     certainty: how far noise leaves it to be seen that values near each other deviate together, 1 of a clean touch.
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
@@ -70,13 +70,13 @@ class Recollection:
     def filled(self, readings: npt.NDArray[np.floating], sensor: Sensor) -> npt.NDArray[np.float32]:
         """The readings, shape (T, C) in the sensor's unit, with what is missing or stuck as kept touches have it."""
         low, high = sensor.limits
-        recalled = low + (high - low) * (self.expected.T.astype(np.float32) / np.float32(LEVELS - 1))
-        lacking = (np.isnan(readings) | self.stuck) & np.isfinite(recalled)
-        return np.where(lacking, recalled, readings).astype(np.float32)
+        expected = low + (high - low) * (self.expected.T.astype(np.float32) / np.float32(LEVELS - 1))
+        lacking = (np.isnan(readings) | self.stuck) & np.isfinite(expected)
+        return np.where(lacking, expected, readings).astype(np.float32)
 
 
 def shape_of(deviation: FloatArray, seen: npt.NDArray[np.bool_]) -> tuple[float, float]:
-    """Energy and coherence (see Measured) of a touch's deviation, (C, T) in levels, 0 where a value is not seen."""
+    """Energy and coherence (see NaturalDeviation) of a deviation, (C, T) in levels, 0 where a value is not seen."""
     counts = seen.sum(axis=1)
     energy = float(np.square(deviation).sum()) / max(int(counts.sum()), 1)
     if not energy:
@@ -105,7 +105,7 @@ def independent(energy: float, coherence: float, natural: float) -> float:
     return energy * min(max((natural - coherence) / (natural - 1), 0.0), 1.0)
 
 
-def trust_in(energy: float, coherence: float, measured: Measured) -> float:
+def trust_in(energy: float, coherence: float, measured: NaturalDeviation) -> float:
     """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² where odds are even."""
     noise = independent(energy, coherence, measured.coherence)
     return noise**2 / (noise**2 + measured.energy**2) if noise else 0.0

@@ -1,4 +1,4 @@
-"""Recall: a touch is compared with kept ones, reading by reading, by the likelihood of what happened to it.
+"""Matching: a touch is compared with kept ones, reading by reading, by the likelihood of what happened to it.
 
 A mean over windows forgets where a reading passes the noise's edge; kept touches do not:
 
@@ -26,16 +26,16 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Noise, Table
 from scroll_tactile.matching.match import (
-    Kept,
-    Measured,
-    Recollection,
+    KeptTouch,
+    Match,
+    NaturalDeviation,
     by_chance,
     shape_of,
     trust_in,
     without_zero,
 )
 
-__all__ = ["Recall"]
+__all__ = ["TouchMatcher"]
 
 FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
@@ -57,7 +57,7 @@ RARELY = 20  # kept touches, of which fewer than one has a channel unchanging: t
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _Query:
     """A touch that is compared: its levels (C, T), as far as the longest kept touch goes where it is not `whole`.
 
     shifted: 256 · level, flat. seen: which values count, (C, T). stuck: the channels that are. full: the columns that
@@ -72,7 +72,7 @@ class _Asked:
     whole: bool
 
     @classmethod
-    def of(cls, levels: LevelArray, columns: int, whole: bool, quiet: npt.NDArray[np.bool_]) -> _Asked:
+    def of(cls, levels: LevelArray, columns: int, whole: bool, quiet: npt.NDArray[np.bool_]) -> _Query:
         """quiet: the channels that are no less whole where they never change, (C,)."""
         full = levels.shape[1] if whole else columns
         grid = levels[:, :full].copy()
@@ -144,7 +144,7 @@ PARTS = tuple(field.name for field in fields(_Room))
 LEVEL_PARTS = ("blocks", "brought")  # whole numbers, 0 to 254
 
 
-class Recall:
+class TouchMatcher:
     """Kept touches, and what can be asked of them.
 
     touches: of one number of channels; lengths may differ. measured: of these touches, or of most of them.
@@ -154,7 +154,7 @@ class Recall:
     Raises InputError for touches of different channels, and for none.
     """
 
-    def __init__(self, touches: Iterable[Kept], measured: Measured) -> None:
+    def __init__(self, touches: Iterable[KeptTouch], measured: NaturalDeviation) -> None:
         kept = sorted(touches, key=lambda touch: (touch.key, touch.material))
         if len({len(touch.levels) for touch in kept}) != 1:
             raise InputError("expected kept touches, one or more, all of the same number of channels")
@@ -176,18 +176,22 @@ class Recall:
 
     @classmethod
     def from_arrays(
-        cls, touches: Sequence[Kept], arrays: Mapping[str, npt.NDArray[Any]], longest: int, measured: Measured
-    ) -> Recall:
+        cls,
+        touches: Sequence[KeptTouch],
+        arrays: Mapping[str, npt.NDArray[Any]],
+        longest: int,
+        measured: NaturalDeviation,
+    ) -> TouchMatcher:
         """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
-        recall = cls.__new__(cls)
-        recall.measured, recall.channels, recall.longest = measured, len(touches[0].levels), longest
-        recall._edges = _edges(longest, recall.channels)
-        recall._touches = [(touch.material, touch.key) for touch in touches]
-        recall._levels = [touch.levels for touch in touches]
+        matcher = cls.__new__(cls)
+        matcher.measured, matcher.channels, matcher.longest = measured, len(touches[0].levels), longest
+        matcher._edges = _edges(longest, matcher.channels)
+        matcher._touches = [(touch.material, touch.key) for touch in touches]
+        matcher._levels = [touch.levels for touch in touches]
         floats = {name: arrays[name].astype(np.float32) for name in LEVEL_PARTS}
-        recall._held = _Room(**{name: arrays[name] for name in PARTS} | floats)
-        recall._named()
-        return recall
+        matcher._held = _Room(**{name: arrays[name] for name in PARTS} | floats)
+        matcher._named()
+        return matcher
 
     @staticmethod
     def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
@@ -227,7 +231,7 @@ class Recall:
         """Key → row of what is kept."""
         return {key: row for row, (_, key) in enumerate(self._touches)}
 
-    def follow(self, added: Iterable[Kept], removed: Iterable[tuple[str, bytes]] = ()) -> bool:
+    def follow(self, added: Iterable[KeptTouch], removed: Iterable[tuple[str, bytes]] = ()) -> bool:
         """Take in touches that came, and let others go; what was measured stays. False where it has to be made again:
 
         a touch is longer than all that were kept, or none is left.
@@ -246,7 +250,7 @@ class Recall:
         self._named()
         return bool(self._touches)
 
-    def copy(self) -> Recall:
+    def copy(self) -> TouchMatcher:
         """Another of the same touches: what comes to it does not come to this one."""
         other = copy.copy(self)
         other._touches, other._levels = [*self._touches], [*self._levels]
@@ -258,7 +262,7 @@ class Recall:
     def _room(self, count: int) -> _Room:
         return _Room.of(count, self.channels, len(self._edges) - 1, len(self._edges[::COARSER]) - 1)
 
-    def _add(self, touch: Kept) -> None:
+    def _add(self, touch: KeptTouch) -> None:
         row, held = len(self._touches), self._held
         if row == len(held.blocks):
             held = self._room(row + max(8, row // 8))
@@ -283,9 +287,9 @@ class Recall:
         self._columns, self._gapless = held.columns[:count], bool(held.gapless[:count].all())
         self._often_quiet = held.unchanging[:count].sum(axis=0)
 
-    def recollect(
+    def match(
         self, levels: LevelArray, *, whole: bool = False, left_out: int | None = None, noise: Noise | None = None
-    ) -> Recollection:
+    ) -> Match:
         """Compare a touch, levels of shape (C, T), with all that are kept, but for the row `left_out`.
 
         noise: what came over it; the likeliest unless given.
@@ -296,18 +300,18 @@ class Recall:
         if levels.ndim != 2 or len(levels) != self.channels:
             raise InputError(f"expected levels of shape ({self.channels}, T); came {levels.shape}")
         quiet = self._quiet(left_out)
-        asked = _Asked.of(levels, self.longest, whole, quiet)
+        asked = _Query.of(levels, self.longest, whole, quiet)
         found = self._compared(asked, left_out, noise, levels.shape[1])
         if not quiet.any():
             return found
-        stuck = _Asked.of(levels, self.longest, whole, np.zeros_like(quiet))
+        stuck = _Query.of(levels, self.longest, whole, np.zeros_like(quiet))
         if np.array_equal(stuck.stuck, asked.stuck):
             return found
         # Channels that are often quiet are quiet here, too, or dead: as a value is the likelier.
         apart = self._compared(stuck, left_out, noise, levels.shape[1])
         return found if found.likelihood >= apart.likelihood else apart
 
-    def _compared(self, asked: _Asked, left_out: int | None, noise: Noise | None, columns: int) -> Recollection:
+    def _compared(self, asked: _Query, left_out: int | None, noise: Noise | None, columns: int) -> Match:
         given, noise = noise, self._roughly(asked, left_out) if noise is None else noise
         rows = self._shortlist([noise], asked, SHORTLIST, left_out)[:, 0]
         beside = self._beside(rows, asked)
@@ -317,11 +321,11 @@ class Recall:
             finer = self._finer(rows, beside, logs, asked, noise, stride)
             if finer != noise:
                 noise, logs = finer, pairs.logs(self._table(finer))
-        return self._told(asked, rows, beside, logs, noise, columns)
+        return self._result(asked, rows, beside, logs, noise, columns)
 
     def apart(self, row: int) -> tuple[float, float]:
-        """Energy and coherence (see Measured) of how a kept touch deviates from the nearest other one."""
-        asked = _Asked.of(self._levels[row], self.longest, whole=False, quiet=self._quiet(row))
+        """Energy and coherence (see NaturalDeviation) of how a kept touch deviates from the nearest other one."""
+        asked = _Query.of(self._levels[row], self.longest, whole=False, quiet=self._quiet(row))
         beside = self._beside(self._shortlist([CLEAN], asked, SHORTLIST, row)[:, 0], asked)
         best = beside[np.argmax(self._pairs(beside, asked).logs(self._table(CLEAN)))]
         return shape_of(*self._deviation(asked, best, CLEAN))
@@ -349,7 +353,7 @@ class Recall:
             into[:, : part.shape[1]] = part
         return beside.reshape(len(kept), -1)
 
-    def _beside(self, rows: Rows, asked: _Asked) -> LevelArray:
+    def _beside(self, rows: Rows, asked: _Query) -> LevelArray:
         """The levels that a touch is compared with, of some kept ones, (rows, C · T)."""
         if not asked.whole:
             return self._rows(rows, asked.levels.shape[1])
@@ -366,7 +370,7 @@ class Recall:
             brought[same] = np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), brought[same])
         return brought.reshape(len(rows), -1)
 
-    def _shortlist(self, noises: Sequence[Noise], asked: _Asked, count: int, left_out: int | None) -> Rows:
+    def _shortlist(self, noises: Sequence[Noise], asked: _Query, count: int, left_out: int | None) -> Rows:
         """Rows of the kept touches nearest to the touch as it was before each noise, (count, noises), ascending."""
         columns = asked.levels.shape[1]
         edges = self._wider(columns) if asked.whole else self._edges
@@ -412,7 +416,7 @@ class Recall:
     def _table(self, noise: Noise) -> Table:
         return self.measured.likelihood.table(noise)
 
-    def _pairs(self, beside: LevelArray, asked: _Asked, values: slice | Rows = slice(None)) -> _Pairs:
+    def _pairs(self, beside: LevelArray, asked: _Query, values: slice | Rows = slice(None)) -> _Pairs:
         beside = beside[:, values]
         places = asked.shifted[values] | beside
         if self._gapless:
@@ -421,7 +425,7 @@ class Recall:
         both = np.count_nonzero((beside != MISSING) & seen, axis=1)
         return _Pairs(places, np.count_nonzero(seen) / np.maximum(both, 1))
 
-    def _roughly(self, asked: _Asked, left_out: int | None) -> Noise:
+    def _roughly(self, asked: _Query, left_out: int | None) -> Noise:
         beside = self._beside(_distinct(self._shortlist(ROUGH, asked, FIRST, left_out)), asked)
         values = np.flatnonzero(asked.seen)
         values = values[:: max(1, len(values) // FIRST_VALUES)]
@@ -439,7 +443,7 @@ class Recall:
         return max(found, key=likelihood)
 
     def _finer(
-        self, rows: Rows, beside: LevelArray, logs: FloatArray, asked: _Asked, noise: Noise, stride: int
+        self, rows: Rows, beside: LevelArray, logs: FloatArray, asked: _Query, noise: Noise, stride: int
     ) -> Noise:
         """The likeliest amplitude near a noise: by kept touches at first, then by blends, that come nearer."""
         if stride > 2:
@@ -450,9 +454,9 @@ class Recall:
         pairs = self._pairs(nearest, asked)
         return max(noise.near(stride), key=lambda near: float(pairs.logs(self._table(near)).max()))
 
-    def _told(
-        self, asked: _Asked, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise, columns: int
-    ) -> Recollection:
+    def _result(
+        self, asked: _Query, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise, columns: int
+    ) -> Match:
         table, measured = self._table(noise), self.measured
         expected = np.full((self.channels, columns), np.nan)
         mean = _mean(beside, np.exp(WARMTHS[1] * (logs - logs.max()))[None])[0].reshape(self.channels, -1)
@@ -462,7 +466,7 @@ class Recall:
         usual = table.expected[best.reshape(both.shape)[both]].sum() / max(int(np.count_nonzero(both)), 1)
         got = float(logs.max()) / max(asked.values, 1)
         energy, coherence = shape_of(deviation, both)
-        return Recollection(
+        return Match(
             scores=self._scores(asked, rows, beside, logs, noise),
             certainty=table.certainty * asked.share,
             noise=noise,
@@ -475,14 +479,14 @@ class Recall:
             surprise=float(usual) - got,
         )
 
-    def _deviation(self, asked: _Asked, best: LevelArray, noise: Noise) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    def _deviation(self, asked: _Query, best: LevelArray, noise: Noise) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """How a touch deviates from what a kept one reads through noise, (C, T), 0 where one lacks; and where not."""
         near = best.reshape(asked.seen.shape)
         both = asked.seen & (near != MISSING)
         mean = self._table(noise).mean[np.where(both, near, 0)]
         return np.where(both, asked.levels - mean, 0.0), both
 
-    def _scores(self, asked: _Asked, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise) -> FloatArray:
+    def _scores(self, asked: _Query, rows: Rows, beside: LevelArray, logs: FloatArray, noise: Noise) -> FloatArray:
         """The best log-likelihood of each material, by its kept touches or blends; the least, where it has none."""
         labels = self._labels[rows]
         best = np.full(len(self._materials), float(logs.min()))

@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.deviation import recall_of
+from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.likelihood import MISSING, LevelArray
-from scroll_tactile.matching.match import Kept, Recollection
-from scroll_tactile.matching.matcher import Recall
+from scroll_tactile.matching.match import KeptTouch, Match
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
@@ -87,7 +87,7 @@ class Draft:
     views: list[Scale]
     tasks: dict[Scale, Task]
     sample: list[tuple[str, bytes, SampledTouch]]
-    kept: list[Kept]
+    kept: list[KeptTouch]
     longest: int
     least: int
     touches: int
@@ -137,7 +137,7 @@ class Draft:
             sample=self.sample,
             fusion=fusion,
             dependence=Dependence() if whole is None else dependence_of(whole),
-            conformal=Conformal(self.kept) if fusion is not None and fusion.recall is not None else None,
+            conformal=Conformal(self.kept) if fusion is not None and fusion.matcher is not None else None,
             least=self.least,
             longest=self.longest,
             fitted_to=self.touches,
@@ -171,7 +171,7 @@ class _Fit:
         number: int,
         scales: Sequence[Scale],
         apart: Mapping[Scale, LeftOut],
-        matches: Mapping[bytes, Recollection],
+        matches: Mapping[bytes, Match],
     ) -> Judged:
         """What some scales and the kept touches say at a moment, given as its columns and stage."""
         calibration = self.calibrated(number, scales, apart)
@@ -184,27 +184,27 @@ class _Fit:
         last: the last stage that any touch reached. apart: what each scale says of the sampled touches.
         """
         draft, milestones = self.draft, self.draft.memory.plan.milestones()[: last + 1]
-        recall = recall_of(draft.kept) if draft.kept else None
+        matcher = matcher_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
         complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], apart, {})
-        columns = moments_of(milestones, least, matched=recall is not None)
+        columns = moments_of(milestones, least, matched=matcher is not None)
         moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
-        chosen, counts = chosen_of(complete.held_out, recall)
+        chosen, counts = chosen_of(complete.held_out, matcher)
         weight = PRIOR_WEIGHT[draft.kind]
-        if recall is None:
+        if matcher is None:
             judged = [self.judged(moment, moment[1], draft.stages[moment[1]], apart, {}) for moment in moments]
             return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts, weight)
         if self.extractor is None:
             moments = []
-        kept = _KeptTouches.held_out(self, recall, chosen, {*chosen, *counts})
+        kept = _KeptTouches.held_out(self, matcher, chosen, {*chosen, *counts})
         complete = replace(complete, matches=kept.matches)
         if not chosen or self.extractor is None:
             alone = self.judged((least, last), last, draft.views, apart, {})
             return complete.held_out, fuse(
-                recall, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
+                matcher, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
             )
         paced = [kept.paced(pace, chosen, last) for pace in PACES]
-        return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
+        return complete.held_out, fuse(matcher, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
 
 
 @dataclass(frozen=True)
@@ -216,22 +216,22 @@ class _KeptTouches:
     """
 
     fit: _Fit
-    recall: Recall
+    matcher: TouchMatcher
     chosen: Sequence[bytes]
     rows: Mapping[bytes, int]
     levels: Mapping[bytes, LevelArray]
     places: Mapping[bytes, int]
-    matches: Mapping[bytes, Recollection]
+    matches: Mapping[bytes, Match]
 
     @classmethod
-    def held_out(cls, fit: _Fit, recall: Recall, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
+    def held_out(cls, fit: _Fit, matcher: TouchMatcher, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
         """Those with some keys."""
-        kept = recall.rows()
+        kept = matcher.rows()
         rows = {key: kept[key] for key in sorted(keys)}
-        levels = {key: recall.levels(row) for key, row in rows.items()}
+        levels = {key: matcher.levels(row) for key, row in rows.items()}
         places = {key: place for place, (_, key, _) in enumerate(fit.draft.sample)}
-        matches = {key: recall.recollect(levels[key], left_out=row) for key, row in rows.items()}
-        return cls(fit, recall, chosen, rows, levels, places, matches)
+        matches = {key: matcher.match(levels[key], left_out=row) for key, row in rows.items()}
+        return cls(fit, matcher, chosen, rows, levels, places, matches)
 
     def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[Judged]:
         """What is said of their beginnings at each moment, given as its columns and stage."""
@@ -242,7 +242,7 @@ class _KeptTouches:
                 if (levels := self.levels[key]).shape[1] >= columns:
                     # What came over a touch is looked for once, in all of it: that is most of what asking costs.
                     noise = self.matches[key].noise
-                    matches[key] = self.recall.recollect(levels[:, :columns], left_out=self.rows[key], noise=noise)
+                    matches[key] = self.matcher.match(levels[:, :columns], left_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]
             judged.append(self.fit.judged((columns, stage), number, scales, apart, matches))
         return judged
@@ -270,7 +270,7 @@ class _KeptTouches:
         matches = {}
         for key in keys:
             levels, noise = at_pace(self.levels[key], pace), self.matches[key].noise
-            matches[key] = self.recall.recollect(levels, left_out=self.rows[key], whole=True, noise=noise)
+            matches[key] = self.matcher.match(levels, left_out=self.rows[key], whole=True, noise=noise)
             image = extractor.image(stream_of(levels, extractor.sensor))
             for scale, mean in extractor.means(image, views).items():
                 asked[scale][self.places[key]] = {0: mean}

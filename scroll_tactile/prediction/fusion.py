@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import CLEAN
-from scroll_tactile.matching.match import Recollection
-from scroll_tactile.matching.matcher import Recall
+from scroll_tactile.matching.match import Match
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
 from scroll_tactile.readouts.held_out import HeldOut
 
@@ -81,10 +81,10 @@ class Moment:
     surprise: float
     spread: float
 
-    def steepness(self, recollection: Recollection, familiarity: float) -> float:
+    def steepness(self, match: Match, familiarity: float) -> float:
         """β = 1 / (1 + (1/r − 1) c) of a touch for which the readouts are believed by so much, c its certainty."""
-        beside, alone = (_steepness(r, recollection.certainty) for r in (self.match, self.alone))
-        share = (1 - recollection.trust) * familiarity
+        beside, alone = (_steepness(r, match.certainty) for r in (self.match, self.alone))
+        share = (1 - match.trust) * familiarity
         return share * beside + (1 - share) * alone
 
     def familiarity(self, distance: float, own_time: bool) -> float:
@@ -104,9 +104,9 @@ class Moment:
         """
         return probability >= (SURE if self.odd_model else 0.0) and distance <= self.familiar
 
-    def matched_novelty(self, recollection: Recollection) -> float:
+    def matched_novelty(self, match: Match) -> float:
         """The surprise of the kept touches, in units of its spread in known ones, as novelty is."""
-        return (recollection.surprise - self.surprise) / self.spread
+        return (match.surprise - self.surprise) / self.spread
 
     def threshold(self, false_alarms: float) -> float:
         """The novelty that a share `false_alarms` of known touches exceeds; see `Calibration.threshold`."""
@@ -132,7 +132,7 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class Fusion:
-    """The table of all moments, ascending, the last "complete"; recall: the kept touches, None where there are none.
+    """The table of all moments, ascending, the last "complete"; matcher: the kept touches, None where there are none.
 
     paced: how complete touches are judged that were made at other paces, ascending by columns. trajectories: of the
     touches that it was fitted to, at all moments before the last.
@@ -140,7 +140,7 @@ class Fusion:
 
     moments: tuple[Moment, ...]
     paced: tuple[Moment, ...]
-    recall: Recall | None
+    matcher: TouchMatcher | None
     trajectories: Trajectories
 
     @property
@@ -187,7 +187,7 @@ class Judged:
     stage: int
     calibration: Calibration
     held_out: HeldOut
-    matches: Mapping[bytes, Recollection]
+    matches: Mapping[bytes, Match]
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class _Said:
 
 
 def fuse(
-    recall: Recall | None,
+    matcher: TouchMatcher | None,
     judged: Sequence[Judged],
     paced: Sequence[Judged],
     chosen: Sequence[bytes],
@@ -223,34 +223,38 @@ def fuse(
     believed as they are.
     """
     names, even = judged[-1].held_out.names, dict.fromkeys(chosen, 1.0)
-    said = [_at(recall, one, names, even) for one in judged[:-1]]
-    said.append(_at(recall, judged[-1], names, counts))
-    others = [_at(recall, one, names, even) for one in paced]
-    moments = _rows(recall, judged, said, judged[-1], prior_weight)
-    of_paced = _rows(recall, paced, others, None, prior_weight)
+    said = [_at(matcher, one, names, even) for one in judged[:-1]]
+    said.append(_at(matcher, judged[-1], names, counts))
+    others = [_at(matcher, one, names, even) for one in paced]
+    moments = _rows(matcher, judged, said, judged[-1], prior_weight)
+    of_paced = _rows(matcher, paced, others, None, prior_weight)
     return Fusion(
-        tuple(moments), tuple(of_paced), recall, _trajectories(moments[:-1], said[:-1], len(chosen), len(names))
+        tuple(moments), tuple(of_paced), matcher, _trajectories(moments[:-1], said[:-1], len(chosen), len(names))
     )
 
 
 def _rows(
-    recall: Recall | None, judged: Sequence[Judged], said: Sequence[_Said], complete: Judged | None, prior_weight: float
+    matcher: TouchMatcher | None,
+    judged: Sequence[Judged],
+    said: Sequence[_Said],
+    complete: Judged | None,
+    prior_weight: float,
 ) -> list[Moment]:
     """Rows of the table, each drawn to its neighbours."""
     rows = []
     for i, one in enumerate(judged):
         near = [other for other in said[max(0, i - 1) : i + 2] if len(other.targets) >= FEWEST]
-        rows.append(_fitted(one, said[i], near, recall, prior_weight, complete=one is complete))
+        rows.append(_fitted(one, said[i], near, matcher, prior_weight, complete=one is complete))
     return rows
 
 
-def chosen_of(complete: HeldOut, recall: Recall | None) -> tuple[list[bytes], dict[bytes, float]]:
+def chosen_of(complete: HeldOut, matcher: TouchMatcher | None) -> tuple[list[bytes], dict[bytes, float]]:
     """The held-out touches that are seen at all moments: of those that are kept, evenly over their keys.
 
     And those that are compared as complete ones, with how many each stands for: beside them the least sure, where it
     matters what is believed; each of the others stands for many.
     """
-    kept = set() if recall is None else recall.rows().keys()
+    kept = set() if matcher is None else matcher.rows().keys()
     ranked = [key for _, key in sorted(zip(complete.margins.tolist(), complete.keys, strict=True)) if key in kept]
     keys, unsure = sorted(ranked), ranked[: MOST_HELD_OUT // 2]
     places = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int)
@@ -260,7 +264,7 @@ def chosen_of(complete: HeldOut, recall: Recall | None) -> tuple[list[bytes], di
     return chosen, dict.fromkeys(unsure, 1.0) | dict.fromkeys(surer, each)
 
 
-def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Mapping[bytes, float]) -> _Said:
+def _at(matcher: TouchMatcher | None, judged: Judged, names: Sequence[str], counts: Mapping[bytes, float]) -> _Said:
     """What is said at one moment of some touches, and how many each stands for."""
     chosen = list(counts)
     held = judged.held_out
@@ -271,7 +275,7 @@ def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Map
         at = []
     found = [among[chosen[number]] for number in at]
     ways = [judged.matches[chosen[number]] for number in at]
-    matched = [] if recall is None else [match_scores(recall, names, way) for way in ways]
+    matched = [] if matcher is None else [match_scores(matcher, names, way) for way in ways]
     scores = np.array(matched).reshape(len(ways), len(names))
     certainty = np.maximum([way.certainty for way in ways], LEAST_CERTAINTY)
     usual = float(np.median(certainty)) if ways else 1.0
@@ -287,24 +291,30 @@ def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Map
     )
 
 
-def match_scores(recall: Recall, names: Sequence[str], way: Recollection) -> FloatArray:
+def match_scores(matcher: TouchMatcher, names: Sequence[str], way: Match) -> FloatArray:
     """What the kept touches say of some materials, (C,); the least of those of which none is kept."""
-    places, least = {name: i for i, name in enumerate(recall.materials)}, float(way.scores.min())
+    places, least = {name: i for i, name in enumerate(matcher.materials)}, float(way.scores.min())
     return np.array([way.scores[places[name]] if name in places else least for name in names])
 
 
 def _fitted(
-    judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall | None, prior_weight: float, *, complete: bool
+    judged: Judged,
+    said: _Said,
+    near: Sequence[_Said],
+    matcher: TouchMatcher | None,
+    prior_weight: float,
+    *,
+    complete: bool,
 ) -> Moment:
     """A moment; near: what is said at the moments near it, this one among them, where that is enough."""
     held, columns, stage, calibration = judged.held_out, judged.columns, judged.stage, judged.calibration
     own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
     alone = _odd_share(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
     familiar = float(np.quantile(held.distance, USUAL)) if complete and len(held.keys) else np.inf
-    if recall is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
+    if matcher is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
         # Where nothing can be held out, the kept touches decide only where the readouts do not.
         power = float(calibration.weights.sum()) / prior_weight
-        match = 0.5 if recall is None else match_of(power * UNSEEN, recall.measured.likelihood.table(CLEAN).certainty)
+        match = 0.5 if matcher is None else match_of(power * UNSEEN, matcher.measured.likelihood.table(CLEAN).certainty)
         spread = 1.0 / UNMEASURED
         return Moment(columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread)
     together = _joined(near)

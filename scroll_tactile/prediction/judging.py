@@ -8,7 +8,7 @@ Channels that never change are filled in with what the kept touches have there, 
 
     p_y ∝ exp(g (1 − t) log d_y + β S_y),
 
-t which part of how the touch differs from kept ones is noise (`Recollection.trust`): it takes the readouts' word.
+t which part of how the touch differs from kept ones is noise (`Match.trust`): it takes the readouts' word.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LevelArray, levels_of
-from scroll_tactile.matching.match import Recollection
-from scroll_tactile.matching.matcher import Recall
+from scroll_tactile.matching.match import Match
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fusion import USUAL, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
@@ -42,14 +42,14 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     assert fusion is not None
     usual: Hypothesis = "complete" if columns >= model.least else "beginning"
     alone = model.judge(candidates, encoded.means, columns, usual)
-    recall = fusion.recall
+    matcher = fusion.matcher
     usual_length = model.least <= len(encoded.stream) <= model.longest
-    if recall is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
+    if matcher is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
         return _by_readouts(model, encoded, alone, usual)
     levels = levels_seen(encoded.stream)
-    ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
-    if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
-        whole = recall.recollect(levels, whole=True)
+    ways: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
+    if levels.shape[1] != matcher.longest and fusion.reaches(levels.shape[1]):
+        whole = matcher.match(levels, whole=True)
         if whole.evidence > 0:  # at no other pace is it any more like what is kept
             ways.append((whole, "paced", False))
     filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.evidence))
@@ -61,7 +61,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
             kept = stream_of(levels_seen(filled.stream), extractor.sensor)
             means = extractor.means(extractor.image(kept), model.views)
         said = said or model.judge(candidates, means, columns if own_time else len(encoded.stream), hypothesis)
-        answers.append(fused(recall, candidates, said, way, own_time=own_time))
+        answers.append(fused(matcher, candidates, said, way, own_time=own_time))
     evidence = np.array([way.evidence for way, *_ in ways])
     weights = np.exp(COUNTED * (evidence - evidence.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
@@ -73,16 +73,16 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
     """The readouts' word. Where it is that the touch may be of nothing known, kept touches say what sets it apart."""
     unusual = _of_length(model, encoded)
-    if model.recall is not None and alone.novelty > alone.moment.threshold(1 - USUAL):
-        unusual = _unusual(model, encoded, model.recall.recollect(levels_seen(encoded.stream)), hypothesis)
+    if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - USUAL):
+        unusual = _unusual(model, encoded, model.matcher.match(levels_seen(encoded.stream)), hypothesis)
     return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model), unusual=unusual)
 
 
 def fused(
-    recall: Recall,
+    matcher: TouchMatcher,
     candidates: Sequence[str],
     said: Judgement,
-    way: Recollection,
+    way: Match,
     *,
     own_time: bool,
 ) -> Judgement:
@@ -93,7 +93,7 @@ def fused(
     moment = said.moment
     familiarity = moment.familiarity(said.distance, own_time)
     logs = (1 - way.trust) * np.log(np.maximum(said.probability, TINY))
-    logits = familiarity * moment.model * logs + match_scores(recall, candidates, way) * moment.steepness(
+    logits = familiarity * moment.model * logs + match_scores(matcher, candidates, way) * moment.steepness(
         way, familiarity
     )
     chances = np.exp(logits - logits.max())
@@ -102,7 +102,7 @@ def fused(
     return replace(said, probability=chances, novelty=float(novelty))
 
 
-def _unusual(model: Model, encoded: Encoded, way: Recollection, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
+def _unusual(model: Model, encoded: Encoded, way: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
     """What sets a touch apart from those that were learned, if the kept touches explain it so."""
     found: list[Unusual] = list(_of_length(model, encoded))
     if found and hypothesis == "paced":
@@ -127,10 +127,10 @@ def levels_seen(stream: Stream) -> LevelArray:
     return levels_of(readings, stream.sensor)
 
 
-def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, recollection: Recollection) -> Encoded:
+def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: Match) -> Encoded:
     """The touch with its stuck channels as kept touches have them, where that changes any of its levels."""
     stream = encoded.stream
-    readings = recollection.filled(stream.readings, stream.sensor)
+    readings = match.filled(stream.readings, stream.sensor)
     if np.array_equal(levels_of(readings, stream.sensor), levels_of(stream.readings, stream.sensor)):
         return encoded
     readings.setflags(write=False)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.matcher import Recall
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.fusion import Fusion, Moment
@@ -110,9 +110,9 @@ class Model:
         self._of_all: dict[Scale, npt.NDArray[np.intp]] = {}
 
     @property
-    def recall(self) -> Recall | None:
+    def matcher(self) -> TouchMatcher | None:
         """The kept touches."""
-        return None if self.fusion is None else self.fusion.recall
+        return None if self.fusion is None else self.fusion.matcher
 
     @property
     def reads_memory(self) -> bool:
@@ -128,8 +128,8 @@ class Model:
         if readouts is None:
             readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
         other.readouts, other._of_all = readouts, {}
-        if self.fusion is not None and self.fusion.recall is not None and self.conformal is not None:
-            other.fusion = replace(self.fusion, recall=self.fusion.recall.copy())
+        if self.fusion is not None and self.fusion.matcher is not None and self.conformal is not None:
+            other.fusion = replace(self.fusion, matcher=self.fusion.matcher.copy())
             other.conformal = self.conformal.copy()
         return other
 
@@ -155,25 +155,25 @@ class Model:
                 continue
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
                 return False
-        if self.recall is not None and not self._recalls(memory, self.recall):
+        if self.matcher is not None and not self._follow_kept(memory, self.matcher):
             return False
         self.names, self.longest = list(memory.statistics.materials), memory.statistics.longest
         self.known = frozenset(self.names)
         self._of_all = {}
         return True
 
-    def _recalls(self, memory: Memory, recall: Recall) -> bool:
+    def _follow_kept(self, memory: Memory, matcher: TouchMatcher) -> bool:
         """Take in what is kept in the memory now; False where that is nothing."""
         assert self.conformal is not None and self.fusion is not None and memory.kept is not None
-        kept, held = {(material, key) for material, key, _ in memory.kept}, recall.held
+        kept, held = {(material, key) for material, key, _ in memory.kept}, matcher.held
         added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
         if not kept:
             return False
-        if recall.follow(added, held - kept):
+        if matcher.follow(added, held - kept):
             self.conformal.follow(added, held - kept)
         else:  # one is longer than all before it: what they say of themselves stays
             touches = memory.kept.touches()
-            self.fusion = replace(self.fusion, recall=Recall(touches, recall.measured))
+            self.fusion = replace(self.fusion, matcher=TouchMatcher(touches, matcher.measured))
             self.conformal = Conformal(touches)
         return True
 

@@ -23,8 +23,8 @@ from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.likelihood import LEVELS, Likelihood
-from scroll_tactile.matching.match import Kept, Measured
-from scroll_tactile.matching.matcher import Recall
+from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.fusion import Fusion, Moment, Trajectories
@@ -42,7 +42,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 NAME = "model"
-MADE_BY = f"{__version__}, 1"  # the release, and how it is written: the judge may differ in another
+MADE_BY = f"{__version__}, 2"  # the release, and how it is written: the judge may differ in another
 MOST_BANKS = 64
 OF_MOMENT = ("columns", "stage", "model", "match", "alone", "odd", "odd_model", "familiar", "surprise", "spread")
 OF_CALIBRATION = ("weights", "scale_novelty", "usual", "novelties")
@@ -68,8 +68,8 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     for scale, readout in model.readouts.items():
         arrays[f"names-{scale}"] = np.array([places[name] for name in readout.names], dtype=np.int64)
         arrays |= {f"{name}-{scale}": part for name, part in readout.to_arrays().items()}
-    if model.recall is not None and model.conformal is not None:
-        arrays |= _kept_to_arrays(model.recall, model.conformal, places)
+    if model.matcher is not None and model.conformal is not None:
+        arrays |= _kept_to_arrays(model.matcher, model.conformal, places)
     attributes = {
         "made_by": MADE_BY,
         "readout": model.kind,
@@ -118,17 +118,19 @@ def with_banks(embedding: Embedding, arrays: Arrays) -> Embedding:
     return embedding.with_banks(banks)
 
 
-def _kept_to_arrays(recall: Recall, conformal: Conformal, places: Mapping[str, int]) -> dict[str, npt.NDArray[Any]]:
-    measured, rows = recall.measured, {touch: row for row, touch in enumerate(recall.touches)}
+def _kept_to_arrays(
+    matcher: TouchMatcher, conformal: Conformal, places: Mapping[str, int]
+) -> dict[str, npt.NDArray[Any]]:
+    measured, rows = matcher.measured, {touch: row for row, touch in enumerate(matcher.touches)}
     return {
-        "kept-keys": np.array([list(key) for _, key in recall.touches], dtype=np.uint8),
-        "kept-materials": np.array([places[material] for material, _ in recall.touches], dtype=np.int64),
+        "kept-keys": np.array([list(key) for _, key in matcher.touches], dtype=np.uint8),
+        "kept-materials": np.array([places[material] for material, _ in matcher.touches], dtype=np.int64),
         "kept-order": np.array([rows[touch] for touch in conformal.touches], dtype=np.int64),
-        "kept-longest": np.array([recall.longest], dtype=np.int64),
+        "kept-longest": np.array([matcher.longest], dtype=np.int64),
         "measured": np.array([measured.coherence, measured.energy, measured.most]),
         "spread": measured.likelihood.spread,
         "read": measured.likelihood.weights,
-        **{f"recall-{name}": part for name, part in recall.to_arrays().items()},
+        **{f"matcher-{name}": part for name, part in matcher.to_arrays().items()},
         **{f"conformal-{name}": part for name, part in conformal.to_arrays().items()},
     }
 
@@ -151,9 +153,9 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     views = [view for view in memory.plan.views if view in readouts]
     reached = whole("calibrations", about.get("calibrations"), 1, len(stages))
     expect(all(scale in readouts for stage in stages[:reached] for scale in stage), "scales", "of stages", [*readouts])
-    recall, conformal = reader.kept() if "kept-keys" in arrays else (None, None)
-    expect(recall is None or bool(views), "kept-keys", "none without views", "some")
-    calibrations, fusion = reader.table(stages[:reached], views, recall)
+    matcher, conformal = reader.kept() if "kept-keys" in arrays else (None, None)
+    expect(matcher is None or bool(views), "kept-keys", "none without views", "some")
+    calibrations, fusion = reader.table(stages[:reached], views, matcher)
     dependence = reader.floats("dependence", (2,), 0.0, 1.0).tolist()
     return Model(
         kind=kind,
@@ -236,7 +238,7 @@ class _Reader:
         expect(bool((own == parts["reference"]).all()), f"held-{scale}", "the reference first", own)
         return Readout.from_arrays(scale, names, parts, statistics)
 
-    def kept(self) -> tuple[Recall, Conformal]:
+    def kept(self) -> tuple[TouchMatcher, Conformal]:
         """What is made of the kept touches, of those that the memory has still."""
         memory = self._memory.kept
         if memory is None:
@@ -250,21 +252,21 @@ class _Reader:
         there = [row for row, touch in enumerate(touches) if touch in levels]
         expect(len(there) == len(levels) if self._same else bool(there), "kept-keys", "those that are kept", len(there))
         expect(len(there) == count or not self._same, "kept-keys", "no others than are kept", count)
-        kept = {row: Kept(*touches[row], levels[touches[row]]) for row in there}
+        kept = {row: KeptTouch(*touches[row], levels[touches[row]]) for row in there}
         channels, most = memory.made.sensor.channels, memory.made.most_columns
         longest = int(counts("kept-longest", array(self._arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
         lengths = {row: touch.levels.shape[1] for row, touch in kept.items()}
         expect(max(lengths.values()) <= longest, "kept-longest", "the longest", longest)
-        parts = self._parts("recall", Recall.parts(count, channels, longest))
+        parts = self._parts("matcher", TouchMatcher.parts(count, channels, longest))
         columns = parts["columns"][there].tolist()
-        expect(columns == list(lengths.values()), "recall-columns", "their lengths", "others")
-        expect(bool(np.isfinite(parts["squares"]).all()), "recall-squares", "finite numbers", "others")
+        expect(columns == list(lengths.values()), "matcher-columns", "their lengths", "others")
+        expect(bool(np.isfinite(parts["squares"]).all()), "matcher-squares", "finite numbers", "others")
         spread, read = self.floats("spread", (LEVELS,), 1.0, LEVELS), self.floats("read", (LEVELS,), 0.0, 1.0)
         expect(read.sum() > 0, "read", "a level or more", "none")
         coherence, energy, usual = self.floats("measured", (3,), 1e-9).tolist()
         expect(max(coherence, energy) < 1e300, "measured", "finite numbers", [coherence, energy])
-        measured = Measured(Likelihood.of(spread, read), coherence, energy, usual)
-        recall = Recall.from_arrays(
+        measured = NaturalDeviation(Likelihood.of(spread, read), coherence, energy, usual)
+        matcher = TouchMatcher.from_arrays(
             list(kept.values()), {name: part[there] for name, part in parts.items()}, longest, measured
         )
         order = self._places("kept-order", count, count).tolist()
@@ -275,7 +277,7 @@ class _Reader:
         conformal = Conformal.from_arrays(
             [kept[order[place]] for place in standing], {name: part[standing] for name, part in parts.items()}, longest
         )
-        return recall, conformal
+        return matcher, conformal
 
     def _parts(self, what: str, expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[str, npt.NDArray[Any]]:
         return {
@@ -283,7 +285,7 @@ class _Reader:
         }
 
     def table(
-        self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], recall: Recall | None
+        self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], matcher: TouchMatcher | None
     ) -> tuple[list[Calibration], Fusion]:
         """How scores are read at each stage that touches reached, and at each moment."""
         rows = array(self._arrays, "moments", ("float64",), (None, len(OF_MOMENT)))
@@ -297,14 +299,14 @@ class _Reader:
         of_rows = [list(stages[int(stage)]) for stage in rows[:count, 1]]
         of_rows[-1] = [*stages[-1], *views]
         expect(rows[count - 1, 1] == len(stages) - 1, "moments", "the last stage, of a complete touch", rows[:, 1])
-        of_rows += [of_rows[-1] if recall is None else list(views)] * (len(rows) - count)
+        of_rows += [of_rows[-1] if matcher is None else list(views)] * (len(rows) - count)
         found = list(self._calibrations([*stages, *of_rows]))
         moments = [
             Moment(int(columns), int(stage), calibration, *rest)
             for (columns, stage, *rest), calibration in zip(rows.tolist(), found[len(stages) :], strict=True)
         ]
         trajectories = self._trajectories(count - 1)
-        fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), recall, trajectories)
+        fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), matcher, trajectories)
         return found[: len(stages)], fusion
 
     def _calibrations(self, scales: Sequence[Sequence[Scale]]) -> Iterator[Calibration]:

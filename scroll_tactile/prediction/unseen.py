@@ -62,8 +62,8 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
     fusion, seen = model.fusion, set[int]()
     if fusion is None:
         return
-    recall = fusion.recall
-    rows = {} if recall is None else recall.rows()
+    matcher = fusion.matcher
+    rows = {} if matcher is None else matcher.rows()
     for stage in range(len(model.calibrations) - 1, -1, -1):
         scales, whole = model.scales("complete", stage), stage == len(model.calibrations) - 1
         calibration = fusion.complete.calibration if whole else model.calibrations[stage]
@@ -76,9 +76,9 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
             material, key, _ = model.sample[place]
             chances, novelty = np.exp(held.logs[i]), float(held.novelty[i])
             said = Judgement(chances, novelty, moment, float(held.distance[i]))
-            if recall is not None and key in rows and not moment.suffices(float(chances.max()), said.distance):
-                way = recall.recollect(recall.levels(rows[key]), left_out=rows[key])
-                said = fused(recall, held.names, said, way, own_time=True)
+            if matcher is not None and key in rows and not moment.suffices(float(chances.max()), said.distance):
+                way = matcher.match(matcher.levels(rows[key]), left_out=rows[key])
+                said = fused(matcher, held.names, said, way, own_time=True)
             else:
                 said = replace(said, probability=tempered(chances, moment.odd_model))
             threshold = moment.threshold(false_alarms)

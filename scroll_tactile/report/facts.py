@@ -18,7 +18,7 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
-from scroll_tactile.matching.match import Kept
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
@@ -107,7 +107,7 @@ class MemoryFacts:
         return separations(self.learner, self.model)
 
     @cached_property
-    def kept(self) -> list[Kept]:
+    def kept(self) -> list[KeptTouch]:
         """The kept touches, in the order of observation where that is known."""
         touches = self.learner.memory.kept.touches() if self.learner.memory.kept is not None else []
         place = {row.key: row.sequence for row in self.journal}

@@ -11,7 +11,7 @@ import numpy as np
 from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule
-from scroll_tactile.matching.match import Kept
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.prediction.answer import answer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
@@ -148,16 +148,16 @@ def _without(model: Model, touch: UnseenTouch) -> Iterator[Model]:
     sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
     with one_thread():
         other = _left_by(model, touch.material, sampled)
-    recall = model.recall
-    if recall is None or (touch.material, touch.key) not in recall.held:
+    matcher = model.matcher
+    if matcher is None or (touch.material, touch.key) not in matcher.held:
         yield other
         return
-    kept = Kept(touch.material, touch.key, recall.levels(recall.rows()[touch.key]))
-    recall.follow((), [(touch.material, touch.key)])
+    kept = KeptTouch(touch.material, touch.key, matcher.levels(matcher.rows()[touch.key]))
+    matcher.follow((), [(touch.material, touch.key)])
     try:
         yield other
     finally:
-        recall.follow([kept])
+        matcher.follow([kept])
 
 
 def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:

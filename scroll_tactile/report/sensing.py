@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.matching.match import Kept
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, Channel, channels_of
 from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
@@ -34,7 +34,7 @@ def listed(channels: Sequence[Channel], most: int = 8) -> str:
     return ", ".join(numbers[:most]) + (f" and {len(numbers) - most} more" if len(numbers) > most else "")
 
 
-def channel_card(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> Card:
+def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> Card:
     """What is to be seen first of the channels."""
     if sensor.camera:
         return "none", "Channels", "a camera", "Its pixels are not looked at one by one."
@@ -57,13 +57,13 @@ def card_of(found: Sequence[Channel], by: str) -> Card:
     return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
-def _channels(sensor: Sensor, kept: Sequence[Kept], ordered: bool) -> list[Channel]:
+def _channels(sensor: Sensor, kept: Sequence[KeptTouch], ordered: bool) -> list[Channel]:
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
     levels, materials = [touch.levels for touch in kept], [touch.material for touch in kept]
     return channels_of(levels, materials, (low < 0) & (high > 0), ordered=ordered)
 
 
-def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> str:
+def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> str:
     """All channels, and their levels over the touches."""
     if sensor.camera:
         return note("Not shown: a camera has no channels that could be dead one by one; look at its frames below.")
@@ -164,7 +164,7 @@ def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str
     return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
 
 
-def exemplar_pictures(sensor: Sensor, kept: Sequence[Kept], exemplars: Mapping[str, Sequence[Exemplar]]) -> str:
+def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapping[str, Sequence[Exemplar]]) -> str:
     """A small picture of one touch of each material, of as many as there is room for."""
     found: dict[str, str] = {}
     if sensor.camera:

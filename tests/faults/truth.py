@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.match import Kept
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.rows import DESCRIBE, OBSERVE, RETRACT, unspanned
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
@@ -123,7 +123,8 @@ class Truth:
         keeping = self._learner._empty_memory().kept.made  # type: ignore[union-attr]
         if row not in self._conformal:
             kept = [
-                Kept(name, key, keeping.levels(self.stream(key).readings)) for name, key in self.states[row].touches
+                KeptTouch(name, key, keeping.levels(self.stream(key).readings))
+                for name, key in self.states[row].touches
             ]
             self._conformal[row] = Conformal(kept)
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.matching.deviation import recall_of
+from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.likelihood import CLEAN
-from scroll_tactile.matching.match import Kept, Recollection
+from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.prediction.fusion import ODD, Judged, Moment, chosen_of, fuse, match_of, moments_of, tempered
 from scroll_tactile.readouts.calibration import FEWEST, Calibration
 from scroll_tactile.readouts.held_out import HeldOut
@@ -19,13 +19,13 @@ def touches(each=24):
     """Kept touches of which only the keys and materials matter."""
     rng = np.random.default_rng(0)
     return [
-        Kept(name, bytes([i, seed]) * 16, rng.integers(0, 254, (2, 8)).astype(np.uint8))
+        KeptTouch(name, bytes([i, seed]) * 16, rng.integers(0, 254, (2, 8)).astype(np.uint8))
         for i, name in enumerate(NAMES)
         for seed in range(each)
     ]
 
 
-RECALL = recall_of(touches())
+MATCHER = matcher_of(touches())
 KEYS = sorted(touch.key for touch in touches())
 OWN = {touch.key: NAMES.index(touch.material) for touch in touches()}
 
@@ -36,9 +36,9 @@ def evidence(rng, keys, step=TRUE, odd=0.0):
     return step * (rng.normal(size=(len(keys), C)) + step * np.eye(C)[felt])
 
 
-def recollection(scores, certainty=0.5, trust=0.0):
+def match(scores, certainty=0.5, trust=0.0):
     unseen = np.full((2, 8), np.nan)
-    return Recollection(scores, certainty, CLEAN, np.zeros(2, bool), unseen, trust, False, -1.0, 1.0, 0.0)
+    return Match(scores, certainty, CLEAN, np.zeros(2, bool), unseen, trust, False, -1.0, 1.0, 0.0)
 
 
 def judged(columns, logits, scores, keys=KEYS, certainty=0.5):
@@ -50,12 +50,12 @@ def judged(columns, logits, scores, keys=KEYS, certainty=0.5):
     targets = np.array([OWN[key] for key in keys], dtype=np.intp)
     held = HeldOut(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
     said = np.zeros((len(keys), C)) if scores is None else scores
-    matches = {key: recollection(row, certainty=certainty) for key, row in zip(keys, said, strict=True)}
+    matches = {key: match(row, certainty=certainty) for key, row in zip(keys, said, strict=True)}
     return Judged(columns, 0, calibration, held, matches)
 
 
 def fused(*moments, keys=KEYS):
-    return fuse(RECALL, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0), 1.0)
+    return fuse(MATCHER, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0), 1.0)
 
 
 def beta(moment, certainty=0.5):
@@ -116,9 +116,9 @@ def test_a_moment_is_drawn_to_its_neighbours():
     near = [judged(columns, evidence(rng, KEYS) * 8, None) for columns in (10, 30)]
     last = judged(40, evidence(rng, KEYS), None)
     counts = dict.fromkeys(KEYS, 1.0)
-    between = fuse(RECALL, [near[0], scarce, near[1], last], [last], KEYS, counts, 1.0).moments[1]
-    alone = fuse(RECALL, [scarce, last], [last], KEYS, counts, 1.0).moments[0]
-    expected = [fuse(RECALL, [one, last], [last], KEYS, counts, 1.0).moments[0].model for one in near]
+    between = fuse(MATCHER, [near[0], scarce, near[1], last], [last], KEYS, counts, 1.0).moments[1]
+    alone = fuse(MATCHER, [scarce, last], [last], KEYS, counts, 1.0).moments[0]
+    expected = [fuse(MATCHER, [one, last], [last], KEYS, counts, 1.0).moments[0].model for one in near]
     assert max(expected) < between.model < alone.model
 
 
@@ -147,7 +147,7 @@ def test_the_moment_of_a_touch_is_the_latest_that_it_reached():
     fusion = fused(*(judged(columns, evidence(rng, KEYS), None) for columns in (10, 20, 40)))
     assert [fusion.at(columns).columns for columns in (1, 10, 19, 20, 500)] == [10, 10, 10, 20, 40]
     paced = [judged(columns, evidence(rng, KEYS), None) for columns in (20, 80)]
-    fusion = fuse(RECALL, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
+    fusion = fuse(MATCHER, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
     assert [fusion.at_pace(columns).columns for columns in (2, 39, 41, 900)] == [20, 20, 80, 80]
 
 
@@ -180,7 +180,7 @@ def test_touches_are_chosen_evenly_and_the_least_sure_beside_them(monkeypatch):
     monkeypatch.setattr("scroll_tactile.prediction.fusion.MOST_HELD_OUT", 20)
     rng = np.random.default_rng(9)
     held = judged(10, evidence(rng, KEYS), None).held_out
-    chosen, counts = chosen_of(held, RECALL)
+    chosen, counts = chosen_of(held, MATCHER)
     assert chosen == sorted(chosen) and len(chosen) == 20
     least = [held.keys[i] for i in np.argsort(held.margins)[:10]]
     assert set(least) <= counts.keys() and set(chosen) <= counts.keys()
@@ -203,7 +203,7 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
     assert moment.alone > moment.match
 
     def way(trust):
-        return recollection(np.zeros(C), trust=trust)
+        return match(np.zeros(C), trust=trust)
 
     assert moment.steepness(way(0.0), 1.0) == pytest.approx(beta(moment))
     assert moment.steepness(way(1.0), 1.0) == pytest.approx(1 / (1 + (1 / moment.alone - 1) * 0.5))

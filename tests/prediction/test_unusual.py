@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from prediction.test_recalling import CHANNELS, REACH, SCENE, lasting, learned, some, uniform
+from prediction.test_matched import CHANNELS, REACH, SCENE, lasting, learned, some, uniform
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.results import Prediction

@@ -1,6 +1,6 @@
 """What views are for: touches at another speed, of another length, over a small part of the range.
 
-Without kept touches beside them: for those see `test_recalling`.
+Without kept touches beside them: for those see `test_matched`.
 """
 
 import numpy as np

@@ -24,7 +24,7 @@ def learned(recall=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
 
 
 @pytest.fixture(scope="module")
-def recalling():
+def matching():
     return learned()
 
 
@@ -77,42 +77,42 @@ def right(learner, change):
 
 
 @pytest.mark.parametrize("kind", LOST)
-def test_what_is_lost_without_recall_is_recalled(recalling, alone, kind):
+def test_what_is_lost_without_kept_touches_is_known_with_them(matching, alone, kind):
     change, least, most = LOST[kind]
-    assert right(recalling, change) >= least
+    assert right(matching, change) >= least
     assert right(alone, change) <= most
 
 
 @pytest.mark.parametrize("kind", HELD)
-def test_what_is_known_without_recall_stays_known(recalling, alone, kind):
-    assert right(recalling, HELD[kind]) >= max(0.9, right(alone, HELD[kind]) - 1 / len(ASKED))
+def test_what_is_known_without_kept_touches_stays_known(matching, alone, kind):
+    assert right(matching, HELD[kind]) >= max(0.9, right(alone, HELD[kind]) - 1 / len(ASKED))
 
 
-def test_noise_alone_and_what_was_never_touched_is_unknown(recalling):
+def test_noise_alone_and_what_was_never_touched_is_unknown(matching):
     rng = np.random.default_rng(0)
-    alone = [recalling.predict(rng.uniform(0, REACH, (80, CHANNELS))).known for _ in range(20)]
-    strange = [recalling.predict(SCENE.touch(SCENE.materials[10], i)).known for i in range(10)]
-    usual = [recalling.predict(values).known for _, values in ASKED]
+    alone = [matching.predict(rng.uniform(0, REACH, (80, CHANNELS))).known for _ in range(20)]
+    strange = [matching.predict(SCENE.touch(SCENE.materials[10], i)).known for i in range(10)]
+    usual = [matching.predict(values).known for _, values in ASKED]
     assert sum(alone) == sum(strange) == 0
     assert np.mean(usual) >= 0.9
 
 
-def test_a_touch_that_the_model_is_sure_of_is_its_alone(recalling, alone):
+def test_a_touch_that_the_model_is_sure_of_is_its_alone(matching, alone):
     most = 1 - alone.model().fusion.complete.odd_model * (1 - 1 / len(NAMES))  # what forty touches can vouch for
     sure = [values for _, values in ASKED if alone.predict(values).probability > 0.999 * most]
     assert len(sure) > len(ASKED) / 2
-    same = [recalling.predict(values).ranking == alone.predict(values).ranking for values in sure]
+    same = [matching.predict(values).ranking == alone.predict(values).ranking for values in sure]
     assert np.mean(same) > 0.8
 
 
-def test_a_scene_restricts_recall(recalling):
+def test_a_scene_restricts_matching(matching):
     rng = np.random.default_rng(0)
     for name, values in ASKED[:10]:
         scene = sorted({name, NAMES[0], NAMES[1]})
-        prediction = recalling.predict(uniform(values, rng), scene=scene)
+        prediction = matching.predict(uniform(values, rng), scene=scene)
         assert sorted(material for material, _ in prediction.ranking) == scene
         assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
-        assert recalling.predict(uniform(values, rng), scene=[name]).probability == 1
+        assert matching.predict(uniform(values, rng), scene=[name]).probability == 1
 
 
 def test_a_material_without_kept_touches_is_weighed():
@@ -140,7 +140,7 @@ def test_one_material_and_few_touches(names, of_each):
             assert learner.predict(values).material == without.predict(values).material == name
 
 
-def test_touches_far_longer_than_usual_are_kept_in_part_and_recalled(recalling):
+def test_touches_far_longer_than_usual_are_kept_in_part_and_known(matching):
     learner = learned(of_each=4)
     for i in range(4):
         learner.observe("long", lasting(SCENE.touch(SCENE.materials[7], i).readings, 5))
@@ -179,7 +179,7 @@ def test_one_channel():
         assert np.isfinite(learner.predict(np.full((80, 1), flat)).novelty)
 
 
-def test_ragged_touches(recalling):
+def test_ragged_touches(matching):
     learner = learned(of_each=2)
     for i in range(2, 10):
         for name in NAMES:
@@ -189,11 +189,11 @@ def test_ragged_touches(recalling):
 
 
 def present(learner):
-    """The recall that answers now."""
-    return learner._current.present(learner._ledger).recall
+    """The matcher that answers now."""
+    return learner._current.present(learner._ledger).matcher
 
 
-def test_a_model_that_followed_recalls_what_one_fitted_anew_does(tmp_path):
+def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
     """What was measured and fitted stays until the next fit; what is kept is that of now."""
     with TactileLearner.open(tmp_path / "m", sensor=SKIN, embedding=Kernels(dimension=256)) as learner:
         receipts = [learner.observe(name, SCENE.touch(name, i)) for i in range(14) for name in NAMES]
@@ -208,13 +208,13 @@ def test_a_model_that_followed_recalls_what_one_fitted_anew_does(tmp_path):
         assert followed.held == kept
         rng = np.random.default_rng(0)
         asked = [learner.memory.keeping.levels(uniform(values, rng)) for _, values in ASKED[:8]]
-        before = [followed.recollect(levels) for levels in asked]
+        before = [followed.match(levels) for levels in asked]
         learner.settle()
         anew = present(learner)
         assert (anew.held, anew.materials) == (kept, sorted({*NAMES, "new"}))
         anew.measured = measured
         for levels, found in zip(asked, before, strict=True):
-            again = anew.recollect(levels)
+            again = anew.match(levels)
             assert again.noise == found.noise
             assert np.allclose(again.scores, found.scores, rtol=1e-9)
             numbers = [[each.trust, each.evidence, each.surprise] for each in (again, found)]

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sized
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, Likelihood
 from scroll_tactile.matching.match import KeptTouch, NaturalDeviation, independent
 from scroll_tactile.matching.matcher import TouchMatcher
@@ -32,27 +33,24 @@ def matcher_of(touches: Iterable[KeptTouch]) -> TouchMatcher:
 
     Raises InputError for touches of different channels, and for none.
     """
-    level = np.ones(LEVELS)
-    matcher = TouchMatcher(touches, NaturalDeviation(Likelihood(level, level), *ASSUMED))
-    matcher.measured = NaturalDeviation(_likelihood(matcher), *ASSUMED)
-    matcher.measured = _measured(matcher)
-    return matcher
+    kept = KeptArrays.of(touches)
+    return TouchMatcher(kept, _measured(TouchMatcher(kept, NaturalDeviation(_likelihood(kept), *ASSUMED))))
 
 
-def spaced(matcher: Sized, count: int) -> list[int]:
+def spaced(touches: Sized, count: int) -> list[int]:
     """Places of at most so many touches, spread evenly over their keys: at random, but the same of the same set."""
-    return list(range(0, len(matcher), max(1, -(-len(matcher) // count))))
+    return list(range(0, len(touches), max(1, -(-len(touches) // count))))
 
 
-def _likelihood(matcher: TouchMatcher) -> Likelihood:
+def _likelihood(kept: KeptArrays) -> Likelihood:
     """The tables of the spread by level: the mean deviation from the nearest touch, over levels half to twice as high.
 
     The mean deviation, and not the standard deviation, which is a quarter more: kept touches that are likelier come
     nearer than the nearest by all values does.
     """
     counts, deviations = np.zeros(LEVELS), np.zeros(LEVELS)
-    for row in spaced(matcher, PAIRS):
-        pair = matcher.nearest(row)
+    for row in spaced(kept, PAIRS):
+        pair = kept.nearest_alike(row)
         if pair is None:
             continue
         both = (pair[0] != MISSING) & (pair[1] != MISSING)
@@ -74,12 +72,12 @@ def _between(values: FloatArray, least: npt.NDArray[np.int_], most: npt.NDArray[
 
 
 def _measured(matcher: TouchMatcher) -> NaturalDeviation:
-    rows = spaced(matcher, LEFT_OUT)
-    if len(matcher) < 2 or len(rows) < FEWEST:
-        return matcher.measured
-    shapes = [matcher.apart(row) for row in rows]
+    rows = spaced(matcher.kept, LEFT_OUT)
+    if len(matcher.kept) < 2 or len(rows) < FEWEST:
+        return matcher.deviation
+    shapes = [matcher.deviation_of(row) for row in rows]
     natural = float(np.median([coherence for _, coherence in shapes]))
     noise = [independent(energy, coherence, natural) for energy, coherence in shapes]
     most = EVEN**2 * float(np.quantile(noise, USUAL))
     energy = float(np.quantile([energy for energy, _ in shapes], USUAL))
-    return NaturalDeviation(matcher.measured.likelihood, natural, max(most, ROUNDING), max(energy, ROUNDING))
+    return NaturalDeviation(matcher.deviation.likelihood, natural, max(most, ROUNDING), max(energy, ROUNDING))

@@ -44,7 +44,7 @@ class NaturalDeviation:
 class Match:
     """What kept touches say of a touch.
 
-    scores: log-likelihood of each material, in the order of `TouchMatcher.materials`, shape (M,).
+    scores: log-likelihood of each material, in the order of `KeptArrays.materials`, shape (M,).
     certainty: how far noise leaves it to be seen that values near each other deviate together, 1 of a clean touch.
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.

@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.matching.blends import at_places
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.deviation import matcher_of
-from scroll_tactile.matching.likelihood import MISSING, LevelArray
+from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory, give_back_scratch
@@ -226,11 +227,11 @@ class _KeptTouches:
     @classmethod
     def held_out(cls, fit: _Fit, matcher: TouchMatcher, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
         """Those with some keys."""
-        kept = matcher.rows()
+        kept = matcher.kept.rows()
         rows = {key: kept[key] for key in sorted(keys)}
-        levels = {key: matcher.levels(row) for key, row in rows.items()}
+        levels = {key: matcher.kept.levels(row) for key, row in rows.items()}
         places = {key: place for place, (_, key, _) in enumerate(fit.draft.sample)}
-        matches = {key: matcher.match(levels[key], left_out=row) for key, row in rows.items()}
+        matches = {key: matcher.match(levels[key], held_out=row) for key, row in rows.items()}
         return cls(fit, matcher, chosen, rows, levels, places, matches)
 
     def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[Judged]:
@@ -242,7 +243,7 @@ class _KeptTouches:
                 if (levels := self.levels[key]).shape[1] >= columns:
                     # What came over a touch is looked for once, in all of it: that is most of what asking costs.
                     noise = self.matches[key].noise
-                    matches[key] = self.matcher.match(levels[:, :columns], left_out=self.rows[key], noise=noise)
+                    matches[key] = self.matcher.match(levels[:, :columns], held_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]
             judged.append(self.fit.judged((columns, stage), number, scales, apart, matches))
         return judged
@@ -270,7 +271,7 @@ class _KeptTouches:
         matches = {}
         for key in keys:
             levels, noise = at_pace(self.levels[key], pace), self.matches[key].noise
-            matches[key] = self.matcher.match(levels, left_out=self.rows[key], whole=True, noise=noise)
+            matches[key] = self.matcher.match(levels, held_out=self.rows[key], whole=True, noise=noise)
             image = extractor.image(stream_of(levels, extractor.sensor))
             for scale, mean in extractor.means(image, views).items():
                 asked[scale][self.places[key]] = {0: mean}
@@ -281,11 +282,6 @@ class _KeptTouches:
 
 
 def at_pace(levels: LevelArray, pace: float) -> LevelArray:
-    """A touch as if it had been made so many times as fast, by linear interpolation: (C, T) to (C, T / pace)."""
+    """A touch as if it had been made so many times as fast: (C, T) to (C, T / pace)."""
     columns = max(2, round(levels.shape[1] / pace))
-    places = np.linspace(0, levels.shape[1] - 1, columns)
-    first = places.astype(np.intp)
-    after, part = np.minimum(first + 1, levels.shape[1] - 1), places - first
-    low, high = levels[:, first], levels[:, after]
-    blended = np.rint(low * (1 - part) + high * part).astype(np.uint8)
-    return np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), blended)
+    return at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))

@@ -254,7 +254,7 @@ def chosen_of(complete: HeldOut, matcher: TouchMatcher | None) -> tuple[list[byt
     And those that are compared as complete ones, with how many each stands for: beside them the least sure, where it
     matters what is believed; each of the others stands for many.
     """
-    kept = set() if matcher is None else matcher.rows().keys()
+    kept = set() if matcher is None else matcher.kept.rows().keys()
     ranked = [key for _, key in sorted(zip(complete.margins.tolist(), complete.keys, strict=True)) if key in kept]
     keys, unsure = sorted(ranked), ranked[: MOST_HELD_OUT // 2]
     places = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int)
@@ -293,7 +293,7 @@ def _at(matcher: TouchMatcher | None, judged: Judged, names: Sequence[str], coun
 
 def match_scores(matcher: TouchMatcher, names: Sequence[str], way: Match) -> FloatArray:
     """What the kept touches say of some materials, (C,); the least of those of which none is kept."""
-    places, least = {name: i for i, name in enumerate(matcher.materials)}, float(way.scores.min())
+    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(way.scores.min())
     return np.array([way.scores[places[name]] if name in places else least for name in names])
 
 
@@ -314,7 +314,9 @@ def _fitted(
     if matcher is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
         # Where nothing can be held out, the kept touches decide only where the readouts do not.
         power = float(calibration.weights.sum()) / prior_weight
-        match = 0.5 if matcher is None else match_of(power * UNSEEN, matcher.measured.likelihood.table(CLEAN).certainty)
+        match = (
+            0.5 if matcher is None else match_of(power * UNSEEN, matcher.deviation.likelihood.table(CLEAN).certainty)
+        )
         spread = 1.0 / UNMEASURED
         return Moment(columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread)
     together = _joined(near)

@@ -48,7 +48,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         return _by_readouts(model, encoded, alone, usual)
     levels = levels_seen(encoded.stream)
     ways: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
-    if levels.shape[1] != matcher.longest and fusion.reaches(levels.shape[1]):
+    if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
         whole = matcher.match(levels, whole=True)
         if whole.evidence > 0:  # at no other pace is it any more like what is kept
             ways.append((whole, "paced", False))

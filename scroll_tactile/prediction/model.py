@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
@@ -165,15 +166,15 @@ class Model:
     def _follow_kept(self, memory: Memory, matcher: TouchMatcher) -> bool:
         """Take in what is kept in the memory now; False where that is nothing."""
         assert self.conformal is not None and self.fusion is not None and memory.kept is not None
-        kept, held = {(material, key) for material, key, _ in memory.kept}, matcher.held
+        kept, held = {(material, key) for material, key, _ in memory.kept}, matcher.kept.held
         added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
         if not kept:
             return False
-        if matcher.follow(added, held - kept):
+        if matcher.kept.follow(added, held - kept):
             self.conformal.follow(added, held - kept)
         else:  # one is longer than all before it: what they say of themselves stays
             touches = memory.kept.touches()
-            self.fusion = replace(self.fusion, matcher=TouchMatcher(touches, matcher.measured))
+            self.fusion = replace(self.fusion, matcher=TouchMatcher(KeptArrays.of(touches), matcher.deviation))
             self.conformal = Conformal(touches)
         return True
 

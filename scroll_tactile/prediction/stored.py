@@ -22,6 +22,7 @@ from scroll_tactile.embeddings.banks import MOST_CHANNELS, ROUND, THRESHOLDS, Ba
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
@@ -121,16 +122,16 @@ def with_banks(embedding: Embedding, arrays: Arrays) -> Embedding:
 def _kept_to_arrays(
     matcher: TouchMatcher, conformal: Conformal, places: Mapping[str, int]
 ) -> dict[str, npt.NDArray[Any]]:
-    measured, rows = matcher.measured, {touch: row for row, touch in enumerate(matcher.touches)}
+    deviation, rows = matcher.deviation, {touch: row for row, touch in enumerate(matcher.kept.touches)}
     return {
-        "kept-keys": np.array([list(key) for _, key in matcher.touches], dtype=np.uint8),
-        "kept-materials": np.array([places[material] for material, _ in matcher.touches], dtype=np.int64),
+        "kept-keys": np.array([list(key) for _, key in matcher.kept.touches], dtype=np.uint8),
+        "kept-materials": np.array([places[material] for material, _ in matcher.kept.touches], dtype=np.int64),
         "kept-order": np.array([rows[touch] for touch in conformal.touches], dtype=np.int64),
-        "kept-longest": np.array([matcher.longest], dtype=np.int64),
-        "measured": np.array([measured.coherence, measured.energy, measured.most]),
-        "spread": measured.likelihood.spread,
-        "read": measured.likelihood.weights,
-        **{f"matcher-{name}": part for name, part in matcher.to_arrays().items()},
+        "kept-longest": np.array([matcher.kept.longest], dtype=np.int64),
+        "deviation": np.array([deviation.coherence, deviation.energy, deviation.most]),
+        "spread": deviation.likelihood.spread,
+        "read": deviation.likelihood.weights,
+        **{f"matcher-{name}": part for name, part in matcher.kept.to_arrays().items()},
         **{f"conformal-{name}": part for name, part in conformal.to_arrays().items()},
     }
 
@@ -246,8 +247,8 @@ class _Reader:
         levels, channels = {(touch.material, touch.key): touch.levels for touch in memory.touches()}, 0
         count = self._length("kept-materials", memory.capacity)
         keys = array(self._arrays, "kept-keys", ("uint8",), (count, KEY_BYTES))
-        own = counts("kept-materials", self._arrays["kept-materials"], 0, len(self._names) - 1)
-        touches = [(self._names[place], key.tobytes()) for place, key in zip(own.tolist(), keys, strict=True)]
+        materials = counts("kept-materials", self._arrays["kept-materials"], 0, len(self._names) - 1)
+        touches = [(self._names[place], key.tobytes()) for place, key in zip(materials.tolist(), keys, strict=True)]
         expect(len(set(touches)) == count, "kept-keys", "different touches", count)
         there = [row for row, touch in enumerate(touches) if touch in levels]
         expect(len(there) == len(levels) if self._same else bool(there), "kept-keys", "those that are kept", len(there))
@@ -257,18 +258,17 @@ class _Reader:
         longest = int(counts("kept-longest", array(self._arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
         lengths = {row: touch.levels.shape[1] for row, touch in kept.items()}
         expect(max(lengths.values()) <= longest, "kept-longest", "the longest", longest)
-        parts = self._parts("matcher", TouchMatcher.parts(count, channels, longest))
+        parts = self._parts("matcher", KeptArrays.parts(count, channels, longest))
         columns = parts["columns"][there].tolist()
         expect(columns == list(lengths.values()), "matcher-columns", "their lengths", "others")
         expect(bool(np.isfinite(parts["squares"]).all()), "matcher-squares", "finite numbers", "others")
         spread, read = self.floats("spread", (LEVELS,), 1.0, LEVELS), self.floats("read", (LEVELS,), 0.0, 1.0)
         expect(read.sum() > 0, "read", "a level or more", "none")
-        coherence, energy, usual = self.floats("measured", (3,), 1e-9).tolist()
-        expect(max(coherence, energy) < 1e300, "measured", "finite numbers", [coherence, energy])
-        measured = NaturalDeviation(Likelihood.of(spread, read), coherence, energy, usual)
-        matcher = TouchMatcher.from_arrays(
-            list(kept.values()), {name: part[there] for name, part in parts.items()}, longest, measured
-        )
+        coherence, energy, most_energy = self.floats("deviation", (3,), 1e-9).tolist()
+        expect(max(coherence, energy) < 1e300, "deviation", "finite numbers", [coherence, energy])
+        deviation = NaturalDeviation(Likelihood.of(spread, read), coherence, energy, most_energy)
+        own = {name: part[there] for name, part in parts.items()}
+        matcher = TouchMatcher(KeptArrays.from_arrays(list(kept.values()), own, longest), deviation)
         order = self._places("kept-order", count, count).tolist()
         standing = [place for place, row in enumerate(order) if row in kept]
         parts = self._parts("conformal", Conformal.parts(count, channels, longest))

@@ -63,7 +63,7 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
     if fusion is None:
         return
     matcher = fusion.matcher
-    rows = {} if matcher is None else matcher.rows()
+    rows = {} if matcher is None else matcher.kept.rows()
     for stage in range(len(model.calibrations) - 1, -1, -1):
         scales, whole = model.scales("complete", stage), stage == len(model.calibrations) - 1
         calibration = fusion.complete.calibration if whole else model.calibrations[stage]
@@ -77,7 +77,7 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
             chances, novelty = np.exp(held.logs[i]), float(held.novelty[i])
             said = Judgement(chances, novelty, moment, float(held.distance[i]))
             if matcher is not None and key in rows and not moment.suffices(float(chances.max()), said.distance):
-                way = matcher.match(matcher.levels(rows[key]), left_out=rows[key])
+                way = matcher.match(matcher.kept.levels(rows[key]), held_out=rows[key])
                 said = fused(matcher, held.names, said, way, own_time=True)
             else:
                 said = replace(said, probability=tempered(chances, moment.odd_model))

@@ -149,15 +149,15 @@ def _without(model: Model, touch: UnseenTouch) -> Iterator[Model]:
     with one_thread():
         other = _left_by(model, touch.material, sampled)
     matcher = model.matcher
-    if matcher is None or (touch.material, touch.key) not in matcher.held:
+    if matcher is None or (touch.material, touch.key) not in matcher.kept.held:
         yield other
         return
-    kept = KeptTouch(touch.material, touch.key, matcher.levels(matcher.rows()[touch.key]))
-    matcher.follow((), [(touch.material, touch.key)])
+    kept = KeptTouch(touch.material, touch.key, matcher.kept.levels(matcher.kept.rows()[touch.key]))
+    matcher.kept.follow((), [(touch.material, touch.key)])
     try:
         yield other
     finally:
-        matcher.follow([kept])
+        matcher.kept.follow([kept])
 
 
 def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:

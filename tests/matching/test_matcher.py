@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.deviation import matcher_of
+from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.matching.matcher import TouchMatcher
@@ -128,15 +129,15 @@ def test_touches_that_come_and_go_leave_what_a_new_matcher_would_have():
     touches, more = kept(each=4), [KeptTouch("new", bytes([9, i]) * 16, touch(7, i)) for i in range(30)]
     matcher, gone = matcher_of(touches), [touches[3], touches[9]]
     start = [matcher.match(touch(1, 100)), matcher.match(noisy(touch(2, 100), 0.4, 0))]
-    assert matcher.follow(more, [(went.material, went.key) for went in gone])
-    anew = TouchMatcher([stays for stays in touches if stays not in gone] + more, matcher.measured)
-    assert matcher.held == anew.held
-    assert matcher.materials == [*(f"m{material}" for material in range(MATERIALS)), "new"]
+    assert matcher.kept.follow(more, [(went.material, went.key) for went in gone])
+    anew = TouchMatcher(KeptArrays.of([stays for stays in touches if stays not in gone] + more), matcher.deviation)
+    assert matcher.kept.held == anew.kept.held
+    assert matcher.kept.materials == [*(f"m{material}" for material in range(MATERIALS)), "new"]
     for asked in (touch(7, 100), noisy(touch(2, 100), 0.4, 0), touch(1, 50)[:, :40]):
         for whole in (False, True):
             assert near(matcher.match(asked, whole=whole), anew.match(asked, whole=whole))
-    assert matcher.follow(gone, [(came.material, came.key) for came in more])
-    assert matcher.held == {(stays.material, stays.key) for stays in touches}
+    assert matcher.kept.follow(gone, [(came.material, came.key) for came in more])
+    assert matcher.kept.held == {(stays.material, stays.key) for stays in touches}
     again = [matcher.match(touch(1, 100)), matcher.match(noisy(touch(2, 100), 0.4, 0))]
     assert all(map(near, start, again))
 
@@ -149,35 +150,41 @@ def test_whatever_comes_and_goes_it_holds_what_a_set_would(toggled, rng):
     matcher = matcher_of(touches[:3])
     for i in toggled:
         if i in held and len(held) > 1:
-            assert matcher.follow([], [(touches[i].material, touches[i].key)])
+            assert matcher.kept.follow([], [(touches[i].material, touches[i].key)])
             held.discard(i)
         elif i not in held:
-            assert matcher.follow([touches[i]])
+            assert matcher.kept.follow([touches[i]])
             held.add(i)
     stays = [touches[i] for i in held]
     rng.shuffle(stays)
-    anew, asked = TouchMatcher(stays, matcher.measured), noisy(touch(rng.randrange(MATERIALS), 100), 0.3, 1)
-    assert matcher.held == anew.held
-    assert matcher.materials == anew.materials
+    anew, asked = (
+        TouchMatcher(KeptArrays.of(stays), matcher.deviation),
+        noisy(touch(rng.randrange(MATERIALS), 100), 0.3, 1),
+    )
+    assert matcher.kept.held == anew.kept.held
+    assert matcher.kept.materials == anew.kept.materials
     assert near(matcher.match(asked), anew.match(asked))
-    for row in range(len(matcher)):
-        mine = next(stay for stay in stays if matcher.rows()[stay.key] == row)
-        assert (matcher.material(row), matcher.levels(row).tobytes()) == (mine.material, mine.levels.tobytes())
+    for row in range(len(matcher.kept)):
+        mine = next(stay for stay in stays if matcher.kept.rows()[stay.key] == row)
+        assert (matcher.kept.material(row), matcher.kept.levels(row).tobytes()) == (
+            mine.material,
+            mine.levels.tobytes(),
+        )
 
 
 def test_what_cannot_be_followed_says_so():
     short = kept(each=3, readings=60)
-    assert not matcher_of(short).follow(kept(each=1))  # longer than all that were kept
-    assert not matcher_of(short).follow([], [(went.material, went.key) for went in short])
+    assert not matcher_of(short).kept.follow(kept(each=1))  # longer than all that were kept
+    assert not matcher_of(short).kept.follow([], [(went.material, went.key) for went in short])
 
 
 def test_a_touch_left_out_is_as_if_it_were_not_kept():
     touches = kept(each=4)
     matcher = matcher_of(touches)
-    row = matcher.rows()[touches[6].key]
-    without = TouchMatcher([stays for stays in touches if stays is not touches[6]], matcher.measured)
-    asked = matcher.levels(row)
-    left_out = matcher.match(asked, left_out=row)
+    row = matcher.kept.rows()[touches[6].key]
+    without = TouchMatcher(KeptArrays.of([stays for stays in touches if stays is not touches[6]]), matcher.deviation)
+    asked = matcher.kept.levels(row)
+    left_out = matcher.match(asked, held_out=row)
     assert near(left_out, without.match(asked))
     assert left_out.scores.max() < matcher.match(asked).scores.max()
 
@@ -214,10 +221,10 @@ def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
     asked[3] = 0
     assert matcher.match(asked).stuck.tolist() == [False] * 3 + [stuck] + [False] * 4
     for each in touches[2:quiet]:
-        matcher.follow([], {(each.material, each.key)})
+        matcher.kept.follow([], {(each.material, each.key)})
     if quiet == 8:  # two are left, of 34, and without one of those there is one of 33
-        row = matcher.rows()[touches[0].key]
-        assert matcher.match(asked, left_out=row).stuck[3]
+        row = matcher.kept.rows()[touches[0].key]
+        assert matcher.match(asked, held_out=row).stuck[3]
 
 
 def test_channels_that_are_often_quiet_may_be_dead():
@@ -235,13 +242,13 @@ def test_channels_that_are_often_quiet_may_be_dead():
         dead[5:] = 0
         found = matcher.match(dead)
         assert found.stuck.tolist() == [False] * 5 + [True] * 3
-        assert matcher.materials[int(found.scores.argmax())] == quiet.material
+        assert matcher.kept.materials[int(found.scores.argmax())] == quiet.material
     never = matcher_of([each for each in touches if each.levels[:3].any()] + touches[:2])
     died = touch(3, 100)
     died[:3] = 0  # of its material none is quiet: two touches of another are
     found = never.match(died)
     assert found.stuck[:3].all()
-    assert never.materials[int(found.scores.argmax())] == "m3"
+    assert never.kept.materials[int(found.scores.argmax())] == "m3"
 
 
 def test_scores_are_sums_over_all_values():
@@ -250,8 +257,8 @@ def test_scores_are_sums_over_all_values():
     asked = noisy(touch(3, 100), 0.3, 1)
     asked[1, 5:9] = MISSING
     found = matcher.match(asked)
-    table = matcher.measured.likelihood.table(found.noise)
-    for place, material in enumerate(matcher.materials):
+    table = matcher.deviation.likelihood.table(found.noise)
+    for place, material in enumerate(matcher.kept.materials):
         levels = next(alike.levels for alike in alone if alike.material == material)
         total = sum(int(table.logs[256 * int(y) + int(x)]) for y, x in zip(asked.ravel(), levels.ravel(), strict=True))
         assert found.scores[place] == pytest.approx(total / UNIT, rel=1e-12)
@@ -303,9 +310,9 @@ def test_touches_of_other_lengths_and_one_touch_alone():
     ragged = matcher_of(
         [*kept(each=3), *(KeptTouch("short", bytes([8, i]) * 16, touch(6, i)[:, :50]) for i in range(3))]
     )
-    assert ragged.materials[np.argmax(ragged.match(touch(6, 100)[:, :50]).scores)] == "short"
-    assert ragged.materials[np.argmax(ragged.match(noisy(touch(6, 100), 0.2, 0)).scores)] == "short"
-    assert ragged.materials[np.argmax(ragged.match(noisy(touch(1, 100), 0.2, 0)).scores)] == "m1"
+    assert ragged.kept.materials[np.argmax(ragged.match(touch(6, 100)[:, :50]).scores)] == "short"
+    assert ragged.kept.materials[np.argmax(ragged.match(noisy(touch(6, 100), 0.2, 0)).scores)] == "short"
+    assert ragged.kept.materials[np.argmax(ragged.match(noisy(touch(1, 100), 0.2, 0)).scores)] == "m1"
     single = matcher_of(kept(each=1)[:1])
     assert single.match(touch(0, 100)).scores.shape == (1,)
 

@@ -83,11 +83,11 @@ def test_a_readout_without_a_touch_is_one_that_followed_its_going(model, extract
 def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model, extractor):
     """Of each beginning of a touch that readouts and kept touches never observed, as the table reads it."""
     said, fusion, apart = model.fusion.trajectories, model.fusion, []
-    rows = fusion.matcher.rows()
+    rows = fusion.matcher.kept.rows()
     keys = sorted(rows)  # all of them are held out: they are fewer than that
     assert len(said.targets) == len(keys) == len(TOUCHES)
     for touch in unseen_touches(model, 0.05)[::7]:
-        stream = stream_of(fusion.matcher.levels(rows[touch.key]), SKIN)
+        stream = stream_of(fusion.matcher.kept.levels(rows[touch.key]), SKIN)
         with _without(model, touch) as other, one_thread():
             for i, moment in enumerate(fusion.moments[:-1]):
                 beginning = stream.first(moment.columns / SKIN.rate)

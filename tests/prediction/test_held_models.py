@@ -109,7 +109,7 @@ def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypa
         live.begin()
         live.push(touch("a", 9, 30))
         model = live._under_way.frozen.model
-        likelihood = model.matcher.measured.likelihood
+        likelihood = model.matcher.deviation.likelihood
 
         def copied(noise, memo):
             if not count:
@@ -288,7 +288,7 @@ def _arrays(model):
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
     matcher, conformal = model.matcher, model.conformal
-    found |= {f"kept {name}": getattr(matcher, name) for name in ("_blocks", "_brought", "_squares", "_labels")}
+    found |= {f"kept {name}": getattr(matcher.kept, name) for name in ("blocks", "wide_blocks", "squares", "labels")}
     found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
     return found
 

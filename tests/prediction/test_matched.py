@@ -198,21 +198,21 @@ def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
     with TactileLearner.open(tmp_path / "m", sensor=SKIN, embedding=Kernels(dimension=256)) as learner:
         receipts = [learner.observe(name, SCENE.touch(name, i)) for i in range(14) for name in NAMES]
         learner.settle()
-        measured = present(learner).measured
+        measured = present(learner).deviation
         receipt = learner.observe("new", SCENE.touch(SCENE.materials[8], 0))
         learner.observe(NAMES[0], SCENE.touch(NAMES[0], 30))
         learner.retract(receipts[3])
         followed = present(learner)
-        assert followed.measured is measured
+        assert followed.deviation is measured
         kept = {(material, key) for material, key, _ in learner.memory.kept}
-        assert followed.held == kept
+        assert followed.kept.held == kept
         rng = np.random.default_rng(0)
         asked = [learner.memory.keeping.levels(uniform(values, rng)) for _, values in ASKED[:8]]
         before = [followed.match(levels) for levels in asked]
         learner.settle()
         anew = present(learner)
-        assert (anew.held, anew.materials) == (kept, sorted({*NAMES, "new"}))
-        anew.measured = measured
+        assert (anew.kept.held, anew.kept.materials) == (kept, sorted({*NAMES, "new"}))
+        anew.deviation = measured
         for levels, found in zip(asked, before, strict=True):
             again = anew.match(levels)
             assert again.noise == found.noise
@@ -220,7 +220,7 @@ def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
             numbers = [[each.trust, each.evidence, each.surprise] for each in (again, found)]
             assert np.allclose(*numbers, rtol=1e-9)
         learner.retract(receipt)
-        assert "new" not in present(learner).materials
+        assert "new" not in present(learner).kept.materials
         assert "new" not in {material for material, _ in learner.predict(ASKED[0][1]).ranking}
 
 

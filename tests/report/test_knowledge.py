@@ -69,8 +69,8 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
         expected = dict(other.predict(touch.first(seconds)).ranking)
         assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
     # The model has not lost the touch.
-    assert (name, touch.key) in model.matcher.held
-    assert len(model.matcher) == 24
+    assert (name, touch.key) in model.matcher.kept.held
+    assert len(model.matcher.kept) == 24
 
 
 def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):

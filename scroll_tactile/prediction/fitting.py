@@ -29,7 +29,8 @@ from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calib
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.held_out import HeldOut, held_out
 from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
-from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
+from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
@@ -69,7 +70,7 @@ class Renewal:
         with one_thread():
             for scale in sorted(self.tasks):
                 task = self.tasks.pop(scale)
-                self.model.readouts[scale] = Readout(task, self.memory.statistics, like=self.readouts.pop(scale))
+                self.model.readouts[scale] = task.solve(self.memory.statistics, like=self.readouts.pop(scale))
         give_back_scratch()
         return self.model
 
@@ -119,7 +120,7 @@ class Draft:
         """
         with one_thread():
             # One after the other, each task let go: of all at once the memory would be twice a model's.
-            readouts = {scale: Readout(self.tasks.pop(scale), self.memory.statistics) for scale in sorted(self.tasks)}
+            readouts = {scale: self.tasks.pop(scale).solve(self.memory.statistics) for scale in sorted(self.tasks)}
             fit = _Fit(self, readouts, extractor)
             apart = {scale: fit.left_out(scale) for scale in readouts}
             reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]

@@ -301,12 +301,14 @@ class Model:
         parts = list(zip(weights, readouts, codes, places, strict=True))
 
         def exactly(some: npt.NDArray[np.intp]) -> FloatArray:
-            return np.asarray(sum(weight * readout.exact(own, among[some]) for weight, readout, own, among in parts))
+            return np.asarray(
+                sum(weight * readout.many.exact(own, among[some]) for weight, readout, own, among in parts)
+            )
 
         def bounds(some: npt.NDArray[np.intp], fine: int) -> tuple[FloatArray, FloatArray]:
             # One more scale each time, the views first: it is of them that the least is known before.
             found = [
-                readout.bounds(own, among[some], fine=len(parts) - i <= fine)
+                readout.many.bounds(own, among[some], fine=len(parts) - i <= fine)
                 for i, (_, readout, own, among) in enumerate(parts)
             ]
             guess, most = (sum(weight * one[i] for weight, one in zip(weights, found, strict=True)) for i in (0, 1))

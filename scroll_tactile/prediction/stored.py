@@ -33,6 +33,7 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.readout import Readout, ReadoutName
+from scroll_tactile.readouts.readout_arrays import readout_from_arrays, readout_to_arrays
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
 from store import Checkpoint
@@ -68,7 +69,7 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     arrays |= {name: np.concatenate([getattr(each, name) for each in calibrations]) for name in OF_CALIBRATION}
     for scale, readout in model.readouts.items():
         arrays[f"names-{scale}"] = np.array([places[name] for name in readout.names], dtype=np.int64)
-        arrays |= {f"{name}-{scale}": part for name, part in readout.to_arrays().items()}
+        arrays |= {f"{name}-{scale}": part for name, part in readout_to_arrays(readout).items()}
     if model.matcher is not None and model.conformal is not None:
         arrays |= _kept_to_arrays(model.matcher, model.conformal, places)
     attributes = {
@@ -237,7 +238,7 @@ class _Reader:
         expect(parts["shape"][0] < 1, f"shape-{scale}", "a share below 1", parts["shape"])
         own = parts["held"][:references]
         expect(bool((own == parts["reference"]).all()), f"held-{scale}", "the reference first", own)
-        return Readout.from_arrays(scale, names, parts, statistics)
+        return readout_from_arrays(scale, names, parts, statistics)
 
     def kept(self) -> tuple[TouchMatcher, Conformal]:
         """What is made of the kept touches, of those that the memory has still."""

@@ -139,8 +139,8 @@ def learned_by(model: Any) -> Learned:
     for scale, readout in model.readouts.items():
         sums = np.empty((len(readout.names), len(readout.origin)))
         for place, name in enumerate(readout.names):
-            if (held := readout._held.get(place)) is not None:
-                sums[place] = (readout._means[held] + readout.origin) * readout.counts[place]
+            if (held := readout.held_means.rows.get(place)) is not None:
+                sums[place] = (readout.held_means.means[held] + readout.origin) * readout.counts[place]
             else:
                 sums[place] = readout.statistics.sums(scale, [name])[0]
         found[int(scale)] = learned_of(readout.names, readout.counts, sums)

@@ -165,7 +165,7 @@ def many(monkeypatch, tmp_path):
 def read_later(model):
     """The materials that a model has yet to read."""
     readout = min(model.readouts.items())[1]
-    return [name for place, name in enumerate(readout.names) if place not in readout._held]
+    return [name for place, name in enumerate(readout.names) if place not in readout.held_means.rows]
 
 
 def require_alike(prediction, expected):

@@ -19,7 +19,7 @@ from scroll_tactile.readouts.calibration import (
     scale_weights,
 )
 from scroll_tactile.readouts.leave_one_out import left_out
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
@@ -48,7 +48,7 @@ def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000
 def stages_of(statistics, pool, kind="lda", stages=STAGES):
     scales = sorted({scale for stage in stages for scale in stage})
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
-    readouts = {task.scale: Readout(task, statistics) for task in tasks}
+    readouts = {task.scale: task.solve(statistics) for task in tasks}
     apart = {scale: left_out(readout, pool, stages, kind) for scale, readout in readouts.items()}
     materials = [material for material, *_ in pool]
     return [
@@ -131,7 +131,7 @@ def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(un
     for stage, scales in zip(stages_of(statistics, sample), STAGES, strict=True):
         ahead = np.zeros((6, 6))
         for weight, scale in zip(stage.weights, scales, strict=True):
-            readout = Readout(Task.of(statistics, scale, statistics.names(scale)), statistics)
+            readout = Task.of(statistics, scale, statistics.names(scale)).solve(statistics)
             own = [readout.scores(mean, range(6), "lda") for mean in readout.means_solved()[0] + readout.origin]
             ahead += weight * (np.diagonal(own)[:, None] - own)
         np.fill_diagonal(ahead, np.inf)
@@ -153,7 +153,7 @@ def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are
     statistics, sample = scene(materials=2, touches=4)
     (stage,) = stages_of(statistics, sample, stages=STAGES[:1])
     assert len(stage.novelties) == 0
-    readout = Readout(Task.of(statistics, SCALES[0], ["0", "1"]), statistics)
+    readout = Task.of(statistics, SCALES[0], ["0", "1"]).solve(statistics)
     means = statistics.sums(SCALES[0], ["0", "1"]) / statistics.counts(SCALES[0], ["0", "1"])[:, None]
     typical = np.mean([readout.novelty(mean, [0, 1]) for mean in means])
     size = np.diagonal(readout.derived().gram).mean()
@@ -240,7 +240,7 @@ def test_a_scale_is_believed_less_the_stranger_a_touch_looks_in_it(scales, power
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_will_be(kind):
     statistics, sample = scene(noises=(20_000, 60_000), touches=60)
-    readouts = [Readout(Task.of(statistics, scale, statistics.names(scale)), statistics) for scale in SCALES]
+    readouts = [Task.of(statistics, scale, statistics.names(scale)).solve(statistics) for scale in SCALES]
     apart = [left_out(readout, sample, STAGES, kind) for readout in readouts]
     materials = [material for material, *_ in sample]
     scales = list(zip(readouts, apart, strict=True))

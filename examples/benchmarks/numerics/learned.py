@@ -11,8 +11,9 @@ import numpy.typing as npt
 from examples.benchmarks.numerics.memories import Memory
 from examples.benchmarks.numerics.truth import Answers, TrueReadout
 from scroll_tactile.readouts.leave_one_out import left_out
-from scroll_tactile.readouts.readout import Change, Readout, Task
+from scroll_tactile.readouts.readout import Change, Readout
 from scroll_tactile.readouts.shrinkage import LARGEST, LEAST
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
@@ -63,7 +64,7 @@ def name_of(place: int) -> str:
 
 def solved(statistics: Statistics) -> Readout:
     """The readout of statistics, all materials its reference."""
-    return Readout(Task.of(statistics, SCALE, statistics.names(SCALE)), statistics)
+    return Task.of(statistics, SCALE, statistics.names(SCALE)).solve(statistics)
 
 
 def asked(readout: Readout, codes: npt.NDArray[np.integer]) -> Answers:

@@ -70,7 +70,7 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool)
     if not kept:
         return note(
             "Not shown: no readings of touches are kept. A memory has some once it observed touches, unless it was "
-            "made with recall=0."
+            "made with kept_touches=0."
         )
     found = _channels(sensor, kept, ordered)
     means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)
@@ -176,7 +176,7 @@ def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapp
             if touch.material not in found and len(found) < MOST_PICTURES:
                 found[touch.material] = png(_thinned(_touch(touch.levels), LONGEST))
     if not found:
-        return note("Not shown: no readings are kept, neither as exemplars nor for recall.")
+        return note("Not shown: no readings are kept, neither as exemplars nor to match with.")
     names = {*exemplars, *(touch.material for touch in kept)}
     what = (
         "The middle frame of one touch of each material."

@@ -22,7 +22,12 @@ from scroll_tactile.signals.stream import Stream
 Array = npt.NDArray[np.float64]
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=0.0, high=1.0, unit="N", duration=0.4)
-SETTINGS: dict[str, Any] = {"sensor": SKIN, "embedding": Kernels(seed=0, dimension=64), "exemplars": 4, "recall": 500}
+SETTINGS: dict[str, Any] = {
+    "sensor": SKIN,
+    "embedding": Kernels(seed=0, dimension=64),
+    "exemplars": 4,
+    "kept_touches": 500,
+}
 LENGTH = 20  # readings of a touch
 
 

@@ -111,7 +111,7 @@ def test_few_touches_are_decided_at_their_end_alone(touches):
 
 
 def test_a_memory_that_keeps_no_touches_has_a_rule():
-    rule = rule_of(learned(recall=0), 0.05)
+    rule = rule_of(learned(kept_touches=0), 0.05)
     assert len(rule.moments) == 1
     assert not rule.decided(Prediction("oak", 0.99, (("oak", 0.99),), 0.0, True, 0.1), rule.moments[0] - 1)
 

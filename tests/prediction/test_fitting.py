@@ -150,7 +150,7 @@ def test_beginnings_are_right_sooner_than_later_and_no_surer_than_that(model):
 
 
 def test_nothing_is_held_out_where_nothing_is_kept_or_too_few_are(extractor):
-    for few in (learned(recall=0), learned(TOUCHES[:2]), learned(TOUCHES[:4]), learned(TOUCHES[:1])):
+    for few in (learned(kept_touches=0), learned(TOUCHES[:2]), learned(TOUCHES[:4]), learned(TOUCHES[:1])):
         fusion = few.model().fusion
         assert len(fusion.trajectories.targets) < FEWEST
         assert fusion.complete.model == 1.0
@@ -159,10 +159,10 @@ def test_nothing_is_held_out_where_nothing_is_kept_or_too_few_are(extractor):
             assert np.isfinite(few.predict(asked).novelty)
 
 
-@pytest.mark.parametrize("recall", [0, None])
+@pytest.mark.parametrize("kept_touches", [0, None])
 @pytest.mark.parametrize("readings", [2, 3, 5, 9])
-def test_touches_too_short_for_any_moment_before_their_end(recall, readings):
-    short = learned([(name, touch.first(readings / SKIN.rate)) for name, touch in TOUCHES], recall=recall)
+def test_touches_too_short_for_any_moment_before_their_end(kept_touches, readings):
+    short = learned([(name, touch.first(readings / SKIN.rate)) for name, touch in TOUCHES], kept_touches=kept_touches)
     for _, touch in LATER[:3]:
         for count in range(2, readings + 3):
             prediction = short.predict(touch.first(count / SKIN.rate))

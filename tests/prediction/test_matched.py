@@ -14,9 +14,9 @@ ASKED = [(name, SCENE.touch(name, i).readings) for i in range(50, 58) for name i
 CHANNELS, REACH = SKIN.channels, 100.0
 
 
-def learned(recall=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
+def learned(kept_touches=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
     scene = Scene(sensor=sensor, seed=1)
-    learner = TactileLearner(sensor=sensor, embedding=Kernels(dimension=256), recall=recall, **settings)
+    learner = TactileLearner(sensor=sensor, embedding=Kernels(dimension=256), kept_touches=kept_touches, **settings)
     for i in range(of_each):
         for name in names:
             learner.observe(name, scene.touch(name, i))
@@ -30,7 +30,7 @@ def matching():
 
 @pytest.fixture(scope="module")
 def alone():
-    return learned(recall=0)
+    return learned(kept_touches=0)
 
 
 def uniform(values, rng, reach=0.5):
@@ -117,7 +117,7 @@ def test_a_scene_restricts_matching(matching):
 
 def test_a_material_without_kept_touches_is_weighed():
     """Where there is room for fewer touches than materials."""
-    learner = learned(recall=3)
+    learner = learned(kept_touches=3)
     kept = {material for material, *_ in learner.memory.kept}
     assert len(kept) == 3 < len(NAMES)
     assert right(learner, HELD["clean"]) >= 0.9
@@ -166,7 +166,11 @@ def test_each_channel_has_noise_of_its_own_range():
 
 def test_one_channel():
     sensor = SKIN.model_copy(update={"channels": 1})
-    learner, without, scene = learned(sensor=sensor), learned(recall=0, sensor=sensor), Scene(sensor=sensor, seed=1)
+    learner, without, scene = (
+        learned(sensor=sensor),
+        learned(kept_touches=0, sensor=sensor),
+        Scene(sensor=sensor, seed=1),
+    )
     rng, noisy, clean, lost = np.random.default_rng(0), [], [], []
     for name, i in [(name, i) for name in NAMES for i in range(50, 54)]:
         values = scene.touch(name, i).readings
@@ -230,7 +234,7 @@ def test_answers_are_the_same_bytes_for_any_order_of_the_touches():
     asked = [change(values, rng) for _, values in ASKED[:6] for change, *_ in LOST.values()]
     answers = []
     for seed in range(2):
-        learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=256), recall=20)
+        learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=256), kept_touches=20)
         for place in np.random.default_rng(seed).permutation(len(touches)):
             learner.observe(touches[place][0], SCENE.touch(*touches[place]))
         learner.settle()

@@ -19,7 +19,7 @@ ASKED = [(name, SCENE.touch(name, i)) for i in range(20, 26) for name in NAMES]
 
 
 def learned(touches, embedding):
-    learner = TactileLearner(sensor=PAD, embedding=embedding, exemplars=0, recall=0)
+    learner = TactileLearner(sensor=PAD, embedding=embedding, exemplars=0, kept_touches=0)
     for material, readings in touches:
         learner.observe(material, readings)
     return learner

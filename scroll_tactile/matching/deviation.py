@@ -23,7 +23,7 @@ PAIRS, LEFT_OUT = 200, 64  # kept touches by which the spread is measured, and t
 FEWEST = 8  # touches left out; of fewer nothing is measured
 ASSUMED = (10.0, 10.0)  # coherence and energy then: about what RoboSkin's and BioTac's touches have
 USUAL = 0.95  # of touches left out: the odd one of them is noisy itself
-EVEN = 2.0  # times the amplitude of those: where trust is a half
+EVEN = 2.0  # times the amplitude of those: where the share of noise is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardly any value was read
 

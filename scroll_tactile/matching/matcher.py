@@ -25,7 +25,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.matching.blends import blends, block_means, unchanging, weighted_means
 from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import CLEAN, MISSING, UNIT, LevelArray, Noise, Table
-from scroll_tactile.matching.match import Match, NaturalDeviation, by_chance, shape_of, trust_in, without_zero
+from scroll_tactile.matching.match import Match, NaturalDeviation, by_chance, noise_share, shape_of, without_zero
 
 __all__ = ["TouchMatcher"]
 
@@ -239,15 +239,15 @@ class TouchMatcher:
         energy, coherence = shape_of(deviation, both)
         return Match(
             scores=self._scores(query, others, noise),
-            certainty=table.certainty * query.share,
+            information=table.information * query.share,
             noise=noise,
             stuck=query.stuck,
             expected=expected,
-            trust=trust_in(energy, coherence, natural),
+            noise_share=noise_share(energy, coherence, natural),
             moved=energy > max(natural.most, 2 * without_zero(deviation, both)),
             likelihood=likelihood,
-            evidence=likelihood - by_chance(query.levels[query.seen]),
-            surprise=float(mean_log) - likelihood,
+            log_likelihood_gain=likelihood - by_chance(query.levels[query.seen]),
+            excess_loss=float(mean_log) - likelihood,
         )
 
     def _deviation(self, query: _Query, best: LevelArray, noise: Noise) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

@@ -53,8 +53,8 @@ SHARED_TOUCHES = 10.0  # that the weights of a moment and its neighbours count a
 LEAST_PRIOR = 1e-3
 ODD = 0.5  # touches more than those held out that are outliers
 APART = 1.25  # times a moment: the next is no nearer
-LEAST_SPREAD, LEAST_CERTAINTY, LEAST_STEEPNESS = 1e-9, 1e-3, 1e-9
-LEAST_FAMILIAR = 0.5  # of a touch that is just familiar: of a strange one that is compared at another pace
+LEAST_SPREAD, LEAST_INFORMATION, LEAST_STEEPNESS = 1e-9, 1e-3, 1e-9
+LEAST_DISTANCE_WEIGHT = 0.5  # times the weight at the limit: of a touch beyond it that is compared at another pace
 STEPS = 100  # of EM
 
 
@@ -65,8 +65,8 @@ class Moment:
     columns: from how many on; of the last moment, those of a complete touch. stage: of the readouts that judge.
     calibration: how their scores are read. model, match: g, and r that gives β (see `steepness`). alone: r where noise,
     or how unlike all others the touch is, leaves the readouts nothing to say. odd: ε. odd_model: ε of the readouts' own
-    probabilities. familiar: the distance beside a usual one that 19 of 20 stay below. surprise, spread: of the kept
-    touches, of known touches.
+    probabilities. distance_limit: the relative distance that 19 of 20 stay below. mean_excess_loss, loss_spread: mean
+    and standard deviation of the excess loss of known touches beside the kept ones.
     """
 
     columns: int
@@ -77,24 +77,24 @@ class Moment:
     alone: float
     odd: float
     odd_model: float
-    familiar: float
-    surprise: float
-    spread: float
+    distance_limit: float
+    mean_excess_loss: float
+    loss_spread: float
 
-    def steepness(self, match: Match, familiarity: float) -> float:
-        """β = 1 / (1 + (1/r − 1) c) of a touch for which the readouts are believed by so much, c its certainty."""
-        beside, alone = (_steepness(r, match.certainty) for r in (self.match, self.alone))
-        share = (1 - match.trust) * familiarity
+    def steepness(self, match: Match, distance_weight: float) -> float:
+        """β = 1 / (1 + (1/r − 1) c) of a touch for which the readouts have this weight, c its information."""
+        beside, alone = (_steepness(r, match.information) for r in (self.match, self.alone))
+        share = (1 - match.noise_share) * distance_weight
         return share * beside + (1 - share) * alone
 
-    def familiarity(self, distance: float, own_time: bool) -> float:
-        """How far the readouts are believed of a touch beside a usual one, in (0, 1]: less, the further it is off.
+    def distance_weight(self, distance: float, own_time: bool) -> float:
+        """The weight of the readouts for a touch at a relative distance, in (0, 1]: less, the further it is off.
 
-        own_time: whether it is compared with beginnings: then no less than one that is just familiar.
+        own_time: whether it is compared with beginnings: then no less than at the limit.
         """
-        if not (np.isfinite(self.familiar) and np.isfinite(distance)):
+        if not (np.isfinite(self.distance_limit) and np.isfinite(distance)):
             return 1.0
-        least = (1.0 if own_time else LEAST_FAMILIAR) / max(self.familiar, 1.0)
+        least = (1.0 if own_time else LEAST_DISTANCE_WEIGHT) / max(self.distance_limit, 1.0)
         return float(np.clip(1.0 / max(distance, LEAST_SPREAD), least, 1.0))
 
     def suffices(self, probability: float, distance: float) -> bool:
@@ -102,11 +102,11 @@ class Moment:
 
         With one touch of each, any other looks as if noise came over it: then no probability is too low.
         """
-        return probability >= (SURE if self.odd_model else 0.0) and distance <= self.familiar
+        return probability >= (SURE if self.odd_model else 0.0) and distance <= self.distance_limit
 
     def matched_novelty(self, match: Match) -> float:
-        """The surprise of the kept touches, in units of its spread in known ones, as novelty is."""
-        return (match.surprise - self.surprise) / self.spread
+        """The excess loss beside the kept touches, in units of its spread over known touches, as novelty is."""
+        return (match.excess_loss - self.mean_excess_loss) / self.loss_spread
 
     def threshold(self, false_alarms: float) -> float:
         """The novelty that a share `false_alarms` of known touches exceeds; see `Calibration.threshold`."""
@@ -194,7 +194,7 @@ class Judged:
 class _Said:
     """What is said at one moment of those of the touches, `reached`, that reached it; see `HeldOut` and `Trajectories`.
 
-    logs: g's part, scores: β's for a certainty of `certainty`, both (n, C).
+    logs: g's part, scores: β's for a information of `information`, both (n, C).
     """
 
     reached: IntArray
@@ -202,9 +202,9 @@ class _Said:
     counts: FloatArray
     logs: FloatArray
     scores: FloatArray
-    certainty: float
+    information: float
     novelty: FloatArray
-    surprise: FloatArray
+    excess_loss: FloatArray
 
 
 def fuse(
@@ -277,17 +277,17 @@ def _at(matcher: TouchMatcher | None, judged: Judged, names: Sequence[str], coun
     ways = [judged.matches[chosen[number]] for number in at]
     matched = [] if matcher is None else [match_scores(matcher, names, way) for way in ways]
     scores = np.array(matched).reshape(len(ways), len(names))
-    certainty = np.maximum([way.certainty for way in ways], LEAST_CERTAINTY)
-    usual = float(np.median(certainty)) if ways else 1.0
+    information = np.maximum([way.information for way in ways], LEAST_INFORMATION)
+    median = float(np.median(information)) if ways else 1.0
     return _Said(
         np.array(at, dtype=np.intp),
         np.array([names.index(held.names[held.targets[i]]) for i in found], dtype=np.intp),
         np.array([counts[chosen[number]] for number in at]),
         held.logs[np.ix_(found, places)] if found else np.zeros((0, len(names))),
-        scores * (usual / certainty)[:, None],
-        usual,
+        scores * (median / information)[:, None],
+        median,
         held.novelty[found],
-        np.array([way.surprise for way in ways]),
+        np.array([way.excess_loss for way in ways]),
     )
 
 
@@ -310,12 +310,12 @@ def _fitted(
     held, columns, stage, calibration = judged.held_out, judged.columns, judged.stage, judged.calibration
     own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
     alone = _odd_share(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
-    familiar = float(np.quantile(held.distance, USUAL)) if complete and len(held.keys) else np.inf
+    distance_limit = float(np.quantile(held.distance, USUAL)) if complete and len(held.keys) else np.inf
     if matcher is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
         # Where nothing can be held out, the kept touches decide only where the readouts do not.
         power = float(calibration.weights.sum()) / prior_weight
         match = (
-            0.5 if matcher is None else match_of(power * UNSEEN, matcher.deviation.likelihood.table(CLEAN).certainty)
+            0.5 if matcher is None else match_of(power * UNSEEN, matcher.deviation.likelihood.table(CLEAN).information)
         )
         spread = 1.0 / UNMEASURED
         return Moment(columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread)
@@ -324,11 +324,11 @@ def _fitted(
     shared = np.maximum(_weights(together, prior, PRIOR_TOUCHES), LEAST_PRIOR * prior)
     weights = _weights(said, shared, SHARED_TOUCHES)
     by_itself = fit_weights(said.scores[:, None], said.targets.tolist(), prior[1:] * 2, ALONE_TOUCHES, said.counts)
-    match, lone = (match_of(float(value), said.certainty) for value in (weights[1], by_itself[0]))
-    surprise = float(np.average(said.surprise, weights=said.counts))
-    spread = max(float(np.average((said.surprise - surprise) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)
+    match, lone = (match_of(float(value), said.information) for value in (weights[1], by_itself[0]))
+    excess_loss = float(np.average(said.excess_loss, weights=said.counts))
+    spread = max(float(np.average((said.excess_loss - excess_loss) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)
     of_model = float(weights[0])
-    moment = Moment(columns, stage, calibration, of_model, match, lone, 0.0, alone, familiar, surprise, spread)
+    moment = Moment(columns, stage, calibration, of_model, match, lone, 0.0, alone, distance_limit, excess_loss, spread)
     own = _chances(moment, said)[np.arange(len(said.targets)), said.targets]
     return replace(moment, odd=_odd_share(own, said.logs.shape[1], said.counts))
 
@@ -344,7 +344,7 @@ def _worth(said: _Said) -> float:
 
 
 def _joined(said: Sequence[_Said]) -> _Said:
-    """What is said at some moments as that at one; of one median certainty."""
+    """What is said at some moments as that at one; of one median information."""
     parts = [np.concatenate([getattr(one, name) for one in said]) for name in ("targets", "counts", "logs", "scores")]
     none = np.zeros(0)
     return _Said(np.zeros(0, np.intp), parts[0], parts[1], parts[2], parts[3], 1.0, none, none)
@@ -357,7 +357,7 @@ def _weights(said: _Said, prior: FloatArray, touches: float) -> FloatArray:
 
 def _chances(moment: Moment, said: _Said) -> FloatArray:
     """The probability of the materials at a moment, (n, C), before outliers."""
-    logits = moment.model * said.logs + _steepness(moment.match, said.certainty) * said.scores
+    logits = moment.model * said.logs + _steepness(moment.match, said.information) * said.scores
     chances = np.exp(logits - logits.max(axis=1, keepdims=True))
     return np.asarray(chances / chances.sum(axis=1, keepdims=True))
 
@@ -378,14 +378,14 @@ def tempered(chances: FloatArray, odd: float) -> FloatArray:
     return np.asarray((1 - odd) * chances + odd / chances.shape[-1])
 
 
-def _steepness(match: float, certainty: float) -> float:
-    """β of r, where the certainty is this."""
-    return 1 / (1 + (1 / match - 1) * certainty)
+def _steepness(match: float, information: float) -> float:
+    """β of r at this information."""
+    return 1 / (1 + (1 / match - 1) * information)
 
 
-def match_of(steepness: float, certainty: float) -> float:
-    """r, of which β is the steepness that was fitted, where the certainty is that of the touches it was fitted to."""
-    return 1 / (1 + max(1 / max(steepness, LEAST_STEEPNESS) - 1, 0.0) / max(certainty, LEAST_CERTAINTY))
+def match_of(steepness: float, information: float) -> float:
+    """r, of which β is the steepness that was fitted, where the information is that of the touches it was fitted to."""
+    return 1 / (1 + max(1 / max(steepness, LEAST_STEEPNESS) - 1, 0.0) / max(information, LEAST_INFORMATION))
 
 
 def _trajectories(moments: Sequence[Moment], said: Sequence[_Said], touches: int, materials: int) -> Trajectories:

@@ -3,12 +3,11 @@
 A touch that the readouts know well is theirs alone. One that lies far from all that was learned, that they are not sure
 of, or that has another length than those learned, is compared with kept touches as well (see `matching.matcher`): with
 their beginnings, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by its
-own row of the table (see `prediction.fusion`), and they weigh exp(COUNTED e), e the evidence for each, per value.
-Channels that never change are filled in with what the kept touches have there, and the touch is judged again. Of noise
+own row of the table (see `prediction.fusion`), and they weigh exp(COUNTED e), e the log-likelihood gain per value.
+Channels that never change are filled in with what the kept touches have there, and the touch is judged again. The
+readouts have less weight the more of the touch's deviation from kept ones is noise, t (`Match.noise_share`):
 
-    p_y ∝ exp(g (1 − t) log d_y + β S_y),
-
-t which part of how the touch differs from kept ones is noise (`Match.trust`): it takes the readouts' word.
+    p_y ∝ exp(g (1 − t) log d_y + β S_y).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ __all__ = ["fused", "judged", "levels_seen"]
 
 FloatArray = npt.NDArray[np.float64]
 
-COUNTED = 30.0  # values, as which the evidence for a hypothesis counts: neighbours say the same
+COUNTED = 30.0  # values, as which the log-likelihood gain of a hypothesis counts: neighbours say the same
 TINY = 1e-300
 
 
@@ -50,9 +49,9 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     ways: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
     if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
         whole = matcher.match(levels, whole=True)
-        if whole.evidence > 0:  # at no other pace is it any more like what is kept
+        if whole.log_likelihood_gain > 0:  # at no other pace is it any more like what is kept
             ways.append((whole, "paced", False))
-    filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.evidence))
+    filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.log_likelihood_gain))
     answers = []
     for way, hypothesis, own_time in ways:
         said = alone if filled is encoded and hypothesis == usual else None
@@ -62,8 +61,8 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
             means = extractor.means(extractor.image(kept), model.views)
         said = said or model.judge(candidates, means, columns if own_time else len(encoded.stream), hypothesis)
         answers.append(fused(matcher, candidates, said, way, own_time=own_time))
-    evidence = np.array([way.evidence for way, *_ in ways])
-    weights = np.exp(COUNTED * (evidence - evidence.max()))
+    gains = np.array([way.log_likelihood_gain for way, *_ in ways])
+    weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
     best = int(weights.argmax())
     unusual = _unusual(model, encoded, ways[best][0], ways[best][1])
@@ -91,14 +90,14 @@ def fused(
     own_time: whether it was compared with beginnings, and not with whole touches brought to its length.
     """
     moment = said.moment
-    familiarity = moment.familiarity(said.distance, own_time)
-    logs = (1 - way.trust) * np.log(np.maximum(said.probability, TINY))
-    logits = familiarity * moment.model * logs + match_scores(matcher, candidates, way) * moment.steepness(
-        way, familiarity
+    distance_weight = moment.distance_weight(said.distance, own_time)
+    logs = (1 - way.noise_share) * np.log(np.maximum(said.probability, TINY))
+    logits = distance_weight * moment.model * logs + match_scores(matcher, candidates, way) * moment.steepness(
+        way, distance_weight
     )
     chances = np.exp(logits - logits.max())
     chances = tempered(chances / chances.sum(), moment.odd)
-    novelty = (1 - way.trust) * said.novelty + way.trust * moment.matched_novelty(way)
+    novelty = (1 - way.noise_share) * said.novelty + way.noise_share * moment.matched_novelty(way)
     return replace(said, probability=chances, novelty=float(novelty))
 
 
@@ -108,7 +107,7 @@ def _unusual(model: Model, encoded: Encoded, way: Match, hypothesis: Hypothesis)
     if found and hypothesis == "paced":
         found = ["faster" if found == ["shorter"] else "slower"]
     marks: tuple[tuple[Unusual, bool], ...] = (
-        ("noisy", way.trust > 0.5),
+        ("noisy", way.noise_share > 0.5),
         ("zero moved", way.moved),
         ("channels dead", bool(way.stuck.any())),
     )

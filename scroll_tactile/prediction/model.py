@@ -294,10 +294,10 @@ class Model:
                 for readout, own, among in zip(readouts, codes, places, strict=True)
             ]
             best = [int(among[int(scores.argmax())]) for among, scores in zip(places, exact, strict=True)]
-            weights, distance = self._believed(calibration, readouts, codes, best)
+            weights, distance = self._weights_at(calibration, readouts, codes, best)
             return np.asarray(sum(weight * scores for weight, scores in zip(weights, exact, strict=True))), distance
         best = [readout.nearest(own, among)[0] for readout, own, among in zip(readouts, codes, places, strict=True)]
-        weights, distance = self._believed(calibration, readouts, codes, best)
+        weights, distance = self._weights_at(calibration, readouts, codes, best)
         parts = list(zip(weights, readouts, codes, places, strict=True))
 
         def exactly(some: npt.NDArray[np.intp]) -> FloatArray:
@@ -320,7 +320,7 @@ class Model:
         logits[chosen] = scores
         return logits, distance
 
-    def _believed(
+    def _weights_at(
         self,
         calibration: Calibration,
         readouts: Sequence[Readout],
@@ -331,12 +331,12 @@ class Model:
 
         codes: of the touch, by scale; best: the place of the nearest material.
         """
-        if not np.isfinite(calibration.usual).all():
+        if not np.isfinite(calibration.median_distances).all():
             return calibration.weights, 0.0
         distances = np.array(
-            [readout.strangeness(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
+            [readout.diagonal_distance(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
         )
-        return calibration.believed(distances), float(calibration.relative(distances).min())
+        return calibration.weights_at(distances), float(calibration.relative(distances).min())
 
     def _read_by(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """How scores are read at a stage: of the moment's, or of materials that were never felt for so long.

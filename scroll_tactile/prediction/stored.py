@@ -46,8 +46,19 @@ FloatArray = npt.NDArray[np.float64]
 NAME = "model"
 MADE_BY = f"{__version__}, 2"  # the release, and how it is written: the judge may differ in another
 MOST_BANKS = 64
-OF_MOMENT = ("columns", "stage", "model", "match", "alone", "odd", "odd_model", "familiar", "surprise", "spread")
-OF_CALIBRATION = ("weights", "scale_novelty", "usual", "novelties")
+OF_MOMENT = (
+    "columns",
+    "stage",
+    "model",
+    "match",
+    "alone",
+    "odd",
+    "odd_model",
+    "distance_limit",
+    "mean_excess_loss",
+    "loss_spread",
+)
+OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties")
 
 
 def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
@@ -61,7 +72,7 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     arrays: dict[str, npt.NDArray[Any]] = {
         "moments": np.array([[getattr(row, name) for name in OF_MOMENT] for row in rows], dtype=np.float64),
         "novelty-counts": np.array([len(each.novelties) for each in calibrations], dtype=np.int64),
-        "dependence": np.array([model.dependence.evidence, model.dependence.novelty]),
+        "dependence": np.array([model.dependence.log_probability, model.dependence.novelty]),
         "chances": fusion.trajectories.chances,
         "novelty": fusion.trajectories.novelty,
         "targets": fusion.trajectories.targets.astype(np.int64),
@@ -317,7 +328,7 @@ class _Reader:
         total, measuring = edges[-1]
         lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))
         counts("novelty-counts", lengths, 0, MOST_ROWS)
-        weights, usual = self.floats("weights", (total,), 0.0, 1e300), self.floats("usual", (total,), 0.0)
+        weights, medians = self.floats("weights", (total,), 0.0, 1e300), self.floats("median_distances", (total,), 0.0)
         shapes = self.floats("scale_novelty", (measuring, 2))
         expect(bool((shapes[:, 1] > 0).all()), "scale_novelty", "spreads above 0", "others")
         novelties = self.floats("novelties", (int(lengths.sum()),))
@@ -326,7 +337,7 @@ class _Reader:
             own, measured = (slice(edges[i][j], edges[i + 1][j]) for j in (0, 1))
             known = novelties[ends[i] : ends[i + 1]]
             expect(bool((np.diff(known) >= 0).all()), "novelties", "ascending", "others")
-            yield Calibration(weights[own], shapes[measured], known, usual[own])
+            yield Calibration(weights[own], shapes[measured], known, medians[own])
 
     def _trajectories(self, moments: int) -> Trajectories:
         chances = array(self._arrays, "chances", ("float64",), (None, moments, None))

@@ -53,8 +53,8 @@ def held_out(
     places = [place for place in judged_touches(stage, said) if touches[place][0] in own] if len(names) > 1 else []
     materials = [[left.names.index(name) for name in names] for left in said]
     rows = [[left.rows[place, stage] for place in places] for left in said]
-    strange = np.stack([left.strangeness[at] for left, at in zip(said, rows, strict=True)], axis=1)
-    weights = calibration.believed(strange)
+    away = np.stack([left.diagonal_distances[at] for left, at in zip(said, rows, strict=True)], axis=1)
+    weights = calibration.weights_at(away)
     logits = np.zeros((len(places), len(names)))
     distances = []
     for i, (scale, left, at, columns) in enumerate(zip(scales, said, rows, materials, strict=True)):
@@ -69,6 +69,6 @@ def held_out(
         [touches[place][1] for place in places],
         np.array([own[touches[place][0]] for place in places], dtype=np.intp),
         logits,
-        calibration.relative(strange).min(axis=1) if places else np.zeros(0),
+        calibration.relative(away).min(axis=1) if places else np.zeros(0),
         np.asarray(calibration.novelty(np.stack(distances, axis=1))) if places else np.zeros(0),
     )

@@ -48,7 +48,7 @@ class LeftOut:
 
     rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
     about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
-    strangeness: shape (N,), see `Readout.strangeness`, from the material of the highest score.
+    diagonal_distances: shape (N,), see `Readout.diagonal_distance`, from the material of the highest score.
     """
 
     rows: dict[tuple[int, int], int]
@@ -56,7 +56,7 @@ class LeftOut:
     scores: FloatArray
     z: FloatArray
     distances: FloatArray
-    strangeness: FloatArray
+    diagonal_distances: FloatArray
 
 
 def left_out(
@@ -98,8 +98,8 @@ def left_out(
         assert leaving is not None
         parts.append(leaving.out(rows, weights, owners, None if asked is None else scored))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
-    strangeness = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
-    return LeftOut(index, names, joined[0], joined[1], joined[2], strangeness)
+    diagonal = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
+    return LeftOut(index, names, joined[0], joined[1], joined[2], diagonal)
 
 
 def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:
@@ -139,7 +139,7 @@ class _Leaving:
         own: npt.NDArray[np.intp],
         asked: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Scores, z and distances, each of shape (M·q, R), and strangeness (M·q,), without the rows of each touch.
+        """Scores, z, distances, each of shape (M·q, R), and diagonal distances (M·q,), without the rows of each touch.
 
         rows: that each touch added, about the origin, (M, k, d). weights: the rows of the statistics that it stands
         for, (M,). own: its material among the reference, (M,). asked: what is scored, about the origin, (M, q, d); the
@@ -175,9 +175,9 @@ class _Leaving:
         lda[i, :, own] += gain if asked is rows else gain[:, -1:]  # what is asked counts as the complete touch
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
         scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
-        strange = self._strangeness(rows, asked, weights, own, scores.argmax(axis=2))
+        diagonal = self._diagonal_distances(rows, asked, weights, own, scores.argmax(axis=2))
         flat = [part.reshape(touches * queries, -1) for part in (scores, centred, distances)]
-        return flat[0], flat[1], flat[2], strange.reshape(-1)
+        return flat[0], flat[1], flat[2], diagonal.reshape(-1)
 
     def _as_new(
         self,
@@ -198,7 +198,7 @@ class _Leaving:
         far = np.square(away).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto @ inner)
         return np.asarray(self.readout.gamma * np.square(weights / counts)[:, None] * far / 2)
 
-    def _strangeness(
+    def _diagonal_distances(
         self,
         rows: FloatArray,
         asked: FloatArray,
@@ -206,14 +206,14 @@ class _Leaving:
         own: npt.NDArray[np.intp],
         best: npt.NDArray[np.intp],
     ) -> FloatArray:
-        """Of what is asked, (M, q, d), from the material `best` of each, (M, q), without the touch's own rows."""
+        """Diagonal distances of queries (M, q, d) from the material `best` of each, (M, q), without their touch."""
         means, counts = self.readout.means_solved()[0], self.counts[own]
         nearest = means[best]
         back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
         nearest -= (best == own[:, None])[:, :, None] * back[:, None]
-        strangeness: FloatArray = np.square(asked - nearest) @ self.readout.precision
+        distances: FloatArray = np.square(asked - nearest) @ self.readout.precision
         as_new = 1 - np.square(weights / counts)[:, None]
-        return np.where(best == own[:, None], as_new * strangeness, strangeness)
+        return np.where(best == own[:, None], as_new * distances, distances)
 
     def _whole(
         self, white: FloatArray, scored: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray

@@ -276,8 +276,8 @@ class Readout:
         z = (every @ row)[held] if 4 * len(held) > len(every) else every[held] @ row  # picking rows copies them
         return np.asarray(z - sizes[held] / 2)
 
-    def strangeness(self, codes: FloatArray, place: int) -> float:
-        """The squared distance of codes (d,) from a material's mean, in variances of each feature as it was fitted.
+    def diagonal_distance(self, codes: FloatArray, place: int) -> float:
+        """The squared Mahalanobis distance of codes (d,) from a material's mean, by diagonal scatter as fitted.
 
         It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
         differs in.

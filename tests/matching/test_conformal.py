@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.matching.conformal import APART, Conformal
+from scroll_tactile.matching.conformal import OTHER_WEIGHT, Conformal
 from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.matching.match import KeptTouch
 
@@ -30,16 +30,16 @@ def plain(touches, conformal, asked, reach):
     new = conformal._steps_of([asked])[0][: reach * CHANNELS].astype(float)
     labels = [kept.material for kept in touches]
 
-    def strangeness(i, bag, own):
+    def nonconformity(i, bag, own):
         far = [(np.square(bag[i][0] - other).sum(), label) for j, (other, label) in enumerate(bag) if j != i]
         near = min((d for d, label in far if label == own), default=np.inf)
         other = min((d for d, label in far if label != own), default=0.0)
-        return (1 + APART) * np.log1p(near) - APART * np.log1p(other)
+        return (1 + OTHER_WEIGHT) * np.log1p(near) - OTHER_WEIGHT * np.log1p(other)
 
     found = {}
     for own in sorted(set(labels)):
         bag = [*zip(steps, labels, strict=True), (new, own)]
-        scores = np.array([strangeness(i, bag, own if own == bag[i][1] else bag[i][1]) for i in range(len(bag))])
+        scores = np.array([nonconformity(i, bag, own if own == bag[i][1] else bag[i][1]) for i in range(len(bag))])
         same = np.array([label == own for _, label in bag])
         found[own] = (
             np.mean(scores[same] >= scores[-1]),

@@ -42,12 +42,12 @@ def test_what_is_missing_says_nothing(likelihood):
 
 
 def test_noise_hides_how_touches_differ(likelihood):
-    certainty = [
-        likelihood.table(noise).certainty for noise in (CLEAN, Noise(8, True), Noise(20, True), Noise(36, True))
+    information = [
+        likelihood.table(noise).information for noise in (CLEAN, Noise(8, True), Noise(20, True), Noise(36, True))
     ]
-    assert certainty[0] == pytest.approx(1, abs=0.3)
-    assert certainty == sorted(certainty, reverse=True)
-    assert certainty[-1] < 0.01
+    assert information[0] == pytest.approx(1, abs=0.3)
+    assert information == sorted(information, reverse=True)
+    assert information[-1] < 0.01
 
 
 def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):

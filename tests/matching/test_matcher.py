@@ -50,7 +50,7 @@ def matcher():
 def same(one, other):
     """Whether two matches are the same bytes."""
     arrays = ("scores", "stuck", "expected")
-    numbers = ("certainty", "noise", "trust", "evidence", "surprise")
+    numbers = ("information", "noise", "noise_share", "log_likelihood_gain", "excess_loss")
     return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in arrays) and all(
         getattr(one, name) == getattr(other, name) for name in numbers
     )
@@ -62,7 +62,11 @@ def near(one, other):
         one.noise == other.noise
         and np.allclose(one.scores, other.scores, rtol=1e-9)
         and np.allclose(one.expected, other.expected, atol=1e-3, equal_nan=True)
-        and np.allclose([one.trust, one.evidence, one.surprise], [other.trust, other.evidence, other.surprise], 1e-9)
+        and np.allclose(
+            [one.noise_share, one.log_likelihood_gain, one.excess_loss],
+            [other.noise_share, other.log_likelihood_gain, other.excess_loss],
+            1e-9,
+        )
     )
 
 
@@ -99,21 +103,21 @@ def test_the_noise_is_found(matcher, amplitude, normal):
 
 
 def test_noise_is_trusted_to_kept_touches_and_clean_touches_are_not(matcher):
-    assert all(matcher.match(noisy(touch(m, 100), 0.3, m)).trust > 0.95 for m in range(MATERIALS))
-    assert np.mean([matcher.match(touch(m, 100 + i)).trust for m in range(MATERIALS) for i in range(4)]) < 0.3
+    assert all(matcher.match(noisy(touch(m, 100), 0.3, m)).noise_share > 0.95 for m in range(MATERIALS))
+    assert np.mean([matcher.match(touch(m, 100 + i)).noise_share for m in range(MATERIALS) for i in range(4)]) < 0.3
 
 
 def test_an_offset_is_not_independent_noise(matcher):
     drifted = [np.clip(touch(m, 100).astype(int) + 12, 0, 254).astype(np.uint8) for m in range(MATERIALS)]
-    assert all(matcher.match(levels).trust < 0.2 for levels in drifted)
+    assert all(matcher.match(levels).noise_share < 0.2 for levels in drifted)
 
 
 def test_noise_alone_is_explained_by_nothing_that_is_kept(matcher):
     rng = np.random.default_rng(0)
     alone = [rng.integers(0, LEVELS, (CHANNELS, READINGS)).astype(np.uint8) for _ in range(8)]
     known = [noisy(touch(m, 100), 0.3, m) for m in range(MATERIALS)]
-    assert max(matcher.match(levels).evidence for levels in alone) < 0
-    assert min(matcher.match(levels).evidence for levels in known) > 0
+    assert max(matcher.match(levels).log_likelihood_gain for levels in alone) < 0
+    assert min(matcher.match(levels).log_likelihood_gain for levels in known) > 0
 
 
 def test_matching_is_a_function_of_the_set():
@@ -262,11 +266,11 @@ def test_scores_are_sums_over_all_values():
         levels = next(alike.levels for alike in alone if alike.material == material)
         total = sum(int(table.logs[256 * int(y) + int(x)]) for y, x in zip(asked.ravel(), levels.ravel(), strict=True))
         assert found.scores[place] == pytest.approx(total / UNIT, rel=1e-12)
-    assert found.certainty == pytest.approx(table.certainty * (1 - 4 / asked.size), rel=1e-12)
+    assert found.information == pytest.approx(table.information * (1 - 4 / asked.size), rel=1e-12)
 
 
 def test_noise_hides_whether_neighbours_deviate_together(matcher):
-    reaches = [matcher.match(noisy(touch(1, 100), reach, 0)).certainty for reach in (0, 0.1, 0.3, 0.6)]
+    reaches = [matcher.match(noisy(touch(1, 100), reach, 0)).information for reach in (0, 0.1, 0.3, 0.6)]
     assert reaches == sorted(reaches, reverse=True)
     assert reaches[0] > 0.5
     assert reaches[-1] < 0.05
@@ -300,7 +304,7 @@ def test_readings_are_filled_in_where_they_lack(matcher):
 )
 def test_whatever_is_left_of_a_touch_has_an_answer(matcher, asked):
     found = matcher.match(asked)
-    assert np.isfinite([*found.scores, found.trust, found.evidence, found.surprise]).all()
+    assert np.isfinite([*found.scores, found.noise_share, found.log_likelihood_gain, found.excess_loss]).all()
     assert found.expected.shape == asked.shape
     if found.stuck.all():
         assert np.ptp(found.scores) < np.log(2) or found.noise == CLEAN

@@ -57,7 +57,8 @@ def table(model):
     rows = (*model.fusion.moments, *model.fusion.paced)
     said = model.fusion.trajectories
     numbers = [
-        (row.columns, row.stage, row.model, row.match, row.alone, row.odd, row.odd_model, row.familiar) for row in rows
+        (row.columns, row.stage, row.model, row.match, row.alone, row.odd, row.odd_model, row.distance_limit)
+        for row in rows
     ]
     arrays = [said.chances, said.novelty, *(part for row in rows for part in vars(row.calibration).values())]
     return numbers, [array.tobytes() for array in arrays]

@@ -36,12 +36,12 @@ def evidence(rng, keys, step=TRUE, odd=0.0):
     return step * (rng.normal(size=(len(keys), C)) + step * np.eye(C)[felt])
 
 
-def match(scores, certainty=0.5, trust=0.0):
+def match(scores, information=0.5, noise_share=0.0):
     unseen = np.full((2, 8), np.nan)
-    return Match(scores, certainty, CLEAN, np.zeros(2, bool), unseen, trust, False, -1.0, 1.0, 0.0)
+    return Match(scores, information, CLEAN, np.zeros(2, bool), unseen, noise_share, False, -1.0, 1.0, 0.0)
 
 
-def judged(columns, logits, scores, keys=KEYS, certainty=0.5):
+def judged(columns, logits, scores, keys=KEYS, information=0.5):
     """What readouts (logits) and kept touches (scores) say of some touches; either may be None, and says nothing."""
     logs = np.zeros((len(keys), C)) if logits is None else logits
     logs = logs - np.log(np.exp(logs).sum(axis=1, keepdims=True))
@@ -50,7 +50,7 @@ def judged(columns, logits, scores, keys=KEYS, certainty=0.5):
     targets = np.array([OWN[key] for key in keys], dtype=np.intp)
     held = HeldOut(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
     said = np.zeros((len(keys), C)) if scores is None else scores
-    matches = {key: match(row, certainty=certainty) for key, row in zip(keys, said, strict=True)}
+    matches = {key: match(row, information=information) for key, row in zip(keys, said, strict=True)}
     return Judged(columns, 0, calibration, held, matches)
 
 
@@ -58,8 +58,8 @@ def fused(*moments, keys=KEYS):
     return fuse(MATCHER, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0), 1.0)
 
 
-def beta(moment, certainty=0.5):
-    return 1 / (1 + (1 / moment.match - 1) * certainty)
+def beta(moment, information=0.5):
+    return 1 / (1 + (1 / moment.match - 1) * information)
 
 
 def test_moments_are_few_and_hold_the_milestones():
@@ -130,7 +130,7 @@ def test_where_too_few_were_held_out_the_readouts_decide(count):
         moment = fused(own, keys=keys).complete
         assert moment.model == 1.0
         assert beta(moment) < 1e-3
-        assert moment.familiarity(1e9, own_time=True) == 1.0
+        assert moment.distance_weight(1e9, own_time=True) == 1.0
         assert (moment.odd > 0) == (moment.odd_model > 0) == (count > 0)
 
 
@@ -189,11 +189,11 @@ def test_touches_are_chosen_evenly_and_the_least_sure_beside_them(monkeypatch):
     assert chosen_of(held, None) == ([], {})
 
 
-@pytest.mark.parametrize("certainty", [1.0, 0.8, 0.044])
+@pytest.mark.parametrize("information", [1.0, 0.8, 0.044])
 @pytest.mark.parametrize("steepness", [1e-7, 1e-4, 0.3])
-def test_kept_touches_are_believed_as_was_fitted_where_touches_are_as_certain_as_those(steepness, certainty):
-    match = match_of(steepness, certainty)
-    assert 1 / (1 + (1 / match - 1) * certainty) == pytest.approx(steepness)
+def test_kept_touches_are_believed_as_was_fitted_where_touches_are_as_certain_as_those(steepness, information):
+    match = match_of(steepness, information)
+    assert 1 / (1 + (1 / match - 1) * information) == pytest.approx(steepness)
 
 
 def test_noise_leaves_the_word_to_kept_touches_by_themselves():
@@ -202,8 +202,8 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
     moment = fused(judged(10, evidence(rng, KEYS, 6.0), evidence(rng, KEYS, 2.0))).complete
     assert moment.alone > moment.match
 
-    def way(trust):
-        return match(np.zeros(C), trust=trust)
+    def way(noise_share):
+        return match(np.zeros(C), noise_share=noise_share)
 
     assert moment.steepness(way(0.0), 1.0) == pytest.approx(beta(moment))
     assert moment.steepness(way(1.0), 1.0) == pytest.approx(1 / (1 + (1 / moment.alone - 1) * 0.5))

@@ -221,7 +221,7 @@ def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
             again = anew.match(levels)
             assert again.noise == found.noise
             assert np.allclose(again.scores, found.scores, rtol=1e-9)
-            numbers = [[each.trust, each.evidence, each.surprise] for each in (again, found)]
+            numbers = [[each.noise_share, each.log_likelihood_gain, each.excess_loss] for each in (again, found)]
             assert np.allclose(*numbers, rtol=1e-9)
         learner.retract(receipt)
         assert "new" not in present(learner).kept.materials

@@ -224,17 +224,17 @@ positive = st.floats(1e-3, 1e6)
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.floats(0, 9), positive, st.floats(0, 1e6)), min_size=1, max_size=4), st.floats(0.5, 2))
-def test_a_scale_is_believed_less_the_stranger_a_touch_looks_in_it(scales, power):
-    weights, usual, strange = map(np.array, zip(*scales, strict=True))
-    calibration = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), usual)
-    expected = [w if s <= u else w * (u / s) ** power for w, u, s in scales]
-    np.testing.assert_allclose(calibration.believed(strange, power), expected)
-    stranger = calibration.believed(2 * strange + 1, power)
-    assert (stranger <= calibration.believed(strange, power)).all()
-    assert calibration.believed(np.stack([strange, strange]), power).shape == (2, len(weights))
+@given(st.lists(st.tuples(st.floats(0, 9), positive, st.floats(0, 1e6)), min_size=1, max_size=4))
+def test_a_scale_is_weighed_less_the_further_away_a_touch_is_in_it(scales):
+    weights, medians, away = map(np.array, zip(*scales, strict=True))
+    calibration = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), medians)
+    expected = [w if s <= u else w * (u / s) for w, u, s in scales]
+    np.testing.assert_allclose(calibration.weights_at(away), expected)
+    further = calibration.weights_at(2 * away + 1)
+    assert (further <= calibration.weights_at(away)).all()
+    assert calibration.weights_at(np.stack([away, away])).shape == (2, len(weights))
     undoubted = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), np.full(len(weights), np.inf))
-    assert undoubted.believed(strange, power).tolist() == weights.tolist()
+    assert undoubted.weights_at(away).tolist() == weights.tolist()
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
@@ -245,11 +245,11 @@ def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_wil
     materials = [material for material, *_ in sample]
     scales = list(zip(readouts, apart, strict=True))
     plain, viewed = (calibrate_stage(1, materials, scales, kind, viewed=flag) for flag in (False, True))
-    assert np.isinf(plain.usual).all()
-    strange = np.array([[left.strangeness[left.rows[i, 1]] for left in apart] for i in range(60)])
-    assert viewed.usual.tolist() == np.median(strange, axis=0).tolist()
+    assert np.isinf(plain.median_distances).all()
+    away = np.array([[left.diagonal_distances[left.rows[i, 1]] for left in apart] for i in range(60)])
+    assert viewed.median_distances.tolist() == np.median(away, axis=0).tolist()
     scores = np.array([[left.scores[left.rows[i, 1]] for left in apart] for i in range(60)])
-    doubted = scores * np.minimum(1, viewed.usual / strange)[:, :, None]
+    doubted = scores * np.minimum(1, viewed.median_distances / away)[:, :, None]
     targets = [apart[0].names.index(material) for material in materials]
     expected = scale_weights(doubted, targets, PRIOR_WEIGHT[kind] / 2)
     np.testing.assert_allclose(viewed.weights, expected, rtol=1e-9)

@@ -42,8 +42,8 @@ def picked(found, places):
 
 def test_touches_that_say_the_same_count_less():
     loose, tight = dependence_of(apart(0.0)), dependence_of(apart(0.9))
-    assert loose.evidence < tight.evidence <= 1
-    assert loose.evidence < 0.25
+    assert loose.log_probability < tight.log_probability <= 1
+    assert loose.log_probability < 0.25
     assert loose.novelty == pytest.approx(0.0, abs=0.1)
     assert tight.novelty == pytest.approx(0.9, abs=0.15)
 

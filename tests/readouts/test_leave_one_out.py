@@ -69,7 +69,7 @@ def require_left_out(found, place, row, own, without, every, material, weight, r
     total = float(readout.counts.sum())
     variances = [(float(every.scatter[j][j]) + readout.penalty) / total for j in range(WIDTH)]
     far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
-    require_near(found.strangeness[place], far * (1 - share**2) if best == material else far)
+    require_near(found.diagonal_distances[place], far * (1 - share**2) if best == material else far)
 
 
 @settings(max_examples=25, deadline=None)
@@ -166,7 +166,9 @@ def test_materials_of_one_touch_and_stages_that_were_not_reached_are_not_there(k
     task = Task.of(statistics, SCALE, ["a", "b"])
     found = left_out(task.solve(statistics), sample, STAGES, kind)
     assert sorted(found.rows) == [(0, 0), (0, 1), (0, 2), (1, 0)]
-    assert found.scores.shape == found.z.shape == found.distances.shape == (*found.strangeness.shape, 2) == (4, 2)
+    assert (
+        found.scores.shape == found.z.shape == found.distances.shape == (*found.diagonal_distances.shape, 2) == (4, 2)
+    )
     alone, none = learned(touches[2:])
     task = Task.of(alone, SCALE, ["b"])
     empty = left_out(task.solve(alone), none, STAGES, kind)

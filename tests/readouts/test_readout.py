@@ -213,7 +213,7 @@ def test_pruning_keeps_its_bounds(monkeypatch, followed, materials):
     assert readout.novelty(probe, np.arange(len(readout.names))) == pytest.approx(plain, rel=1e-12)
 
 
-def test_the_strangeness_from_a_material_that_was_not_held_is_that_of_one_that_was(monkeypatch):
+def test_the_diagonal_distance_from_a_material_that_was_not_held_is_that_of_one_that_was(monkeypatch):
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
     rng = np.random.default_rng(0)
     statistics = Statistics(WIDTH, [SCALE])
@@ -222,6 +222,6 @@ def test_the_strangeness_from_a_material_that_was_not_held_is_that_of_one_that_w
     probe = rng.integers(-EDGE, EDGE, WIDTH).astype(float)
     few, again = (readout_of(statistics, ["000", "001"]) for _ in range(2))
     again.held(range(40))
-    assert [few.strangeness(probe, place) for place in range(40)] == [
-        again.strangeness(probe, place) for place in range(40)
+    assert [few.diagonal_distance(probe, place) for place in range(40)] == [
+        again.diagonal_distance(probe, place) for place in range(40)
     ]

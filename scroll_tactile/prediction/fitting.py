@@ -23,8 +23,9 @@ from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
-from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
+from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.moments import Fusion
 from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.held_out import HeldOut, held_out
@@ -174,11 +175,11 @@ class _Fit:
         scales: Sequence[Scale],
         apart: Mapping[Scale, LeftOut],
         matches: Mapping[bytes, Match],
-    ) -> Judged:
+    ) -> HeldOutMoment:
         """What some scales and the kept touches say at a moment, given as its columns and stage."""
         calibration = self.calibrated(number, scales, apart)
         said = held_out(number, scales, self.draft.sample, apart, calibration)
-        return Judged(*moment, calibration, said, matches)
+        return HeldOutMoment(*moment, calibration, said, matches)
 
     def fused(self, last: int, apart: Mapping[Scale, LeftOut]) -> tuple[HeldOut, Fusion]:
         """Complete touches held out of the readouts, and how far these and the kept touches are believed.
@@ -235,7 +236,7 @@ class _KeptTouches:
         matches = {key: matcher.match(levels[key], held_out=row) for key, row in rows.items()}
         return cls(fit, matcher, chosen, rows, levels, places, matches)
 
-    def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[Judged]:
+    def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
         """What is said of their beginnings at each moment, given as its columns and stage."""
         apart, judged = self._read(moments), []
         for number, (columns, stage) in enumerate(moments):
@@ -264,7 +265,7 @@ class _KeptTouches:
                     asked[scale].setdefault(self.places[key], {})[number] = mean
         return {scale: fit.left_out(scale, asked) for scale in asked}
 
-    def paced(self, pace: float, keys: Sequence[bytes], last: int) -> Judged:
+    def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
         """What the views and the kept touches say of some of them, had they been made so many times as fast."""
         fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
         assert extractor is not None

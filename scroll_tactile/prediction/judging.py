@@ -3,7 +3,7 @@
 A touch that the readouts know well is theirs alone. One that lies far from all that was learned, that they are not sure
 of, or that has another length than those learned, is compared with kept touches as well (see `matching.matcher`): with
 their beginnings, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by its
-own row of the table (see `prediction.fusion`), and they weigh exp(COUNTED e), e the log-likelihood gain per value.
+own row of the table (see `prediction.moments`), and they weigh exp(COUNTED e), e the log-likelihood gain per value.
 Channels that never change are filled in with what the kept touches have there, and the touch is judged again. The
 readouts have less weight the more of the touch's deviation from kept ones is noise, t (`Match.noise_share`):
 
@@ -22,8 +22,8 @@ from scroll_tactile.matching.likelihood import LevelArray, levels_of
 from scroll_tactile.matching.match import Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.fusion import USUAL, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
+from scroll_tactile.prediction.moments import WITHIN, match_scores, tempered
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.stream import Stream
 
@@ -72,9 +72,9 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
     """The readouts' word. Where it is that the touch may be of nothing known, kept touches say what sets it apart."""
     unusual = _of_length(model, encoded)
-    if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - USUAL):
+    if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - WITHIN):
         unusual = _unusual(model, encoded, model.matcher.match(levels_seen(encoded.stream)), hypothesis)
-    return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model), unusual=unusual)
+    return replace(alone, probability=tempered(alone.probability, alone.moment.model_outlier_rate), unusual=unusual)
 
 
 def fused(
@@ -92,11 +92,10 @@ def fused(
     moment = said.moment
     distance_weight = moment.distance_weight(said.distance, own_time)
     logs = (1 - way.noise_share) * np.log(np.maximum(said.probability, TINY))
-    logits = distance_weight * moment.model * logs + match_scores(matcher, candidates, way) * moment.steepness(
-        way, distance_weight
-    )
+    match_weight = moment.match_weight_at(way, distance_weight)
+    logits = distance_weight * moment.model_weight * logs + match_scores(matcher, candidates, way) * match_weight
     chances = np.exp(logits - logits.max())
-    chances = tempered(chances / chances.sum(), moment.odd)
+    chances = tempered(chances / chances.sum(), moment.outlier_rate)
     novelty = (1 - way.noise_share) * said.novelty + way.noise_share * moment.matched_novelty(way)
     return replace(said, probability=chances, novelty=float(novelty))
 

@@ -28,8 +28,8 @@ from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.fusion import Fusion, Moment, Trajectories
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.moments import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.readout import Readout, ReadoutName
@@ -49,11 +49,11 @@ MOST_BANKS = 64
 OF_MOMENT = (
     "columns",
     "stage",
-    "model",
-    "match",
-    "alone",
-    "odd",
-    "odd_model",
+    "model_weight",
+    "match_weight",
+    "lone_match_weight",
+    "outlier_rate",
+    "model_outlier_rate",
     "distance_limit",
     "mean_excess_loss",
     "loss_spread",

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.prediction.fusion import tempered
 from scroll_tactile.prediction.judging import fused
 from scroll_tactile.prediction.model import Judgement, Model
+from scroll_tactile.prediction.moments import tempered
 from scroll_tactile.readouts.held_out import held_out
 
 __all__ = ["UnseenTouch", "unseen_touches"]
@@ -80,6 +80,6 @@ def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
                 way = matcher.match(matcher.kept.levels(rows[key]), held_out=rows[key])
                 said = fused(matcher, held.names, said, way, own_time=True)
             else:
-                said = replace(said, probability=tempered(chances, moment.odd_model))
+                said = replace(said, probability=tempered(chances, moment.model_outlier_rate))
             threshold = moment.threshold(false_alarms)
             yield UnseenTouch(material, key, tuple(held.names), said.probability, said.novelty, threshold)

@@ -10,7 +10,7 @@ from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
-from scroll_tactile.prediction.fusion import Trajectories
+from scroll_tactile.prediction.moments import Trajectories
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction
 

@@ -57,7 +57,7 @@ def table(model):
     rows = (*model.fusion.moments, *model.fusion.paced)
     said = model.fusion.trajectories
     numbers = [
-        (row.columns, row.stage, row.model, row.match, row.alone, row.odd, row.odd_model, row.distance_limit)
+        [value for name, value in vars(row).items() if name not in ("calibration", "mean_excess_loss", "loss_spread")]
         for row in rows
     ]
     arrays = [said.chances, said.novelty, *(part for row in rows for part in vars(row.calibration).values())]
@@ -154,7 +154,7 @@ def test_nothing_is_held_out_where_nothing_is_kept_or_too_few_are(extractor):
     for few in (learned(kept_touches=0), learned(TOUCHES[:2]), learned(TOUCHES[:4]), learned(TOUCHES[:1])):
         fusion = few.model().fusion
         assert len(fusion.trajectories.targets) < FEWEST
-        assert fusion.complete.model == 1.0
+        assert fusion.complete.model_weight == 1.0
         assert few.predict(TOUCHES[0][1]).material == TOUCHES[0][0]
         for asked in (LATER[0][1], LATER[0][1].first(0.06), faster(LATER[0][1].readings, 2.0)):
             assert np.isfinite(few.predict(asked).novelty)

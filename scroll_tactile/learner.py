@@ -511,7 +511,7 @@ class TactileLearner:
                 return lambda: Prediction(None, 0.0, (), float("inf"), False, seconds)
 
             def read(touch: Stream) -> Touch:
-                encoded = extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
+                encoded = extractor.encode(touch, model.longest, lambda columns: model.scales_for(candidates, columns))
                 if reader is None or not model.is_last(encoded.columns):
                     return encoded, None
                 return encoded, reader.logits_of(encoded.image, candidates)
@@ -618,11 +618,11 @@ class TactileLearner:
                 return lambda: Composition(nothing, 1.0, unknown)
             composer = self._current.composer(self._ledger, model)
 
-            def needed(columns: int) -> list[Scale]:
-                return sorted({*model.needed(model.names, columns), *composer.needed(columns)})
+            def scales_for(columns: int) -> list[Scale]:
+                return sorted({*model.scales_for(model.names, columns), *composer.scales_for(columns)})
 
             def composed() -> Composition:
-                encoded = extractor.encode(touch, model.longest, needed)
+                encoded = extractor.encode(touch, model.longest, scales_for)
                 prediction = self._answer(model, extractor, model.names, [(encoded, None)])
                 made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
                 return Composition(made_of, new, prediction)

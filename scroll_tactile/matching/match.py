@@ -14,8 +14,8 @@ __all__ = [
     "KeptTouch",
     "Match",
     "NaturalDeviation",
-    "by_chance",
     "independent",
+    "negative_entropy",
     "noise_share",
     "shape_of",
     "without_zero",
@@ -121,7 +121,7 @@ def noise_share(energy: float, coherence: float, natural: NaturalDeviation) -> f
     return noise**2 / (noise**2 + natural.energy**2) if noise else 0.0
 
 
-def by_chance(levels: LevelArray) -> float:
+def negative_entropy(levels: LevelArray) -> float:
     """The mean log-likelihood of values drawn from their own frequencies: minus their entropy; 0 of none."""
     shares = np.bincount(levels, minlength=LEVELS) / max(len(levels), 1)
     shares = shares[shares > 0]

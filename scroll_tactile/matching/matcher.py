@@ -25,7 +25,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.matching.blends import blends, block_means, unchanging, weighted_means
 from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import CLEAN, MISSING, UNIT, LevelArray, Noise, Table
-from scroll_tactile.matching.match import Match, NaturalDeviation, by_chance, noise_share, shape_of, without_zero
+from scroll_tactile.matching.match import Match, NaturalDeviation, negative_entropy, noise_share, shape_of, without_zero
 
 __all__ = ["TouchMatcher"]
 
@@ -246,7 +246,7 @@ class TouchMatcher:
             noise_share=noise_share(energy, coherence, natural),
             moved=energy > max(natural.most, 2 * without_zero(deviation, both)),
             likelihood=likelihood,
-            log_likelihood_gain=likelihood - by_chance(query.levels[query.seen]),
+            log_likelihood_gain=likelihood - negative_entropy(query.levels[query.seen]),
             excess_loss=float(mean_log) - likelihood,
         )
 

@@ -1,7 +1,7 @@
 """Heads for each constituent over the readouts of a model, fitted and evaluated on the sampled touches.
 
 Each sampled touch is scored by readouts that never observed it, and by heads that never observed its material. These
-scores say how far heads and novelty are to be believed.
+scores calibrate heads and novelty.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _touches_apart(model: Model, stage: int, names: Sequence[str]) -> list[_Touc
 
 
 def _weights(model: Model, stage: int) -> FloatArray:
-    """How far each scale of a stage is believed, summing to one; equally, where the calibration believes none."""
+    """The weight of each scale of a stage, summing to one; equal, where the calibration gives none any."""
     weights = model.calibrations[stage].weights
     total = float(weights.sum())
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))

@@ -156,18 +156,18 @@ class FeatureExtractor:
         self,
         stream: Stream,
         longest: int,
-        needed: Callable[[int], Sequence[Scale]],
+        scales_for: Callable[[int], Sequence[Scale]],
         cache: WindowCache | None = None,
     ) -> Encoded:
         """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
 
-        longest: its columns. needed: the scales to be read of a touch of so many columns. cache: of the same touch when
-        it was shorter.
+        longest: its columns. scales_for: the scales to be read of a touch of so many columns. cache: of the same touch
+        when it was shorter.
         """
         within = self._within(stream, longest)
         image = self.image(within)
         whole = image if len(within) == len(stream) else self.image(stream)
-        return Encoded(stream, image, self.means(image, needed(image.shape[1]), whole, cache), within.seconds)
+        return Encoded(stream, image, self.means(image, scales_for(image.shape[1]), whole, cache), within.seconds)
 
     def means(
         self, image: Image, scales: Sequence[Scale], whole: Image | None = None, cache: WindowCache | None = None

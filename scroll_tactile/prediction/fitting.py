@@ -2,7 +2,7 @@
 
 A sampled touch that is kept is taken out of the readouts and out of the kept touches. What both then say of it, of its
 beginnings and of it at other paces, all made of its kept levels, is what they will say of a touch to come. How scores
-are read, and how far each expert is believed at each moment, is fitted to that, here and nowhere else: nothing is
+are read, and the weight of each expert at each moment, is fitted to that, here and nowhere else: nothing is
 measured when it is asked for, and all is a function of the set of touches.
 """
 
@@ -182,7 +182,7 @@ class _Fit:
         return HeldOutMoment(*moment, calibration, said, matches)
 
     def fused(self, last: int, apart: Mapping[Scale, LeftOut]) -> tuple[HeldOut, Fusion]:
-        """Complete touches held out of the readouts, and how far these and the kept touches are believed.
+        """Complete touches held out of the readouts, and the weights of these and of the kept touches.
 
         last: the last stage that any touch reached. apart: what each scale says of the sampled touches.
         """

@@ -132,5 +132,5 @@ def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: 
     if np.array_equal(levels_of(readings, stream.sensor), levels_of(stream.readings, stream.sensor)):
         return encoded
     readings.setflags(write=False)
-    needed = [*encoded.means]
-    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda columns: needed)
+    scales = [*encoded.means]
+    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda columns: scales)

@@ -81,7 +81,7 @@ class Model:
 
     names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there.
     views: the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are
-    read, as far as any touch reached it. fusion: how far readouts and kept touches are believed; None where nothing
+    read, as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing
     was learned. conformal: how typical others are of the kept touches. apart: scale → the sampled touches held out;
     sample: these. dependence: how far touches of one thing say the same. least: the columns of all but the shortest
     touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
@@ -208,7 +208,7 @@ class Model:
             return self.fusion.complete
         return self.fusion.at_pace(columns)
 
-    def needed(self, candidates: Sequence[str], columns: int) -> list[Scale]:
+    def scales_for(self, candidates: Sequence[str], columns: int) -> list[Scale]:
         """The scales that are read to judge these candidates for a touch of so many columns."""
         decided = self._decided(candidates, len(self.plan.stages(columns)))
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]} | set(self.views))
@@ -223,7 +223,7 @@ class Model:
     ) -> Judgement:
         """Weigh the candidates for a touch by the readouts alone.
 
-        means: for each scale that is `needed`, its mean features in the codes' unit, (d,). columns: observed so far.
+        means: for each of the scales of `scales_for`, mean features in the codes' unit, (d,). columns: observed so far.
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
         A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
@@ -327,7 +327,7 @@ class Model:
         codes: Sequence[FloatArray],
         best: Sequence[int],
     ) -> tuple[FloatArray, float]:
-        """How far each scale is believed of a touch, (S,), and the distance of `Judgement`.
+        """The weight of each scale for a touch, (S,), and the distance of `Judgement`.
 
         codes: of the touch, by scale; best: the place of the nearest material.
         """

@@ -232,7 +232,7 @@ def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kin
     """The weight of each scale where no touch can be left out, most materials having one.
 
     Within-class scatter is then that within a touch alone, and touches of a material differ by far more: how far the
-    scores are to be believed nothing says but the scores between the materials. So a touch that is the mean of its
+    scores are to weigh nothing says but the scores between the materials. So a touch that is the mean of its
     material is ahead by so many logits, and what lies between two materials is as likely to be either.
     """
     share = PRIOR_WEIGHT[kind] / len(scales)

@@ -258,7 +258,7 @@ class _Leaving:
         targets[np.arange(len(own)), :, own] = 1.0
         scores = asked + across @ np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - targets)
         # With the shares of all touches, as a new one is judged: that a material lacks the very touch that is judged
-        # would be all that a heavily shrunk ridge says, and its scores would be believed not at all.
+        # would be all that a heavily shrunk ridge says, and its scores would have no weight.
         counts = self.counts - weights[:, None] * np.eye(len(self.counts))[own]
         shares = counts / (self.total - weights)[:, None]
         return np.asarray(scores + (self.readout.shares - shares)[:, None, :])

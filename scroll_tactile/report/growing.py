@@ -182,6 +182,6 @@ def _answers(
     counts = {round(part * len(stream)) for part in parts} if len(rule.moments) < 2 else {*rule.moments, len(stream)}
     for count in sorted({min(max(fewest_readings(sensor), first + 1, count), len(stream)) for count in counts}):
         beginning = stream.first(count / sensor.rate)
-        encoded = extractor.encode(beginning, model.longest, lambda columns: model.needed(names, columns))
+        encoded = extractor.encode(beginning, model.longest, lambda columns: model.scales_for(names, columns))
         prediction = answer(model, extractor, names, [(encoded, None)], learner.settings.false_alarms)
         yield encoded.columns, prediction

@@ -92,7 +92,7 @@ def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model
         with _without(model, touch) as other, one_thread():
             for i, moment in enumerate(fusion.moments[:-1]):
                 beginning = stream.first(moment.columns / SKIN.rate)
-                encoded = extractor.encode(beginning, model.longest, lambda at: model.needed(NAMES, at))
+                encoded = extractor.encode(beginning, model.longest, lambda at: model.scales_for(NAMES, at))
                 alone = other.judge(sorted(NAMES), encoded.means, moment.columns, "beginning")
                 found = judged(other, extractor, sorted(NAMES), encoded)
                 if alone.probability.max() < 0.99:

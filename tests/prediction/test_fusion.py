@@ -1,4 +1,4 @@
-"""How far readouts and kept touches are believed at each moment, fitted to what was said of touches held out."""
+"""The weights of readouts and kept touches at each moment, fitted to held-out touches."""
 
 import numpy as np
 import pytest
@@ -117,7 +117,7 @@ def test_a_share_of_every_probability_is_left_for_outliers():
 
 
 def test_a_moment_is_drawn_to_its_neighbours():
-    """The same few touches by themselves, and between two moments at which the readouts are believed far less."""
+    """The same few touches by themselves, and between two moments at which the readouts have far less weight."""
     rng = np.random.default_rng(3)
     few = KEYS[::10]
     scarce = judged(20, evidence(rng, few), None, few)

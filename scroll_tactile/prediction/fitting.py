@@ -3,7 +3,7 @@
 A sampled touch that is kept is taken out of the readouts and out of the kept touches. What both then say of it, of its
 beginnings and of it at other paces, all made of its kept levels, is what they will say of a touch to come. How scores
 are read, and the weight of each expert at each moment, is fitted to that, here and nowhere else: nothing is
-measured when it is asked for, and all is a function of the set of touches.
+measured when a prediction is made, and all is a function of the set of touches.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.moments import Fusion
 from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOut, held_out
-from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
+from scroll_tactile.readouts.held_out import HeldOutProbabilities, held_out_probabilities
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
@@ -39,8 +39,8 @@ from scroll_tactile.statistics.sample import SampledTouch
 __all__ = ["PACES", "Draft", "Renewal", "at_pace"]
 
 FloatArray = npt.NDArray[np.float64]
-Asked = dict[Scale, dict[int, dict[int, FloatArray]]]
-"""Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `left_out`."""
+Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
+"""Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `held_out_scores`."""
 
 PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
 
@@ -123,10 +123,10 @@ class Draft:
             # One after the other, each task let go: of all at once the memory would be twice a model's.
             readouts = {scale: self.tasks.pop(scale).solve(self.memory.statistics) for scale in sorted(self.tasks)}
             fit = _Fit(self, readouts, extractor)
-            apart = {scale: fit.left_out(scale) for scale in readouts}
+            held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
             reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
-            calibrations = [fit.calibrated(stage, scales, apart) for stage, scales in enumerate(reached)]
-            whole, fusion = fit.fused(len(reached) - 1, apart) if reached else (None, None)
+            calibrations = [fit.calibrated(stage, scales, held_out) for stage, scales in enumerate(reached)]
+            whole, fusion = fit.fused(len(reached) - 1, held_out) if reached else (None, None)
         give_back_scratch()
         return Model(
             kind=self.kind,
@@ -136,7 +136,7 @@ class Draft:
             views=self.views,
             readouts=readouts,
             calibrations=calibrations,
-            apart=apart,
+            held_out=held_out,
             sample=self.sample,
             fusion=fusion,
             dependence=Dependence() if whole is None else dependence_of(whole),
@@ -155,17 +155,17 @@ class _Fit:
     readouts: Mapping[Scale, Readout]
     extractor: FeatureExtractor | None
 
-    def left_out(self, scale: Scale, asked: Asked | None = None) -> LeftOut:
-        """What a scale says of the sampled touches, each held out; where `asked` is given, of that in their place."""
+    def held_out_scores(self, scale: Scale, queries: Queries | None = None) -> HeldOutScores:
+        """What a scale says of the sampled touches, each held out; where `queries` is given, of that in their place."""
         draft = self.draft
         stages = [[*stage, *draft.views] for stage in draft.stages]
-        own = None if asked is None else asked[scale]
-        return left_out(self.readouts[scale], draft.sample, stages, draft.kind, own)
+        own = None if queries is None else queries[scale]
+        return held_out_scores(self.readouts[scale], draft.sample, stages, draft.kind, own)
 
-    def calibrated(self, number: int, scales: Sequence[Scale], apart: Mapping[Scale, LeftOut]) -> Calibration:
-        """How scores are read at a stage, or at any other number by which `apart` has what is said."""
+    def calibrated(self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]) -> Calibration:
+        """How scores are read at a stage, or at any other number by which `held_out` has what is said."""
         materials = [material for material, *_ in self.draft.sample]
-        own = [(self.readouts[scale], apart[scale]) for scale in scales]
+        own = [(self.readouts[scale], held_out[scale]) for scale in scales]
         return calibrate_stage(number, materials, own, self.draft.kind, viewed=bool(self.draft.views))
 
     def judged(
@@ -173,36 +173,36 @@ class _Fit:
         moment: tuple[int, int],
         number: int,
         scales: Sequence[Scale],
-        apart: Mapping[Scale, LeftOut],
+        held_out: Mapping[Scale, HeldOutScores],
         matches: Mapping[bytes, Match],
     ) -> HeldOutMoment:
         """What some scales and the kept touches say at a moment, given as its columns and stage."""
-        calibration = self.calibrated(number, scales, apart)
-        said = held_out(number, scales, self.draft.sample, apart, calibration)
-        return HeldOutMoment(*moment, calibration, said, matches)
+        calibration = self.calibrated(number, scales, held_out)
+        answers = held_out_probabilities(number, scales, self.draft.sample, held_out, calibration)
+        return HeldOutMoment(*moment, calibration, answers, matches)
 
-    def fused(self, last: int, apart: Mapping[Scale, LeftOut]) -> tuple[HeldOut, Fusion]:
+    def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
         """Complete touches held out of the readouts, and the weights of these and of the kept touches.
 
-        last: the last stage that any touch reached. apart: what each scale says of the sampled touches.
+        last: the last stage that any touch reached. held_out: what each scale says of the sampled touches.
         """
         draft, milestones = self.draft, self.draft.memory.plan.milestones()[: last + 1]
         matcher = matcher_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
-        complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], apart, {})
+        complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], held_out, {})
         columns = moments_of(milestones, least, matched=matcher is not None)
         moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
         chosen, counts = chosen_of(complete.held_out, matcher)
         weight = PRIOR_WEIGHT[draft.kind]
         if matcher is None:
-            judged = [self.judged(moment, moment[1], draft.stages[moment[1]], apart, {}) for moment in moments]
+            judged = [self.judged(moment, moment[1], draft.stages[moment[1]], held_out, {}) for moment in moments]
             return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts, weight)
         if self.extractor is None:
             moments = []
         kept = _KeptTouches.held_out(self, matcher, chosen, {*chosen, *counts})
         complete = replace(complete, matches=kept.matches)
         if not chosen or self.extractor is None:
-            alone = self.judged((least, last), last, draft.views, apart, {})
+            alone = self.judged((least, last), last, draft.views, held_out, {})
             return complete.held_out, fuse(
                 matcher, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
             )
@@ -212,7 +212,7 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _KeptTouches:
-    """Kept touches that are held out of readouts and kept touches alike, to be asked as they would be if they came now.
+    """Kept touches, held out of readouts and kept touches alike, to be matched as if they came now.
 
     chosen: the keys of those that are seen at all moments. levels, rows: by key, the levels (C, T) and the row among
     the kept. places: of all sampled touches, in the sample. matches: what the other kept touches say of each.
@@ -238,7 +238,7 @@ class _KeptTouches:
 
     def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
         """What is said of their beginnings at each moment, given as its columns and stage."""
-        apart, judged = self._read(moments), []
+        held_out, judged = self._read(moments), []
         for number, (columns, stage) in enumerate(moments):
             matches = {}
             for key in self.chosen:
@@ -247,13 +247,13 @@ class _KeptTouches:
                     noise = self.matches[key].noise
                     matches[key] = self.matcher.match(levels[:, :columns], held_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]
-            judged.append(self.fit.judged((columns, stage), number, scales, apart, matches))
+            judged.append(self.fit.judged((columns, stage), number, scales, held_out, matches))
         return judged
 
-    def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, LeftOut]:
+    def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, HeldOutScores]:
         """What each scale of windows says of their beginnings, by the moment's number."""
         fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
-        asked: Asked = {scale: {} for scale in fit.readouts if scale not in draft.views}
+        queries: Queries = {scale: {} for scale in fit.readouts if scale not in draft.views}
         for key in self.chosen if moments else ():
             assert extractor is not None
             touch, cache = stream_of(self.levels[key], extractor.sensor), WindowCache()
@@ -262,25 +262,25 @@ class _KeptTouches:
                     break
                 image = extractor.image(touch.first(columns / touch.sensor.rate))
                 for scale, mean in extractor.means(image, draft.stages[stage], cache=cache).items():
-                    asked[scale].setdefault(self.places[key], {})[number] = mean
-        return {scale: fit.left_out(scale, asked) for scale in asked}
+                    queries[scale].setdefault(self.places[key], {})[number] = mean
+        return {scale: fit.held_out_scores(scale, queries) for scale in queries}
 
     def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
         """What the views and the kept touches say of some of them, had they been made so many times as fast."""
         fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
         assert extractor is not None
-        asked: Asked = {scale: {} for scale in views}
+        queries: Queries = {scale: {} for scale in views}
         matches = {}
         for key in keys:
             levels, noise = at_pace(self.levels[key], pace), self.matches[key].noise
             matches[key] = self.matcher.match(levels, held_out=self.rows[key], whole=True, noise=noise)
             image = extractor.image(stream_of(levels, extractor.sensor))
             for scale, mean in extractor.means(image, views).items():
-                asked[scale][self.places[key]] = {0: mean}
+                queries[scale][self.places[key]] = {0: mean}
         lengths = [self.levels[key].shape[1] / pace for key in keys]
         columns = max(1, round(float(np.median(lengths)))) if lengths else 1
-        apart = {scale: fit.left_out(scale, asked) for scale in views}
-        return fit.judged((columns, last), 0, views, apart, matches)
+        held_out = {scale: fit.held_out_scores(scale, queries) for scale in views}
+        return fit.judged((columns, last), 0, views, held_out, matches)
 
 
 def at_pace(levels: LevelArray, pace: float) -> LevelArray:

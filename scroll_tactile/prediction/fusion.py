@@ -36,7 +36,7 @@ from scroll_tactile.prediction.moments import (
     tempered,
 )
 from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
-from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 __all__ = ["HeldOutMoment", "chosen_of", "full_match_weight", "fuse", "moments_of"]
 
@@ -78,13 +78,13 @@ class HeldOutMoment:
     columns: int
     stage: int
     calibration: Calibration
-    held_out: HeldOut
+    held_out: HeldOutProbabilities
     matches: Mapping[bytes, Match]
 
 
 @dataclass(frozen=True)
 class _FusionInputs:
-    """The inputs of a fit at one moment, of the touches `reached`, that reached it; see `HeldOut` and `Trajectories`.
+    """The inputs of a fit at one moment, of the touches `reached`, that reached it; see `Trajectories`.
 
     logs: g's part, scores: β's for an information of `information`, both (n, C).
     """
@@ -140,7 +140,7 @@ def _rows(
     return rows
 
 
-def chosen_of(complete: HeldOut, matcher: TouchMatcher | None) -> tuple[list[bytes], dict[bytes, float]]:
+def chosen_of(complete: HeldOutProbabilities, matcher: TouchMatcher | None) -> tuple[list[bytes], dict[bytes, float]]:
     """The held-out touches that are seen at all moments: of those that are kept, evenly over their keys.
 
     And those that are compared as complete ones, with how many each stands for: beside them the least sure, where it

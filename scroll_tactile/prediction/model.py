@@ -20,7 +20,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.moments import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.leave_one_out import HeldOutScores
 from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
 from scroll_tactile.results import Unusual
@@ -82,7 +82,7 @@ class Model:
     names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there.
     views: the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are
     read, as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing
-    was learned. conformal: how typical others are of the kept touches. apart: scale → the sampled touches held out;
+    was learned. conformal: how typical others are of the kept touches. held_out: scale → the sampled touches held out;
     sample: these. dependence: how far touches of one thing say the same. least: the columns of all but the shortest
     touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
 
@@ -97,7 +97,7 @@ class Model:
     views: list[Scale]
     readouts: dict[Scale, Readout]
     calibrations: list[Calibration]
-    apart: dict[Scale, LeftOut]
+    held_out: dict[Scale, HeldOutScores]
     sample: list[tuple[str, bytes, SampledTouch]]
     fusion: Fusion | None
     dependence: Dependence
@@ -285,7 +285,7 @@ class Model:
         names: Sequence[str],
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
-        scales, calibration = self.scales(hypothesis, stage), self._read_by(hypothesis, moment, stage)
+        scales, calibration = self.scales(hypothesis, stage), self.calibration(hypothesis, moment, stage)
         readouts, codes = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
         places = [self._places(scale, names) for scale in scales]
         if len(names) <= EAGER:
@@ -338,7 +338,7 @@ class Model:
         )
         return calibration.weights_at(distances), float(calibration.relative(distances).min())
 
-    def _read_by(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
+    def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """How scores are read at a stage: of the moment's, or of materials that were never felt for so long.
 
         Or of a beginning where touches are so short that no moment comes before they are complete.
@@ -357,7 +357,7 @@ class Model:
     ) -> float:
         """The standardised novelty of a touch judged at a stage, if it is one of these materials that it may be."""
         distances = self._distances(self.scales(hypothesis, stage), means, names)
-        return float(self._read_by(hypothesis, moment, stage).novelty(distances))
+        return float(self.calibration(hypothesis, moment, stage).novelty(distances))
 
     def novelty(self, stage: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch by the windows of a stage alone."""

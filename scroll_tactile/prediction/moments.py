@@ -138,6 +138,10 @@ class Fusion:
         """How a complete touch is judged of which the pace, not the end, makes it so many columns long."""
         return min(self.paced, key=lambda row: abs(math.log(row.columns / columns)))
 
+    def latest(self, stage: int) -> Moment:
+        """The latest moment of a stage; that of complete touches, where the stage has none."""
+        return next((moment for moment in reversed(self.moments) if moment.stage == stage), self.complete)
+
     def at(self, columns: int) -> Moment:
         """The latest moment that so many columns reached; the first, where they reached none."""
         return self.moments[max(0, bisect_right([moment.columns for moment in self.moments], columns) - 1)]

@@ -178,7 +178,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
         views=views,
         readouts=readouts,
         calibrations=calibrations,
-        apart={},
+        held_out={},
         sample=[],
         fusion=fusion,
         dependence=Dependence(*dependence),

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.leave_one_out import HeldOutScores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 
 __all__ = [
@@ -113,7 +113,7 @@ UNMEASURED = 5.0  # spreads: where too little could be left out to measure the d
 def calibrate_stage(
     stage: int,
     materials: Sequence[str],
-    scales: Sequence[tuple[Readout, LeftOut]],
+    scales: Sequence[tuple[Readout, HeldOutScores]],
     kind: ReadoutName,
     *,
     viewed: bool = False,
@@ -123,24 +123,26 @@ def calibrate_stage(
     materials: of the sampled touches. scales: of those that judge, ascending, the readout and what it left out.
     viewed: whether a scale's weight falls with a touch's diagonal distance.
     """
-    apart = [left for _, left in scales]
+    held_out = [left for _, left in scales]
     measuring = [(readout, left) for readout, left in scales if readout.scale.measures_novelty]
-    names = common_names(apart)
-    touches = judged_touches(stage, apart) if len(names) > 1 else []
-    medians = np.full(len(apart), np.inf)
+    names = common_names(held_out)
+    touches = judged_touches(stage, held_out) if len(names) > 1 else []
+    medians = np.full(len(held_out), np.inf)
     if not touches:
-        unheld = np.full(len(apart), _unheld(names, scales, kind))
+        unheld = np.full(len(held_out), _unheld(names, scales, kind))
         return Calibration(unheld, _assumed(measuring), np.zeros(0), medians)
-    scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
+    scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in held_out], axis=1)
     measured = [_picked(left, left.distances, names, touches, stage).min(axis=1) for _, left in measuring]
     distances = np.stack(measured, axis=1)
     own = {name: i for i, name in enumerate(names)}
     if viewed:
-        rows = [[left.rows[touch, stage] for touch in touches] for left in apart]
-        away = np.stack([left.diagonal_distances[own_rows] for left, own_rows in zip(apart, rows, strict=True)], axis=1)
+        rows = [[left.rows[touch, stage] for touch in touches] for left in held_out]
+        away = np.stack(
+            [left.diagonal_distances[own_rows] for left, own_rows in zip(held_out, rows, strict=True)], axis=1
+        )
         medians = np.median(away, axis=0)
         scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
-    weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(apart))
+    weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(held_out))
     if len(distances) < FEWEST:
         return Calibration(weights, _assumed(measuring), np.zeros(0), medians)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
@@ -153,18 +155,18 @@ def calibrate_stage(
     return Calibration(weights, shape, np.sort(own_novelty), medians)
 
 
-def common_names(apart: Sequence[LeftOut]) -> list[str]:
+def common_names(held_out: Sequence[HeldOutScores]) -> list[str]:
     """The reference materials of all of some scales, in alphabetical order."""
-    return sorted(set.intersection(*(set(left.names) for left in apart)))
+    return sorted(set.intersection(*(set(left.names) for left in held_out)))
 
 
-def judged_touches(stage: int, apart: Sequence[LeftOut]) -> list[int]:
+def judged_touches(stage: int, held_out: Sequence[HeldOutScores]) -> list[int]:
     """The sampled touches, by their place in the sample, that all of some scales left out at a stage."""
-    found = [{touch for touch, reached in left.rows if reached == stage} for left in apart]
+    found = [{touch for touch, reached in left.rows if reached == stage} for left in held_out]
     return sorted(set.intersection(*found))
 
 
-def _picked(left: LeftOut, values: FloatArray, names: list[str], touches: list[int], stage: int) -> FloatArray:
+def _picked(left: HeldOutScores, values: FloatArray, names: list[str], touches: list[int], stage: int) -> FloatArray:
     """The values of some touches at a stage for some of the materials, shape (touches, names)."""
     own = {name: i for i, name in enumerate(left.names)}
     rows = np.array([left.rows[touch, stage] for touch in touches], dtype=np.intp)
@@ -228,7 +230,7 @@ def fit_weights(
     return weights
 
 
-def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kind: ReadoutName) -> float:
+def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, HeldOutScores]], kind: ReadoutName) -> float:
     """The weight of each scale where no touch can be left out, most materials having one.
 
     Within-class scatter is then that within a touch alone, and touches of a material differ by far more: how far the
@@ -248,7 +250,7 @@ def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kin
     return min(share, AHEAD / max(float(np.median(ahead.min(axis=1))), TINY))
 
 
-def _assumed(scales: Sequence[tuple[Readout, LeftOut]]) -> FloatArray:
+def _assumed(scales: Sequence[tuple[Readout, HeldOutScores]]) -> FloatArray:
     """Without touches left out: the distances of the class means themselves, spread by their own mean size."""
     shapes = []
     for readout, _ in scales:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 __all__ = ["Dependence", "dependence_of"]
 
@@ -52,7 +52,7 @@ class Dependence:
         return math.fsum(novelties) / math.sqrt(count * (1 + (count - 1) * self.novelty))
 
 
-def dependence_of(held: HeldOut) -> Dependence:
+def dependence_of(held: HeldOutProbabilities) -> Dependence:
     """Fit both to held-out touches."""
     groups: dict[int, list[int]] = {}
     for row in sorted(range(len(held.keys)), key=held.keys.__getitem__):

@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import Calibration, common_names, judged_touches
-from scroll_tactile.readouts.leave_one_out import LeftOut, Sampled
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, Sampled
 from scroll_tactile.signals.windows import Scale
 
-__all__ = ["HeldOut", "held_out"]
+__all__ = ["HeldOutProbabilities", "held_out_probabilities"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutProbabilities:
     """What is said of N sampled touches, each held out, of the C materials that all scales know.
 
     names: the materials, in alphabetical order. places: of the touches in the sample, ascending. keys: their content
@@ -43,11 +43,15 @@ class HeldOut:
         return np.asarray(self.logs[rows, self.targets] - others.max(axis=1, initial=-np.inf))
 
 
-def held_out(
-    stage: int, scales: Sequence[Scale], sample: Sampled, apart: Mapping[Scale, LeftOut], calibration: Calibration
-) -> HeldOut:
-    """What some scales say at a stage, as they are calibrated. apart: what each says of the sampled touches."""
-    said = [apart[scale] for scale in scales]
+def held_out_probabilities(
+    stage: int,
+    scales: Sequence[Scale],
+    sample: Sampled,
+    held_out: Mapping[Scale, HeldOutScores],
+    calibration: Calibration,
+) -> HeldOutProbabilities:
+    """What some scales say at a stage, as they are calibrated. held_out: what each says of the sampled touches."""
+    said = [held_out[scale] for scale in scales]
     names, touches = common_names(said), list(sample)
     own = {name: i for i, name in enumerate(names)}
     places = [place for place in judged_touches(stage, said) if touches[place][0] in own] if len(names) > 1 else []
@@ -63,7 +67,7 @@ def held_out(
             distances.append(left.distances[np.ix_(at, columns)].min(axis=1))
     logits -= logits.max(axis=1, keepdims=True) if len(names) else 0.0
     logits -= np.log(np.exp(logits).sum(axis=1, keepdims=True))
-    return HeldOut(
+    return HeldOutProbabilities(
         names,
         places,
         [touches[place][1] for place in places],

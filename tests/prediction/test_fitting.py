@@ -10,8 +10,8 @@ from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace
+from scroll_tactile.prediction.held_out_touches import held_out_touches
 from scroll_tactile.prediction.judging import judged
-from scroll_tactile.prediction.unseen import unseen_touches
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.report.growing import _without
 from scroll_tactile.statistics.moments import one_thread
@@ -87,7 +87,7 @@ def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model
     rows = fusion.matcher.kept.rows()
     keys = sorted(rows)  # all of them are held out: they are fewer than that
     assert len(said.targets) == len(keys) == len(TOUCHES)
-    for touch in unseen_touches(model, 0.05)[::7]:
+    for touch in held_out_touches(model, 0.05)[::7]:
         stream = stream_of(fusion.matcher.kept.levels(rows[touch.key]), SKIN)
         with _without(model, touch) as other, one_thread():
             for i, moment in enumerate(fusion.moments[:-1]):

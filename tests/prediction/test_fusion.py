@@ -16,7 +16,7 @@ from scroll_tactile.prediction.fusion import (
 )
 from scroll_tactile.prediction.moments import Moment, tempered
 from scroll_tactile.readouts.calibration import FEWEST, Calibration
-from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]
 C = len(NAMES)
@@ -56,7 +56,7 @@ def judged(columns, logits, scores, keys=KEYS, information=0.5):
     novelty = np.random.default_rng(columns).normal(size=len(keys))
     calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(novelty), np.ones(1))
     targets = np.array([OWN[key] for key in keys], dtype=np.intp)
-    held = HeldOut(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
+    held = HeldOutProbabilities(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
     said = np.zeros((len(keys), C)) if scores is None else scores
     matches = {key: match(row, information=information) for key, row in zip(keys, said, strict=True)}
     return HeldOutMoment(columns, 0, calibration, held, matches)

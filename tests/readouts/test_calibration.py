@@ -18,7 +18,7 @@ from scroll_tactile.readouts.calibration import (
     fit_weights,
     scale_weights,
 )
-from scroll_tactile.readouts.leave_one_out import left_out
+from scroll_tactile.readouts.leave_one_out import held_out_scores
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
@@ -49,7 +49,7 @@ def stages_of(statistics, pool, kind="lda", stages=STAGES):
     scales = sorted({scale for stage in stages for scale in stage})
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
     readouts = {task.scale: task.solve(statistics) for task in tasks}
-    apart = {scale: left_out(readout, pool, stages, kind) for scale, readout in readouts.items()}
+    apart = {scale: held_out_scores(readout, pool, stages, kind) for scale, readout in readouts.items()}
     materials = [material for material, *_ in pool]
     return [
         calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
@@ -241,7 +241,7 @@ def test_a_scale_is_weighed_less_the_further_away_a_touch_is_in_it(scales):
 def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_will_be(kind):
     statistics, sample = scene(noises=(20_000, 60_000), touches=60)
     readouts = [Task.of(statistics, scale, statistics.names(scale)).solve(statistics) for scale in SCALES]
-    apart = [left_out(readout, sample, STAGES, kind) for readout in readouts]
+    apart = [held_out_scores(readout, sample, STAGES, kind) for readout in readouts]
     materials = [material for material, *_ in sample]
     scales = list(zip(readouts, apart, strict=True))
     plain, viewed = (calibrate_stage(1, materials, scales, kind, viewed=flag) for flag in (False, True))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile.readouts.dependence import USUAL, Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(12)]
 
@@ -31,7 +31,9 @@ def held(rows):
     logits = np.array([row[2] for row in rows]).reshape(len(rows), len(NAMES))
     logs = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
     targets, novelty = np.array([row[1] for row in rows], dtype=np.intp), np.array([row[3] for row in rows])
-    return HeldOut(NAMES, [*range(len(rows))], [row[0] for row in rows], targets, logs, np.ones(len(rows)), novelty)
+    return HeldOutProbabilities(
+        NAMES, [*range(len(rows))], [row[0] for row in rows], targets, logs, np.ones(len(rows)), novelty
+    )
 
 
 def picked(found, places):

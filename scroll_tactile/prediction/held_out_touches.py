@@ -1,4 +1,4 @@
-"""What a model says of touches that it never observed: of the sampled ones, each left out."""
+"""Answers of a model to the sampled touches, each held out."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import numpy.typing as npt
 from scroll_tactile.prediction.judging import fused
 from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.prediction.moments import tempered
-from scroll_tactile.readouts.held_out import held_out
+from scroll_tactile.readouts.held_out import held_out_probabilities
 
-__all__ = ["UnseenTouch", "unseen_touches"]
+__all__ = ["HeldOutTouch", "held_out_touches"]
 
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class UnseenTouch:
-    """What is said of a touch by all others.
+class HeldOutTouch:
+    """The answer to a touch by all others.
 
     material, key: its own. names: the materials it was weighed among, in alphabetical order. probability: of each,
     shape (C,). novelty: see `Prediction`. threshold: of the novelty, from which on it is called unknown.
@@ -49,37 +49,36 @@ class UnseenTouch:
         return self.novelty <= self.threshold
 
 
-def unseen_touches(model: Model, false_alarms: float) -> list[UnseenTouch]:
-    """What a model, just fitted, says of the sampled touches, each left out of readouts and kept touches.
+def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
+    """Answers of a model, just fitted, to the sampled touches, each held out of readouts and kept touches.
 
     They are weighed among the materials that have a sampled touch. Those of a material's only touch are not there.
     Calibration is that of all. false_alarms: as in `Settings`.
     """
-    return list(_unseen(model, false_alarms))
+    return list(_held_out_touches(model, false_alarms))
 
 
-def _unseen(model: Model, false_alarms: float) -> Iterator[UnseenTouch]:
-    fusion, seen = model.fusion, set[int]()
+def _held_out_touches(model: Model, false_alarms: float) -> Iterator[HeldOutTouch]:
+    fusion, judged = model.fusion, set[int]()
     if fusion is None:
         return
     matcher = fusion.matcher
     rows = {} if matcher is None else matcher.kept.rows()
     for stage in range(len(model.calibrations) - 1, -1, -1):
-        scales, whole = model.scales("complete", stage), stage == len(model.calibrations) - 1
-        calibration = fusion.complete.calibration if whole else model.calibrations[stage]
-        held = held_out(stage, scales, model.sample, model.apart, calibration)
-        moment = next((moment for moment in reversed(fusion.moments) if moment.stage == stage), fusion.complete)
+        calibration = model.calibration("complete", fusion.complete, stage)
+        scales, moment = model.scales("complete", stage), fusion.latest(stage)
+        held = held_out_probabilities(stage, scales, model.sample, model.held_out, calibration)
         for i, place in enumerate(held.places):
-            if place in seen:
+            if place in judged:
                 continue
-            seen.add(place)
+            judged.add(place)
             material, key, _ = model.sample[place]
-            chances, novelty = np.exp(held.logs[i]), float(held.novelty[i])
-            said = Judgement(chances, novelty, moment, float(held.distance[i]))
-            if matcher is not None and key in rows and not moment.suffices(float(chances.max()), said.distance):
-                way = matcher.match(matcher.kept.levels(rows[key]), held_out=rows[key])
-                said = fused(matcher, held.names, said, way, own_time=True)
+            chances = np.exp(held.logs[i])
+            alone = Judgement(chances, float(held.novelty[i]), moment, float(held.distance[i]))
+            if matcher is not None and key in rows and not moment.suffices(float(chances.max()), alone.distance):
+                match = matcher.match(matcher.kept.levels(rows[key]), held_out=rows[key])
+                result = fused(matcher, held.names, alone, match, own_time=True)
             else:
-                said = replace(said, probability=tempered(chances, moment.model_outlier_rate))
+                result = replace(alone, probability=tempered(chances, moment.model_outlier_rate))
             threshold = moment.threshold(false_alarms)
-            yield UnseenTouch(material, key, tuple(held.names), said.probability, said.novelty, threshold)
+            yield HeldOutTouch(material, key, tuple(held.names), result.probability, result.novelty, threshold)

@@ -168,11 +168,11 @@ def _at(
     if len(places) < len(names):
         at = []
     found = [among[chosen[number]] for number in at]
-    ways = [judged.matches[chosen[number]] for number in at]
-    matched = [] if matcher is None else [match_scores(matcher, names, way) for way in ways]
-    scores = np.array(matched).reshape(len(ways), len(names))
-    information = np.maximum([way.information for way in ways], LEAST_INFORMATION)
-    median = float(np.median(information)) if ways else 1.0
+    matches = [judged.matches[chosen[number]] for number in at]
+    matched = [] if matcher is None else [match_scores(matcher, names, match) for match in matches]
+    scores = np.array(matched).reshape(len(matches), len(names))
+    information = np.maximum([match.information for match in matches], LEAST_INFORMATION)
+    median = float(np.median(information)) if matches else 1.0
     return _FusionInputs(
         np.array(at, dtype=np.intp),
         np.array([names.index(held.names[held.targets[i]]) for i in found], dtype=np.intp),
@@ -181,7 +181,7 @@ def _at(
         scores * (median / information)[:, None],
         median,
         held.novelty[found],
-        np.array([way.excess_loss for way in ways]),
+        np.array([match.excess_loss for match in matches]),
     )
 
 

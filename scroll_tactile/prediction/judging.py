@@ -36,7 +36,7 @@ TINY = 1e-300
 
 
 def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
-    """What a model says of an encoded touch, of which the candidates may be the materials."""
+    """The judgement of an encoded touch by a model; the candidates are what its material may be."""
     fusion, columns = model.fusion, encoded.columns
     assert fusion is not None
     usual: Hypothesis = "complete" if columns >= model.least else "beginning"
@@ -46,31 +46,35 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     if matcher is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
         return _by_readouts(model, encoded, alone, usual)
     levels = levels_seen(encoded.stream)
-    ways: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
+    matches: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
     if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
         whole = matcher.match(levels, whole=True)
         if whole.log_likelihood_gain > 0:  # at no other pace is it any more like what is kept
-            ways.append((whole, "paced", False))
-    filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.log_likelihood_gain))
+            matches.append((whole, "paced", False))
+    filled = _filled(
+        model, extractor, encoded, max((match for match, *_ in matches), key=lambda match: match.log_likelihood_gain)
+    )
     answers = []
-    for way, hypothesis, own_time in ways:
-        said = alone if filled is encoded and hypothesis == usual else None
+    for match, hypothesis, own_time in matches:
+        judgement = alone if filled is encoded and hypothesis == usual else None
         means = filled.means
         if hypothesis == "paced":
             kept = stream_of(levels_seen(filled.stream), extractor.sensor)
             means = extractor.means(extractor.image(kept), model.views)
-        said = said or model.judge(candidates, means, columns if own_time else len(encoded.stream), hypothesis)
-        answers.append(fused(matcher, candidates, said, way, own_time=own_time))
-    gains = np.array([way.log_likelihood_gain for way, *_ in ways])
+        judgement = judgement or model.judge(
+            candidates, means, columns if own_time else len(encoded.stream), hypothesis
+        )
+        answers.append(fused(matcher, candidates, judgement, match, own_time=own_time))
+    gains = np.array([match.log_likelihood_gain for match, *_ in matches])
     weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
     best = int(weights.argmax())
-    unusual = _unusual(model, encoded, ways[best][0], ways[best][1])
+    unusual = _unusual(model, encoded, matches[best][0], matches[best][1])
     return replace(answers[best], probability=probability / probability.sum(), unusual=unusual)
 
 
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
-    """The readouts' word. Where it is that the touch may be of nothing known, kept touches say what sets it apart."""
+    """The judgement by the readouts. Where the touch may be of nothing known, kept touches say what differs."""
     unusual = _of_length(model, encoded)
     if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - WITHIN):
         unusual = _unusual(model, encoded, model.matcher.match(levels_seen(encoded.stream)), hypothesis)
@@ -80,35 +84,35 @@ def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: H
 def fused(
     matcher: TouchMatcher,
     candidates: Sequence[str],
-    said: Judgement,
-    way: Match,
+    alone: Judgement,
+    match: Match,
     *,
     own_time: bool,
 ) -> Judgement:
-    """What the readouts and the kept touches say of a touch together.
+    """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts.
 
     own_time: whether it was compared with beginnings, and not with whole touches brought to its length.
     """
-    moment = said.moment
-    distance_weight = moment.distance_weight(said.distance, own_time)
-    logs = (1 - way.noise_share) * np.log(np.maximum(said.probability, TINY))
-    match_weight = moment.match_weight_at(way, distance_weight)
-    logits = distance_weight * moment.model_weight * logs + match_scores(matcher, candidates, way) * match_weight
+    moment = alone.moment
+    distance_weight = moment.distance_weight(alone.distance, own_time)
+    logs = (1 - match.noise_share) * np.log(np.maximum(alone.probability, TINY))
+    match_weight = moment.match_weight_at(match, distance_weight)
+    logits = distance_weight * moment.model_weight * logs + match_scores(matcher, candidates, match) * match_weight
     chances = np.exp(logits - logits.max())
     chances = tempered(chances / chances.sum(), moment.outlier_rate)
-    novelty = (1 - way.noise_share) * said.novelty + way.noise_share * moment.matched_novelty(way)
-    return replace(said, probability=chances, novelty=float(novelty))
+    novelty = (1 - match.noise_share) * alone.novelty + match.noise_share * moment.matched_novelty(match)
+    return replace(alone, probability=chances, novelty=float(novelty))
 
 
-def _unusual(model: Model, encoded: Encoded, way: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
+def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
     """What sets a touch apart from those that were learned, if the kept touches explain it so."""
     found: list[Unusual] = list(_of_length(model, encoded))
     if found and hypothesis == "paced":
         found = ["faster" if found == ["shorter"] else "slower"]
     marks: tuple[tuple[Unusual, bool], ...] = (
-        ("noisy", way.noise_share > 0.5),
-        ("zero moved", way.moved),
-        ("channels dead", bool(way.stuck.any())),
+        ("noisy", match.noise_share > 0.5),
+        ("zero moved", match.moved),
+        ("channels dead", bool(match.stuck.any())),
     )
     return (*found, *(mark for mark, holds in marks if holds))
 

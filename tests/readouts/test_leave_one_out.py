@@ -155,7 +155,7 @@ def test_of_few_touches_the_left_out_scores_find_the_materials(kind):
 
 def heavily_shrunk(statistics):
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("scroll_tactile.readouts.readout.shrinkage", lambda *_: 0.999)
+        monkeypatch.setattr("scroll_tactile.readouts.task.shrinkage", lambda *_: 0.999)
         return Task.of(statistics, SCALE, [*"abcd"]).solve(statistics)
 
 

@@ -26,7 +26,7 @@ from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.gate import open_store
-from scroll_tactile.memory.identity import Identity, usual_embedding, usual_exemplars, usual_recall
+from scroll_tactile.memory.identity import Identity, default_kept_touches, usual_embedding, usual_exemplars
 from scroll_tactile.memory.kept import Keeping
 from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.merge import Choice, MergeRules
@@ -78,7 +78,7 @@ class TactileLearner:
     sensor: whose streams it reads. embedding: the frozen features; `Kernels()` unless given, and `Frames()` for a
     camera. Of a camera's frames only those count in which the gel is pressed (see `signals.contact`).
     augmentation: the copies that each touch is observed with, as one observation; see `Augmented`.
-    settings: readout, false_alarms, recall and exemplars, by name; see `scroll_tactile.settings.Settings`.
+    settings: readout, false_alarms, kept_touches and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
     any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
@@ -101,8 +101,8 @@ class TactileLearner:
         chosen = usual_embedding(sensor) if embedding is None else embedding
         given = Settings(**settings)
         exemplars = usual_exemplars(sensor) if given.exemplars is None else given.exemplars
-        recall = usual_recall(sensor, chosen) if given.recall is None else given.recall
-        self._set_up(sensor, chosen, augmentation, given, exemplars, recall)
+        kept_touches = default_kept_touches(sensor, chosen) if given.kept_touches is None else given.kept_touches
+        self._set_up(sensor, chosen, augmentation, given, exemplars, kept_touches)
         self._ledger = Ledger(self._empty_memory, contents=Contents())
 
     def _set_up(
@@ -112,12 +112,12 @@ class TactileLearner:
         augmentation: Augmented | None,
         settings: Settings,
         exemplars: int,
-        recall: int,
+        kept_touches: int,
     ) -> None:
         self._sensor = sensor
         self._embedding = embedding
         self._augmentation = augmentation
-        self._settings = settings.model_copy(update={"exemplars": exemplars, "recall": recall})
+        self._settings = settings.model_copy(update={"exemplars": exemplars, "kept_touches": kept_touches})
         self._plan = window_plan(sensor, embedding)
         self._extractor = FeatureExtractor(sensor, embedding, self._plan, augmentation)
         self._unverified: tuple[Identity, Path] | None = None
@@ -128,7 +128,7 @@ class TactileLearner:
         self._tuned_reader: TunedReader | None = None
 
     def _empty_memory(self, encode: Callable[[npt.NDArray[np.float32]], Codes] | None = None) -> Memory:
-        keeping = Keeping(self._sensor, self._settings.recall or 0)
+        keeping = Keeping(self._sensor, self._settings.kept_touches or 0)
         return Memory(self._embedding.dimension, self._plan, self._settings.exemplars or 0, encode, keeping)
 
     @classmethod
@@ -158,10 +158,10 @@ class TactileLearner:
         finish_interrupted(Path(path))
         if sensor is None and not is_there(Path(path)):
             raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
-        store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, chosen.recall, mode)
+        store = open_store(path, sensor, embedding, augmentation, chosen.exemplars, chosen.kept_touches, mode)
         try:
             identity = Identity.read(store)
-            identity.require(store.path, sensor, augmentation, chosen.exemplars, chosen.recall)
+            identity.require(store.path, sensor, augmentation, chosen.exemplars, chosen.kept_touches)
             if embedding is None:
                 found = identity.own_embedding(store.path)
                 identity.require_plan(store.path, found)
@@ -170,7 +170,7 @@ class TactileLearner:
                 identity.require_embedding(store.path, found)
             store.read_with(window_plan(identity.sensor, found))
             learner = cls.__new__(cls)
-            kept = identity.exemplars, identity.recall
+            kept = identity.exemplars, identity.kept_touches
             learner._set_up(identity.sensor, found, identity.augmentation, chosen, *kept)
             learner._unverified = (identity, store.path) if embedding is None else None
             bare = identity.embedding.bare
@@ -209,7 +209,7 @@ class TactileLearner:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         sensor, embedding, augmentation, settings = state["made_with"]
-        self._set_up(sensor, embedding, augmentation, settings, settings.exemplars, settings.recall)
+        self._set_up(sensor, embedding, augmentation, settings, settings.exemplars, settings.kept_touches)
         self._unverified, self._snapshot_of = state["unverified"], state["of"]
         self._ledger = Ledger(lambda: self._empty_memory().fill(*state["held"]), contents=state["contents"])
         logger.info("a snapshot of %s, in memory only", state["of"])
@@ -425,7 +425,7 @@ class TactileLearner:
         where the file is merged, and counted once where it is there already. They are left out of a memory of which any
         were compacted. Without them come the readings of the exemplars. readings: False leaves out all that shows a
         touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with
-        exemplars=0 and recall=0. source: what is said of observations that have none.
+        exemplars=0 and kept_touches=0. source: what is said of observations that have none.
 
         Raises InputError in a memory without a path, and for a source that is none; StoreError.
         """
@@ -474,7 +474,7 @@ class TactileLearner:
                 carried.copy(progress or _silent)
                 self.close()
                 before = carried.put_in_place()
-                own: dict[str, Any] = self._settings.model_dump(exclude={"exemplars", "recall"})
+                own: dict[str, Any] = self._settings.model_dump(exclude={"exemplars", "kept_touches"})
                 self.__dict__.update(type(self).open(store.path, embedding=chosen, **own).__dict__)
         finally:
             carried.close()
@@ -511,7 +511,7 @@ class TactileLearner:
                 return lambda: Prediction(None, 0.0, (), float("inf"), False, seconds)
 
             def read(touch: Stream) -> Touch:
-                encoded = extractor.encode(touch, model.longest, lambda columns: model.needed(candidates, columns))
+                encoded = extractor.encode(touch, model.longest, lambda columns: model.scales_for(candidates, columns))
                 if reader is None or not model.is_last(encoded.columns):
                     return encoded, None
                 return encoded, reader.logits_of(encoded.image, candidates)
@@ -618,11 +618,11 @@ class TactileLearner:
                 return lambda: Composition(nothing, 1.0, unknown)
             composer = self._current.composer(self._ledger, model)
 
-            def needed(columns: int) -> list[Scale]:
-                return sorted({*model.needed(model.names, columns), *composer.needed(columns)})
+            def scales_for(columns: int) -> list[Scale]:
+                return sorted({*model.scales_for(model.names, columns), *composer.scales_for(columns)})
 
             def composed() -> Composition:
-                encoded = extractor.encode(touch, model.longest, needed)
+                encoded = extractor.encode(touch, model.longest, scales_for)
                 prediction = self._answer(model, extractor, model.names, [(encoded, None)])
                 made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
                 return Composition(made_of, new, prediction)

@@ -143,7 +143,7 @@ class Prediction:
         """The materials that it may be, likeliest first: all but those of which it would be an odd touch.
 
         error: of the touches of any one material that was observed, this share or less lack their own (see
-        `readouts.conformal`); of several streams of one thing, for each such group. It holds whatever the sensor and
+        `matching.conformal`); of several streams of one thing, for each such group. It holds whatever the sensor and
         the embedding are worth: a poor one makes the sets large. Nothing is left of a touch like none that was kept:
         an empty set means unknown.
 

@@ -39,11 +39,11 @@ class FrozenModel(BaseModel):
 
 
 class Settings(FrozenModel):
-    """How a learner reads its memory; all but `recall` and `exemplars` can differ at every opening.
+    """How a learner reads its memory; all but `kept_touches` and `exemplars` can differ at every opening.
 
     readout: "lda" or "ridge" (the paper's); both are computed from the same statistics.
     false_alarms: the share of touches of known materials that may be called unknown, between 0 and 1.
-    recall: touches that are kept, as small integers, to compare a touch with that was felt through noise or dead
+    kept_touches: touches that are kept, as small integers, to compare a touch with that was felt through noise or dead
     channels, or at another speed. 0 keeps none. None is as many as 16 MB hold, at most 1000, and none for a camera.
     exemplars: streams in the buffer that `fine_tune` trains on; three times as many are kept raw, to choose from. 0
     keeps none. None is 400, and none for a camera, whose frames are large (480 × 640: 4 MB).
@@ -53,7 +53,7 @@ class Settings(FrozenModel):
 
     readout: Literal["lda", "ridge"] = "lda"
     false_alarms: Annotated[float, Field(gt=0, lt=1, strict=False)] = 0.05
-    recall: Annotated[int, Field(ge=0)] | None = None
+    kept_touches: Annotated[int, Field(ge=0)] | None = None
     exemplars: Annotated[int, Field(ge=0)] | None = None
 
 

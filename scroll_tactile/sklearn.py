@@ -33,7 +33,7 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
     material as its text.
 
     sensor: of the readings; None: 100 Hz, and the range of the first touches that are fitted, a tenth wider at both
-    ends. embedding, readout, recall: as of the learner.
+    ends. embedding, readout, kept_touches: as of the learner.
 
     After fitting: classes_, the labels in ascending order; n_features_in_, the channels; learner_, the learner. An
     estimator that was fitted in parts, in any order, is the same as one that was fitted at once.
@@ -47,12 +47,12 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
         sensor: Sensor | None = None,
         embedding: Embedding | None = None,
         readout: str = "lda",
-        recall: int | None = None,
+        kept_touches: int | None = None,
     ) -> None:
         self.sensor = sensor
         self.embedding = embedding
         self.readout = readout
-        self.recall = recall
+        self.kept_touches = kept_touches
 
     def fit(self, X: Touches, y: Labels) -> Self:
         """Observe these touches and nothing else."""
@@ -72,7 +72,11 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
         if learner is None:
             sensor = _sensor_of(touches) if self.sensor is None else self.sensor
             learner = TactileLearner(
-                sensor=sensor, embedding=self.embedding, readout=self.readout, recall=self.recall, exemplars=0
+                sensor=sensor,
+                embedding=self.embedding,
+                readout=self.readout,
+                kept_touches=self.kept_touches,
+                exemplars=0,
             )
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):

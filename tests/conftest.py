@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from real_sets import CACHE
 
-from scroll_tactile.readouts.likelihood import Likelihood, Noise, Table
+from scroll_tactile.matching.likelihood import Likelihood, Noise, Table
 
 # The tests sync files tens of thousands of times: where there is room in memory, they do not wait for a disk.
 IN_MEMORY = Path("/dev/shm")

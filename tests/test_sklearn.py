@@ -28,13 +28,13 @@ def touches(count=8, readings=50):
 
 
 def make(**changes):
-    return TactileClassifier(**{"sensor": PAD, "embedding": SMALL, "recall": 0, **changes})
+    return TactileClassifier(**{"sensor": PAD, "embedding": SMALL, "kept_touches": 0, **changes})
 
 
 def test_it_answers_as_its_learner_does():
     X, y = touches()
     fitted = make().fit(X, y)
-    learner = TactileLearner(sensor=PAD, embedding=SMALL, recall=0, exemplars=0)
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, kept_touches=0, exemplars=0)
     for touch, label in zip(X, y, strict=True):
         learner.observe(label, touch)
     assert fitted.learner_.digest() == learner.digest()
@@ -86,7 +86,7 @@ def test_it_works_in_pipelines_and_searches():
 
 def test_a_sensor_that_is_not_given_is_as_wide_as_the_touches():
     X, y = touches()
-    one_channel = TactileClassifier(embedding=SMALL, recall=0).fit(X[:, :, 0], y)
+    one_channel = TactileClassifier(embedding=SMALL, kept_touches=0).fit(X[:, :, 0], y)
     sensor = one_channel.learner_.sensor
     assert (sensor.channels, sensor.readings) == (1, 50)
     assert sensor.low < X[:, :, 0].min() < X[:, :, 0].max() < sensor.high

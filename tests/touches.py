@@ -55,7 +55,7 @@ def without(*places):
 
 
 def kept_of(learner):
-    """The touches kept for recall, to the byte; None of a memory that keeps none."""
+    """The kept touches, to the byte; None of a memory that keeps none."""
     kept = learner.memory.kept
     return None if kept is None else [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
 

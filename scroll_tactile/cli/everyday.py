@@ -217,7 +217,7 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
         table.add_row(shown(name), str(count))
     console().print(table)
     say(f"[bold]observations:[/] {sum(materials.values())} of {len(materials)} materials")
-    say(f"[bold]kept for recall:[/] {kept} touches")
+    say(f"[bold]kept touches:[/] {kept}")
     say(f"[bold]sensor:[/] {shown(sensor.name)}, {sensor.channels} channels at {sensor.rate:g} Hz")
     say(
         f"[bold]embedding:[/] {shown(embedding.name)}, {embedding.dimension} features, "

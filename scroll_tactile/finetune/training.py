@@ -16,7 +16,8 @@ from scroll_tactile.finetune.network import Backbone, TouchFeatures, TrainingSam
 from scroll_tactile.libraries import optional
 from scroll_tactile.memory.tuned import TuneMode
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
@@ -95,7 +96,7 @@ def start_without(
         start = Start(known, {}, np.zeros(len(known)))
     else:
         reference = names if model.kind == "lda" else list(statistics.materials)
-        readouts = {scale: Readout(Task.of(statistics, scale, reference), statistics) for scale in scales}
+        readouts = {scale: Task.of(statistics, scale, reference).solve(statistics) for scale in scales}
         start = start_of(model, known, readouts)
     for sample in samples:
         statistics.add(sample.material, sample.codes, sample.image.shape[1])

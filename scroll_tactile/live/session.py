@@ -313,7 +313,7 @@ class LiveSession:
         for moment in [*rule.moments, image.shape[1]]:
             stream = self._memory.extractor.stream(low + (high - low) * (image[:, : max(2, moment)].T + 1) / 2)
             encoded = self._memory.extractor.encode(
-                stream, model.longest, lambda columns: model.needed(model.names, columns), cache
+                stream, model.longest, lambda columns: model.scales_for(model.names, columns), cache
             )
             self._memory.answer(model, model.names, [encoded])
 
@@ -348,7 +348,7 @@ class LiveSession:
 
         def encoded(each: Stream, cache: WindowCache | None = None) -> Encoded:
             return self._memory.extractor.encode(
-                each, model.longest, lambda columns: model.needed(candidates, columns), cache
+                each, model.longest, lambda columns: model.scales_for(candidates, columns), cache
             )
 
         touch.encoded = touch.encoded or [encoded(each) for each in touch.earlier]

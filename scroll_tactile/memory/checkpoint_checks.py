@@ -42,7 +42,7 @@ IntArray = npt.NDArray[np.int64]
 class CheckpointChecks:
     """The checks of checkpoints of one sensor, dimension and plan of windows; each raises Unexpected.
 
-    keeps: whether touches are kept for recall.
+    keeps: whether touches are kept to match with.
     """
 
     def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, keeps: bool) -> None:

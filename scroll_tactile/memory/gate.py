@@ -52,7 +52,7 @@ class Gate:
         copies = identity.augmentation.copies if identity.augmentation else 0
         made_with = identity.sensor, identity.embedding.dimension, plan
         self._rows = RowChecks(*made_with, copies)
-        self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.recall))
+        self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.kept_touches))
 
     def head(self, head: Head) -> Head:
         """This row, which is what its kind must be but for its arrays. Raises as `record`."""
@@ -170,7 +170,7 @@ def open_store(
     embedding: Embedding | None,
     augmentation: Augmented | None,
     exemplars: int | None,
-    recall: int | None,
+    kept_touches: int | None,
     mode: Literal["write", "read"],
 ) -> MemoryStore:
     """The store in a folder; a new one where there is none and a sensor is given."""
@@ -181,7 +181,7 @@ def open_store(
             raise
     require_augmentable(sensor, augmentation)
     chosen = usual_embedding(sensor) if embedding is None else embedding
-    identity = Identity.of(sensor, chosen, exemplars, augmentation, recall)
+    identity = Identity.of(sensor, chosen, exemplars, augmentation, kept_touches)
     return MemoryStore.open(path, identity=identity.to_json(), mode=mode)
 
 

@@ -36,9 +36,9 @@ __all__ = [
     "Grid",
     "Identified",
     "Identity",
+    "default_kept_touches",
     "usual_embedding",
     "usual_exemplars",
-    "usual_recall",
 ]
 
 USUAL_EXEMPLARS = 400  # streams
@@ -117,7 +117,7 @@ class Identity(_Kept):
     """Everything that a memory is made with and that never changes.
 
     reading: whether wide windows may be partial, and which scales judge. views: of whole touches, that are read beside
-    windows. exemplars: streams in the buffer. recall: touches kept for recall.
+    windows. exemplars: streams in the buffer. kept_touches: how many are kept.
     """
 
     sensor: Sensor
@@ -127,7 +127,7 @@ class Identity(_Kept):
     views: tuple[ScaleKind, ...]
     augmentation: Augmented | None
     exemplars: _Streams
-    recall: _Streams
+    kept_touches: _Streams
 
     @model_validator(mode="after")
     def _of_a_sensor_that_can_be(self) -> Self:
@@ -142,11 +142,11 @@ class Identity(_Kept):
         embedding: Embedding,
         exemplars: int | None,
         augmentation: Augmented | None = None,
-        recall: int | None = None,
+        kept_touches: int | None = None,
     ) -> Self:
         """The identity of a new memory.
 
-        exemplars: streams in its buffer, recall: kept touches; None: the usual numbers, none for a camera. Raises
+        exemplars: streams in its buffer, kept_touches: how many; None: the usual numbers, none for a camera. Raises
         InputError for an embedding that cannot read the sensor, or numbers beyond all bounds, EmbeddingError.
         """
         require_rest(embedding, sensor)
@@ -160,7 +160,7 @@ class Identity(_Kept):
                 views=tuple(view.kind for view in plan.views),
                 augmentation=augmentation,
                 exemplars=usual_exemplars(sensor) if exemplars is None else exemplars,
-                recall=usual_recall(sensor, embedding) if recall is None else recall,
+                kept_touches=default_kept_touches(sensor, embedding) if kept_touches is None else kept_touches,
             )
         except ValidationError as error:
             raise InputError(f"no memory can be made with {_first(error)}") from None
@@ -207,7 +207,7 @@ class Identity(_Kept):
         sensor: Sensor | None,
         augmentation: Augmented | None,
         exemplars: int | None,
-        recall: int | None,
+        kept_touches: int | None,
     ) -> None:
         """Raise MismatchError for anything, where it is given, that the memory was not made with."""
         if sensor is not None and sensor != self.sensor:
@@ -231,10 +231,10 @@ class Identity(_Kept):
                 f"{path} was made with exemplars={self.exemplars}; it was opened with {exemplars}. Readings that were "
                 "not kept are gone: leave exemplars out"
             )
-        if recall not in (None, self.recall):
+        if kept_touches not in (None, self.kept_touches):
             raise MismatchError(
-                f"{path} was made with recall={self.recall}; it was opened with {recall}. Which touches are kept is a "
-                "function of all that were observed: leave recall out"
+                f"{path} was made with kept_touches={self.kept_touches}; it was opened with {kept_touches}. Which "
+                "touches are kept is a function of all that were observed: leave kept_touches out"
             )
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
@@ -339,8 +339,8 @@ def usual_embedding(sensor: Sensor) -> Embedding:
     return Frames() if sensor.camera else Kernels()
 
 
-def usual_recall(sensor: Sensor, embedding: Embedding) -> int:
-    """The default number of touches kept for recall; none without views, beside which a touch is recalled."""
+def default_kept_touches(sensor: Sensor, embedding: Embedding) -> int:
+    """The default number of kept touches; none without views, beside which a touch is matched."""
     return usual_kept(sensor) if window_plan(sensor, embedding).whole else 0
 
 

@@ -1,4 +1,4 @@
-"""Kept touches: a bounded sample of what was observed, for recall (see `readouts.recall`).
+"""Kept touches: a bounded sample of what was observed to compare others with (see `matching.matcher`).
 
 In a checkpoint these are `kept-keys` (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their
 materials are the attribute `kept`.
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LevelArray, levels_of
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.likelihood import LevelArray, levels_of
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.statistics.sample import Sample
 
@@ -57,9 +57,9 @@ class KeptTouches(Sample[LevelArray]):
         super().__init__(made.capacity)
         self.made = made
 
-    def touches(self) -> list[Kept]:
+    def touches(self) -> list[KeptTouch]:
         """All of them, by material and key."""
-        return [Kept(material, key, levels) for material, key, levels in self]
+        return [KeptTouch(material, key, levels) for material, key, levels in self]
 
     def take(self, material: str, key: bytes, readings: npt.NDArray[np.floating] | None) -> None:
         """Keep a touch where it belongs in, if its readings are there."""

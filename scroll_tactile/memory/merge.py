@@ -147,7 +147,7 @@ class MergePlan:
         source = self.source
         if self.newest is None or source.compacted:
             return None
-        if memory.kept is not None and Identity.read(source).recall != memory.kept.capacity:
+        if memory.kept is not None and Identity.read(source).kept_touches != memory.kept.capacity:
             return None
         return sums_without(source, self.newest, memory, {head.sequence for head in self.left_out})
 
@@ -250,10 +250,10 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
             f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
             f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
         )
-    if whole and memory.kept is not None and mine.recall != other.recall:
+    if whole and memory.kept is not None and mine.kept_touches != other.kept_touches:
         raise MismatchError(
-            f"{theirs.path} was compacted and keeps {other.recall} touches for recall; {ours.path} keeps "
-            f"{mine.recall}, and the readings for the others are gone"
+            f"{theirs.path} was compacted and keeps {other.kept_touches} touches to match with; {ours.path} keeps "
+            f"{mine.kept_touches}, and the readings for the others are gone"
         )
 
 

@@ -33,7 +33,7 @@ def pack_memory(
     packed = copy(memory)
     packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
     if not readings:
-        identity |= {"exemplars": 0, "recall": 0}
+        identity |= {"exemplars": 0, "kept_touches": 0}
         packed.kept = packed.exemplars = None
         packed.capacity = 0
     with reported(path, "packing a memory"):

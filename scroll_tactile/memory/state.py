@@ -12,12 +12,12 @@ from typing import Any, Self, cast
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.kept import Keeping, KeptTouches
 from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.readouts.likelihood import LevelArray
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
@@ -34,13 +34,13 @@ class Memory:
 
     dimension: d, of the features. plan: which windows of a touch are read. exemplars: streams in the buffer, or 0;
     kept as `capacity`. encode: readings → the rows of codes that the touch adds, by scale, for rows of the journal that
-    have readings alone; None where all rows have codes. keeping: which touches are kept for recall; None keeps none.
+    have readings alone; None where all rows have codes. keeping: which touches are kept to match with; None keeps none.
 
     What was learned:
 
     - statistics: exact sums by scale.
     - sample: the touches that readouts are calibrated on.
-    - kept: touches for recall; None without `keeping`.
+    - kept: touches to match with; None without `keeping`.
     - exemplars: the candidates for the buffer, and where their readings lie; None with a capacity of 0.
     - descriptions: material → what it is made of; the material need not have been observed.
     - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.

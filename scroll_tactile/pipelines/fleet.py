@@ -92,7 +92,7 @@ def learn(
     embedding: Embedding | None = None,
     augmentation: Augmented | None = None,
     exemplars: int | None = None,
-    recall: int | None = None,
+    kept_touches: int | None = None,
     workers: int | None = None,
     client: Any = None,
     add: bool = False,
@@ -104,7 +104,8 @@ def learn(
 
     sources: files, folders and addresses that fsspec knows, of recordings (as `recordings.read` takes them) and of
     memories, in folders or packed. options: how recordings are cut into touches and named.
-    sensor, embedding, augmentation, exemplars, recall: of the memory, as of `TactileLearner`; an existing one knows.
+    sensor, embedding, augmentation, exemplars, kept_touches: of the memory, as of `TactileLearner`; an existing one
+    knows.
     workers: processes on this machine; as many as it has cores unless given. With one, and no patience, this one
     learns. client: of a `dask.distributed` cluster, or anything whose `get_executor` gives an Executor, or an Executor;
     its workers must reach the folder beside the destination, where packed memories lie until they are merged.
@@ -127,7 +128,7 @@ def learn(
     place = Path(destination).absolute()
     found, missing = expand([os.fspath(source) for source in sources], patience)
     report = FleetReport(refused=missing)
-    settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "recall": recall}
+    settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "kept_touches": kept_touches}
     folder = place.with_name(place.name + ".fleet")
     with ExitStack() as stack:
         stack.enter_context(alone_in(folder, place))

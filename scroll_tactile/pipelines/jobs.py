@@ -39,7 +39,7 @@ class Making:
     embedding: Embedding
     augmentation: Augmented | None
     exemplars: int | None
-    recall: int | None
+    kept_touches: int | None
     options: SourceOptions
     patience: float | None = None
 
@@ -56,7 +56,7 @@ class Making:
         """As a memory that is held was made; as is said of a new one. Raises InputError."""
         if held is not None:
             sensor, embedding, kept = held.sensor, held.embedding, held.settings
-            return cls(sensor, embedding, held.augmentation, kept.exemplars, kept.recall, options, patience)
+            return cls(sensor, embedding, held.augmentation, kept.exemplars, kept.kept_touches, options, patience)
         if sensor is None:
             raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
         chosen = usual_embedding(sensor) if embedding is None else embedding
@@ -65,7 +65,7 @@ class Making:
     @property
     def identity(self) -> Identity:
         """That of the memory that comes out."""
-        return Identity.of(self.sensor, self.embedding, self.exemplars, self.augmentation, self.recall)
+        return Identity.of(self.sensor, self.embedding, self.exemplars, self.augmentation, self.kept_touches)
 
     def open(self, path: Path) -> TactileLearner:
         """A learner of this making, in a folder."""
@@ -75,7 +75,7 @@ class Making:
             embedding=self.embedding,
             augmentation=self.augmentation,
             exemplars=self.exemplars,
-            recall=self.recall,
+            kept_touches=self.kept_touches,
         )
 
 

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.conformal import Typicality
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
 from scroll_tactile.prediction.judging import judged, levels_seen
 from scroll_tactile.prediction.model import Judgement, Model
-from scroll_tactile.readouts.conformal import Typicality
 from scroll_tactile.results import Prediction
 from scroll_tactile.statistics.moments import one_thread
 

@@ -1,4 +1,4 @@
-"""The composition of a touch: heads for each constituent over the readouts of a model, and how far they are believed.
+"""The composition of a touch: heads for each constituent over the readouts of a model, and their weights.
 
 A touch may be of a material that was observed: then its composition is that material's, weighed by the probabilities
 of the materials. Or it is of one never observed: then the heads answer, ridge regressions over the materials. The
@@ -49,7 +49,7 @@ class Composer:
             stages = [fitter.fit(targets) for fitter in fitters]
         return cls(model, targets, stages, [fitter.space for fitter in fitters])
 
-    def needed(self, columns: int) -> list[Scale]:
+    def scales_for(self, columns: int) -> list[Scale]:
         """The scales whose windows the heads read of a touch of so many columns."""
         return self.model.stages[self._stage(columns)]
 
@@ -61,7 +61,7 @@ class Composer:
     ) -> tuple[tuple[Constituent, ...], float]:
         """Each constituent that is wanted, and the probability that the touch is of a material never observed.
 
-        feels_like: probability of each material observed. encoded: the touch, with the scales that are `needed`.
+        feels_like: probability of each material observed. encoded: the touch, with the scales of `scales_for`.
         expected: the probability of a material never observed before the touch.
         """
         stage = self._stage(encoded.columns)
@@ -94,9 +94,9 @@ class Composer:
             if isinstance(head, str):
                 return None
             observed = {material: feels_like[material] for material in known if material in feels_like}
-            believed = (1 - unfamiliar) * sum(observed.values())
+            weight = (1 - unfamiliar) * sum(observed.values())
             value = (1 - unfamiliar) * sum(chance * known[material] for material, chance in observed.items())
-            return min(max(value + (1 - believed) * head(z), 0.0), 1.0)
+            return min(max(value + (1 - weight) * head(z), 0.0), 1.0)
 
         having = [(material, feels_like.get(material, 0.0)) for material, has in target.presence.items() if has]
         evidence = sorted((item for item in having if item[1] > 0), key=lambda item: (-item[1], item[0]))

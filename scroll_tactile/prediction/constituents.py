@@ -1,7 +1,7 @@
 """Heads for each constituent over the readouts of a model, fitted and evaluated on the sampled touches.
 
 Each sampled touch is scored by readouts that never observed it, and by heads that never observed its material. These
-scores say how far heads and novelty are to be believed.
+scores calibrate heads and novelty.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ class MaterialSpace:
 
 
 @dataclass(frozen=True)
-class _TouchApart:
+class _ScoredTouch:
     """A sampled touch, judged by readouts that never observed it: z of its stage, shape (C,), and its novelty.
 
-    familiar: among all materials. unfamiliar: among all but its own.
+    known_novelty: its novelty among all materials. new_novelty: among all but its own.
     """
 
     material: str
     z: FloatArray
-    familiar: float
-    unfamiliar: float
+    known_novelty: float
+    new_novelty: float
 
 
 @dataclass(frozen=True)
@@ -87,12 +87,12 @@ class HeadFitter:
 
     def __init__(self, model: Model, stage: int) -> None:
         self.space = space_of(model, stage)
-        self.touches = _touches_apart(model, stage, self.space.names)
+        self.touches = _scored_touches(model, stage, self.space.names)
         self._systems: dict[tuple[float, bytes], RidgeSystem] = {}
 
     def fit(self, targets: Mapping[str, Target]) -> StageHeads:
         """The heads of all constituents, and how novelty is to be read."""
-        values = [touch.familiar for touch in self.touches] + [touch.unfamiliar for touch in self.touches]
+        values = [touch.known_novelty for touch in self.touches] + [touch.new_novelty for touch in self.touches]
         truth = [0.0] * len(self.touches) + [1.0] * len(self.touches)
         return StageHeads(
             fit_curve(values, truth, NOVEL),
@@ -151,7 +151,7 @@ def space_of(model: Model, stage: int) -> MaterialSpace:
     """The materials that the readouts of a stage rested on when they were fitted, as they see them."""
     readouts = [model.readouts[scale] for scale in model.stages[stage]]
     known = [[readout.names[place] for place in readout.reference] for readout in readouts]
-    names = common_names([model.apart[scale] for scale in model.stages[stage]])
+    names = common_names([model.held_out[scale] for scale in model.stages[stage]])
     gram = np.zeros((len(names), len(names)))
     for weight, own, readout in zip(_weights(model, stage), known, readouts, strict=True):
         places = [own.index(name) for name in names]
@@ -169,30 +169,30 @@ def combined(model: Model, stage: int, names: Sequence[str], means: Mapping[Scal
     return total
 
 
-def _touches_apart(model: Model, stage: int, names: Sequence[str]) -> list[_TouchApart]:
-    apart, calibration = [model.apart[scale] for scale in model.stages[stage]], model.calibrations[stage]
+def _scored_touches(model: Model, stage: int, names: Sequence[str]) -> list[_ScoredTouch]:
+    held_out, calibration = [model.held_out[scale] for scale in model.stages[stage]], model.calibrations[stage]
     if len(names) < 2:
         return []
-    places = [[left.names.index(name) for name in names] for left in apart]
+    places = [[left.names.index(name) for name in names] for left in held_out]
     touches = []
-    for number in judged_touches(stage, apart):
+    for number in judged_touches(stage, held_out):
         material, *_ = model.sample[number]
         if material not in names:
             continue
-        rows = [left.rows[number, stage] for left in apart]
-        distances = np.stack([left.distances[row][own] for left, row, own in zip(apart, rows, places, strict=True)])
+        rows = [left.rows[number, stage] for left in held_out]
+        distances = np.stack([left.distances[row][own] for left, row, own in zip(held_out, rows, places, strict=True)])
         z = sum(
             weight * left.z[row][own]
-            for weight, left, row, own in zip(_weights(model, stage), apart, rows, places, strict=True)
+            for weight, left, row, own in zip(_weights(model, stage), held_out, rows, places, strict=True)
         )
         others = np.delete(distances, names.index(material), axis=1)
         novelties = [float(calibration.novelty(part.min(axis=1))) for part in (distances, others)]
-        touches.append(_TouchApart(material, np.asarray(z), *novelties))
+        touches.append(_ScoredTouch(material, np.asarray(z), *novelties))
     return touches
 
 
 def _weights(model: Model, stage: int) -> FloatArray:
-    """How far each scale of a stage is believed, summing to one; equally, where the calibration believes none."""
+    """The weight of each scale of a stage, summing to one; equal, where the calibration gives none any."""
     weights = model.calibrations[stage].weights
     total = float(weights.sum())
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))

@@ -268,7 +268,7 @@ class CurrentModel:
 
     def composer(self, ledger: Ledger, model: Model) -> Composer:
         """The heads of all constituents that were described, over a model of this memory."""
-        if model.fusion is not None and not model.apart:  # it was read, and heads rest on touches held out
+        if model.fusion is not None and not model.held_out:  # it was read, and heads rest on touches held out
             model = self.settle(ledger)
         state = model, ledger.version, ledger.described
         if self._composer is None or self._composer[:3] != state:

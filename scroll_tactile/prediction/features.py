@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_competing, embed_windows, require_rest
 from scroll_tactile.errors import EmbeddingError
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.rows import Codes
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
@@ -156,18 +156,18 @@ class FeatureExtractor:
         self,
         stream: Stream,
         longest: int,
-        needed: Callable[[int], Sequence[Scale]],
+        scales_for: Callable[[int], Sequence[Scale]],
         cache: WindowCache | None = None,
     ) -> Encoded:
         """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
 
-        longest: its columns. needed: the scales to be read of a touch of so many columns. cache: of the same touch when
-        it was shorter.
+        longest: its columns. scales_for: the scales to be read of a touch of so many columns. cache: of the same touch
+        when it was shorter.
         """
         within = self._within(stream, longest)
         image = self.image(within)
         whole = image if len(within) == len(stream) else self.image(stream)
-        return Encoded(stream, image, self.means(image, needed(image.shape[1]), whole, cache), within.seconds)
+        return Encoded(stream, image, self.means(image, scales_for(image.shape[1]), whole, cache), within.seconds)
 
     def means(
         self, image: Image, scales: Sequence[Scale], whole: Image | None = None, cache: WindowCache | None = None

@@ -2,8 +2,8 @@
 
 A sampled touch that is kept is taken out of the readouts and out of the kept touches. What both then say of it, of its
 beginnings and of it at other paces, all made of its kept levels, is what they will say of a touch to come. How scores
-are read, and how far each expert is believed at each moment, is fitted to that, here and nowhere else: nothing is
-measured when it is asked for, and all is a function of the set of touches.
+are read, and the weight of each expert at each moment, is fitted to that, here and nowhere else: nothing is
+measured when a prediction is made, and all is a function of the set of touches.
 """
 
 from __future__ import annotations
@@ -15,20 +15,23 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.matching.blends import at_places
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.deviation import matcher_of
+from scroll_tactile.matching.likelihood import LevelArray
+from scroll_tactile.matching.match import KeptTouch, Match
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
-from scroll_tactile.prediction.fusion import Fusion, Judged, chosen_of, fuse, moments_of
+from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.moments import Fusion
 from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
-from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
-from scroll_tactile.readouts.deviation import recall_of
-from scroll_tactile.readouts.held_out import HeldOut, held_out
-from scroll_tactile.readouts.leave_one_out import LeftOut, left_out
-from scroll_tactile.readouts.likelihood import MISSING, LevelArray
-from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName, Task
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept, Recollection
+from scroll_tactile.readouts.held_out import HeldOutProbabilities, held_out_probabilities
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
+from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
@@ -36,8 +39,8 @@ from scroll_tactile.statistics.sample import SampledTouch
 __all__ = ["PACES", "Draft", "Renewal", "at_pace"]
 
 FloatArray = npt.NDArray[np.float64]
-Asked = dict[Scale, dict[int, dict[int, FloatArray]]]
-"""Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `left_out`."""
+Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
+"""Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `held_out_scores`."""
 
 PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
 
@@ -68,7 +71,7 @@ class Renewal:
         with one_thread():
             for scale in sorted(self.tasks):
                 task = self.tasks.pop(scale)
-                self.model.readouts[scale] = Readout(task, self.memory.statistics, like=self.readouts.pop(scale))
+                self.model.readouts[scale] = task.solve(self.memory.statistics, like=self.readouts.pop(scale))
         give_back_scratch()
         return self.model
 
@@ -87,7 +90,7 @@ class Draft:
     views: list[Scale]
     tasks: dict[Scale, Task]
     sample: list[tuple[str, bytes, SampledTouch]]
-    kept: list[Kept]
+    kept: list[KeptTouch]
     longest: int
     least: int
     touches: int
@@ -118,12 +121,12 @@ class Draft:
         """
         with one_thread():
             # One after the other, each task let go: of all at once the memory would be twice a model's.
-            readouts = {scale: Readout(self.tasks.pop(scale), self.memory.statistics) for scale in sorted(self.tasks)}
+            readouts = {scale: self.tasks.pop(scale).solve(self.memory.statistics) for scale in sorted(self.tasks)}
             fit = _Fit(self, readouts, extractor)
-            apart = {scale: fit.left_out(scale) for scale in readouts}
+            held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
             reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
-            calibrations = [fit.calibrated(stage, scales, apart) for stage, scales in enumerate(reached)]
-            whole, fusion = fit.fused(len(reached) - 1, apart) if reached else (None, None)
+            calibrations = [fit.calibrated(stage, scales, held_out) for stage, scales in enumerate(reached)]
+            whole, fusion = fit.fused(len(reached) - 1, held_out) if reached else (None, None)
         give_back_scratch()
         return Model(
             kind=self.kind,
@@ -133,11 +136,11 @@ class Draft:
             views=self.views,
             readouts=readouts,
             calibrations=calibrations,
-            apart=apart,
+            held_out=held_out,
             sample=self.sample,
             fusion=fusion,
             dependence=Dependence() if whole is None else dependence_of(whole),
-            conformal=Conformal(self.kept) if fusion is not None and fusion.recall is not None else None,
+            conformal=Conformal(self.kept) if fusion is not None and fusion.matcher is not None else None,
             least=self.least,
             longest=self.longest,
             fitted_to=self.touches,
@@ -152,17 +155,17 @@ class _Fit:
     readouts: Mapping[Scale, Readout]
     extractor: FeatureExtractor | None
 
-    def left_out(self, scale: Scale, asked: Asked | None = None) -> LeftOut:
-        """What a scale says of the sampled touches, each held out; where `asked` is given, of that in their place."""
+    def held_out_scores(self, scale: Scale, queries: Queries | None = None) -> HeldOutScores:
+        """What a scale says of the sampled touches, each held out; where `queries` is given, of that in their place."""
         draft = self.draft
         stages = [[*stage, *draft.views] for stage in draft.stages]
-        own = None if asked is None else asked[scale]
-        return left_out(self.readouts[scale], draft.sample, stages, draft.kind, own)
+        own = None if queries is None else queries[scale]
+        return held_out_scores(self.readouts[scale], draft.sample, stages, draft.kind, own)
 
-    def calibrated(self, number: int, scales: Sequence[Scale], apart: Mapping[Scale, LeftOut]) -> Calibration:
-        """How scores are read at a stage, or at any other number by which `apart` has what is said."""
+    def calibrated(self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]) -> Calibration:
+        """How scores are read at a stage, or at any other number by which `held_out` has what is said."""
         materials = [material for material, *_ in self.draft.sample]
-        own = [(self.readouts[scale], apart[scale]) for scale in scales]
+        own = [(self.readouts[scale], held_out[scale]) for scale in scales]
         return calibrate_stage(number, materials, own, self.draft.kind, viewed=bool(self.draft.views))
 
     def judged(
@@ -170,87 +173,87 @@ class _Fit:
         moment: tuple[int, int],
         number: int,
         scales: Sequence[Scale],
-        apart: Mapping[Scale, LeftOut],
-        matches: Mapping[bytes, Recollection],
-    ) -> Judged:
+        held_out: Mapping[Scale, HeldOutScores],
+        matches: Mapping[bytes, Match],
+    ) -> HeldOutMoment:
         """What some scales and the kept touches say at a moment, given as its columns and stage."""
-        calibration = self.calibrated(number, scales, apart)
-        said = held_out(number, scales, self.draft.sample, apart, calibration)
-        return Judged(*moment, calibration, said, matches)
+        calibration = self.calibrated(number, scales, held_out)
+        answers = held_out_probabilities(number, scales, self.draft.sample, held_out, calibration)
+        return HeldOutMoment(*moment, calibration, answers, matches)
 
-    def fused(self, last: int, apart: Mapping[Scale, LeftOut]) -> tuple[HeldOut, Fusion]:
-        """Complete touches held out of the readouts, and how far these and the kept touches are believed.
+    def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
+        """Complete touches held out of the readouts, and the weights of these and of the kept touches.
 
-        last: the last stage that any touch reached. apart: what each scale says of the sampled touches.
+        last: the last stage that any touch reached. held_out: what each scale says of the sampled touches.
         """
         draft, milestones = self.draft, self.draft.memory.plan.milestones()[: last + 1]
-        recall = recall_of(draft.kept) if draft.kept else None
+        matcher = matcher_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
-        complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], apart, {})
-        columns = moments_of(milestones, least, matched=recall is not None)
+        complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], held_out, {})
+        columns = moments_of(milestones, least, matched=matcher is not None)
         moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
-        chosen, counts = chosen_of(complete.held_out, recall)
+        chosen, counts = chosen_of(complete.held_out, matcher)
         weight = PRIOR_WEIGHT[draft.kind]
-        if recall is None:
-            judged = [self.judged(moment, moment[1], draft.stages[moment[1]], apart, {}) for moment in moments]
+        if matcher is None:
+            judged = [self.judged(moment, moment[1], draft.stages[moment[1]], held_out, {}) for moment in moments]
             return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts, weight)
         if self.extractor is None:
             moments = []
-        kept = _KeptTouches.held_out(self, recall, chosen, {*chosen, *counts})
+        kept = _KeptTouches.held_out(self, matcher, chosen, {*chosen, *counts})
         complete = replace(complete, matches=kept.matches)
         if not chosen or self.extractor is None:
-            alone = self.judged((least, last), last, draft.views, apart, {})
+            alone = self.judged((least, last), last, draft.views, held_out, {})
             return complete.held_out, fuse(
-                recall, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
+                matcher, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
             )
         paced = [kept.paced(pace, chosen, last) for pace in PACES]
-        return complete.held_out, fuse(recall, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
+        return complete.held_out, fuse(matcher, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
 
 
 @dataclass(frozen=True)
 class _KeptTouches:
-    """Kept touches that are held out of readouts and kept touches alike, to be asked as they would be if they came now.
+    """Kept touches, held out of readouts and kept touches alike, to be matched as if they came now.
 
     chosen: the keys of those that are seen at all moments. levels, rows: by key, the levels (C, T) and the row among
     the kept. places: of all sampled touches, in the sample. matches: what the other kept touches say of each.
     """
 
     fit: _Fit
-    recall: Recall
+    matcher: TouchMatcher
     chosen: Sequence[bytes]
     rows: Mapping[bytes, int]
     levels: Mapping[bytes, LevelArray]
     places: Mapping[bytes, int]
-    matches: Mapping[bytes, Recollection]
+    matches: Mapping[bytes, Match]
 
     @classmethod
-    def held_out(cls, fit: _Fit, recall: Recall, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
+    def held_out(cls, fit: _Fit, matcher: TouchMatcher, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
         """Those with some keys."""
-        kept = recall.rows()
+        kept = matcher.kept.rows()
         rows = {key: kept[key] for key in sorted(keys)}
-        levels = {key: recall.levels(row) for key, row in rows.items()}
+        levels = {key: matcher.kept.levels(row) for key, row in rows.items()}
         places = {key: place for place, (_, key, _) in enumerate(fit.draft.sample)}
-        matches = {key: recall.recollect(levels[key], left_out=row) for key, row in rows.items()}
-        return cls(fit, recall, chosen, rows, levels, places, matches)
+        matches = {key: matcher.match(levels[key], held_out=row) for key, row in rows.items()}
+        return cls(fit, matcher, chosen, rows, levels, places, matches)
 
-    def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[Judged]:
+    def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
         """What is said of their beginnings at each moment, given as its columns and stage."""
-        apart, judged = self._read(moments), []
+        held_out, judged = self._read(moments), []
         for number, (columns, stage) in enumerate(moments):
             matches = {}
             for key in self.chosen:
                 if (levels := self.levels[key]).shape[1] >= columns:
                     # What came over a touch is looked for once, in all of it: that is most of what asking costs.
                     noise = self.matches[key].noise
-                    matches[key] = self.recall.recollect(levels[:, :columns], left_out=self.rows[key], noise=noise)
+                    matches[key] = self.matcher.match(levels[:, :columns], held_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]
-            judged.append(self.fit.judged((columns, stage), number, scales, apart, matches))
+            judged.append(self.fit.judged((columns, stage), number, scales, held_out, matches))
         return judged
 
-    def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, LeftOut]:
+    def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, HeldOutScores]:
         """What each scale of windows says of their beginnings, by the moment's number."""
         fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
-        asked: Asked = {scale: {} for scale in fit.readouts if scale not in draft.views}
+        queries: Queries = {scale: {} for scale in fit.readouts if scale not in draft.views}
         for key in self.chosen if moments else ():
             assert extractor is not None
             touch, cache = stream_of(self.levels[key], extractor.sensor), WindowCache()
@@ -259,33 +262,28 @@ class _KeptTouches:
                     break
                 image = extractor.image(touch.first(columns / touch.sensor.rate))
                 for scale, mean in extractor.means(image, draft.stages[stage], cache=cache).items():
-                    asked[scale].setdefault(self.places[key], {})[number] = mean
-        return {scale: fit.left_out(scale, asked) for scale in asked}
+                    queries[scale].setdefault(self.places[key], {})[number] = mean
+        return {scale: fit.held_out_scores(scale, queries) for scale in queries}
 
-    def paced(self, pace: float, keys: Sequence[bytes], last: int) -> Judged:
+    def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
         """What the views and the kept touches say of some of them, had they been made so many times as fast."""
         fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
         assert extractor is not None
-        asked: Asked = {scale: {} for scale in views}
+        queries: Queries = {scale: {} for scale in views}
         matches = {}
         for key in keys:
             levels, noise = at_pace(self.levels[key], pace), self.matches[key].noise
-            matches[key] = self.recall.recollect(levels, left_out=self.rows[key], whole=True, noise=noise)
+            matches[key] = self.matcher.match(levels, held_out=self.rows[key], whole=True, noise=noise)
             image = extractor.image(stream_of(levels, extractor.sensor))
             for scale, mean in extractor.means(image, views).items():
-                asked[scale][self.places[key]] = {0: mean}
+                queries[scale][self.places[key]] = {0: mean}
         lengths = [self.levels[key].shape[1] / pace for key in keys]
         columns = max(1, round(float(np.median(lengths)))) if lengths else 1
-        apart = {scale: fit.left_out(scale, asked) for scale in views}
-        return fit.judged((columns, last), 0, views, apart, matches)
+        held_out = {scale: fit.held_out_scores(scale, queries) for scale in views}
+        return fit.judged((columns, last), 0, views, held_out, matches)
 
 
 def at_pace(levels: LevelArray, pace: float) -> LevelArray:
-    """A touch as if it had been made so many times as fast, by linear interpolation: (C, T) to (C, T / pace)."""
+    """A touch as if it had been made so many times as fast: (C, T) to (C, T / pace)."""
     columns = max(2, round(levels.shape[1] / pace))
-    places = np.linspace(0, levels.shape[1] - 1, columns)
-    first = places.astype(np.intp)
-    after, part = np.minimum(first + 1, levels.shape[1] - 1), places - first
-    low, high = levels[:, first], levels[:, after]
-    blended = np.rint(low * (1 - part) + high * part).astype(np.uint8)
-    return np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), blended)
+    return at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))

@@ -1,4 +1,4 @@
-"""Fusion: how far the readouts and the kept touches are believed beside each other, at each moment of a touch.
+"""Fusion: weights of the readouts and the kept touches beside each other, fitted at each moment of a touch.
 
 Which of them is right depends on how much was felt: of BioTac's touches the kept ones are after 0.1 s in 81 % and the
 readouts in 54, after 0.5 s in 83 and 94. So at each moment m, the last of them "complete",
@@ -14,7 +14,6 @@ them can rule out. All is fitted to one set of held-out touches, seen at all mom
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -22,143 +21,36 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import CLEAN
+from scroll_tactile.matching.match import Match
+from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.prediction.moments import (
+    APART,
+    LEAST_SPREAD,
+    WITHIN,
+    Fusion,
+    Moment,
+    Trajectories,
+    match_scores,
+    match_weight,
+    tempered,
+)
 from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
-from scroll_tactile.readouts.held_out import HeldOut
-from scroll_tactile.readouts.likelihood import CLEAN
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Recollection
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
-__all__ = [
-    "USUAL",
-    "Fusion",
-    "Judged",
-    "Moment",
-    "Trajectories",
-    "chosen_of",
-    "fuse",
-    "match_scores",
-    "moments_of",
-    "tempered",
-]
+__all__ = ["HeldOutMoment", "chosen_of", "full_match_weight", "fuse", "moments_of"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
 MOST_HELD_OUT = 96  # touches, each compared with all kept ones at every moment
-SURE = 0.99  # of the readouts' probability: a touch with less is compared with kept ones
-USUAL = 0.95  # of held-out touches are familiar
 PRIOR_TOUCHES = 0.5  # that half of what each is worth by itself counts as
 ALONE_TOUCHES = 2.0  # that what the kept touches are worth by themselves counts as
 SHARED_TOUCHES = 10.0  # that the weights of a moment and its neighbours count as
 LEAST_PRIOR = 1e-3
-ODD = 0.5  # touches more than those held out that are outliers
-APART = 1.25  # times a moment: the next is no nearer
-LEAST_SPREAD, LEAST_CERTAINTY, LEAST_STEEPNESS = 1e-9, 1e-3, 1e-9
-LEAST_FAMILIAR = 0.5  # of a touch that is just familiar: of a strange one that is compared at another pace
+PRIOR_OUTLIERS = 0.5  # touches more than those held out that are outliers
+LEAST_INFORMATION, LEAST_WEIGHT = 1e-3, 1e-9
 STEPS = 100  # of EM
-
-
-@dataclass(frozen=True)
-class Moment:
-    """How a touch is judged from so many columns on.
-
-    columns: from how many on; of the last moment, those of a complete touch. stage: of the readouts that judge.
-    calibration: how their scores are read. model, match: g, and r that gives β (see `steepness`). alone: r where noise,
-    or how unlike all others the touch is, leaves the readouts nothing to say. odd: ε. odd_model: ε of the readouts' own
-    probabilities. familiar: the distance beside a usual one that 19 of 20 stay below. surprise, spread: of the kept
-    touches, of known touches.
-    """
-
-    columns: int
-    stage: int
-    calibration: Calibration
-    model: float
-    match: float
-    alone: float
-    odd: float
-    odd_model: float
-    familiar: float
-    surprise: float
-    spread: float
-
-    def steepness(self, recollection: Recollection, familiarity: float) -> float:
-        """β = 1 / (1 + (1/r − 1) c) of a touch for which the readouts are believed by so much, c its certainty."""
-        beside, alone = (_steepness(r, recollection.certainty) for r in (self.match, self.alone))
-        share = (1 - recollection.trust) * familiarity
-        return share * beside + (1 - share) * alone
-
-    def familiarity(self, distance: float, own_time: bool) -> float:
-        """How far the readouts are believed of a touch beside a usual one, in (0, 1]: less, the further it is off.
-
-        own_time: whether it is compared with beginnings: then no less than one that is just familiar.
-        """
-        if not (np.isfinite(self.familiar) and np.isfinite(distance)):
-            return 1.0
-        least = (1.0 if own_time else LEAST_FAMILIAR) / max(self.familiar, 1.0)
-        return float(np.clip(1.0 / max(distance, LEAST_SPREAD), least, 1.0))
-
-    def suffices(self, probability: float, distance: float) -> bool:
-        """Whether the readouts' word is enough: their highest probability, and how far off the touch is.
-
-        With one touch of each, any other looks as if noise came over it: then no probability is too low.
-        """
-        return probability >= (SURE if self.odd_model else 0.0) and distance <= self.familiar
-
-    def matched_novelty(self, recollection: Recollection) -> float:
-        """The surprise of the kept touches, in units of its spread in known ones, as novelty is."""
-        return (recollection.surprise - self.surprise) / self.spread
-
-    def threshold(self, false_alarms: float) -> float:
-        """The novelty that a share `false_alarms` of known touches exceeds; see `Calibration.threshold`."""
-        return self.calibration.threshold(false_alarms)
-
-    @property
-    def novelties(self) -> FloatArray:
-        """Those of the held-out touches that it was calibrated on, ascending."""
-        return self.calibration.novelties
-
-
-@dataclass(frozen=True)
-class Trajectories:
-    """What is said of N held-out touches at each of m moments, the last not among them; NaN where one did not reach it.
-
-    chances: probability of the C materials, (N, m, C). novelty: (N, m). targets: the material of each, (N,).
-    """
-
-    chances: FloatArray
-    novelty: FloatArray
-    targets: IntArray
-
-
-@dataclass(frozen=True)
-class Fusion:
-    """The table of all moments, ascending, the last "complete"; recall: the kept touches, None where there are none.
-
-    paced: how complete touches are judged that were made at other paces, ascending by columns. trajectories: of the
-    touches that it was fitted to, at all moments before the last.
-    """
-
-    moments: tuple[Moment, ...]
-    paced: tuple[Moment, ...]
-    recall: Recall | None
-    trajectories: Trajectories
-
-    @property
-    def complete(self) -> Moment:
-        """How a complete touch is judged."""
-        return self.moments[-1]
-
-    def reaches(self, columns: int) -> bool:
-        """Whether a complete touch may be so long by its pace alone: about half to twice as long as usual."""
-        return self.paced[0].columns <= APART * columns and columns <= APART * self.paced[-1].columns
-
-    def at_pace(self, columns: int) -> Moment:
-        """How a complete touch is judged of which the pace, not the end, makes it so many columns long."""
-        return min(self.paced, key=lambda row: abs(math.log(row.columns / columns)))
-
-    def at(self, columns: int) -> Moment:
-        """The latest moment that so many columns reached; the first, where they reached none."""
-        return self.moments[max(0, bisect_right([moment.columns for moment in self.moments], columns) - 1)]
 
 
 def moments_of(milestones: Sequence[int], least: int, *, matched: bool) -> tuple[int, ...]:
@@ -177,8 +69,8 @@ def moments_of(milestones: Sequence[int], least: int, *, matched: bool) -> tuple
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What is said at one moment, from `columns` on, of held-out touches.
+class HeldOutMoment:
+    """What readouts and kept touches give at one moment, from `columns` on, of held-out touches.
 
     stage, calibration: of the readouts. held_out: what they say. matches: what the kept touches say, by key.
     """
@@ -186,15 +78,15 @@ class Judged:
     columns: int
     stage: int
     calibration: Calibration
-    held_out: HeldOut
-    matches: Mapping[bytes, Recollection]
+    held_out: HeldOutProbabilities
+    matches: Mapping[bytes, Match]
 
 
 @dataclass(frozen=True)
-class _Said:
-    """What is said at one moment of those of the touches, `reached`, that reached it; see `HeldOut` and `Trajectories`.
+class _FusionInputs:
+    """The inputs of a fit at one moment, of the touches `reached`, that reached it; see `Trajectories`.
 
-    logs: g's part, scores: β's for a certainty of `certainty`, both (n, C).
+    logs: g's part, scores: β's for an information of `information`, both (n, C).
     """
 
     reached: IntArray
@@ -202,55 +94,59 @@ class _Said:
     counts: FloatArray
     logs: FloatArray
     scores: FloatArray
-    certainty: float
+    information: float
     novelty: FloatArray
-    surprise: FloatArray
+    excess_loss: FloatArray
 
 
 def fuse(
-    recall: Recall | None,
-    judged: Sequence[Judged],
-    paced: Sequence[Judged],
+    matcher: TouchMatcher | None,
+    judged: Sequence[HeldOutMoment],
+    paced: Sequence[HeldOutMoment],
     chosen: Sequence[bytes],
     counts: Mapping[bytes, float],
     prior_weight: float,
 ) -> Fusion:
     """Fit the table to held-out touches.
 
-    judged: what is said by moment, ascending, the last of complete touches. paced: of complete ones at other paces,
+    judged: held-out touches by moment, ascending, the last of complete touches. paced: of complete ones at other paces,
     ascending by columns. chosen: the keys of the touches that are seen at all moments. counts: of those that are seen
     as complete ones, and how many touches each stands for. prior_weight: of the readouts' scores, where they are
-    believed as they are.
+    taken as they are.
     """
     names, even = judged[-1].held_out.names, dict.fromkeys(chosen, 1.0)
-    said = [_at(recall, one, names, even) for one in judged[:-1]]
-    said.append(_at(recall, judged[-1], names, counts))
-    others = [_at(recall, one, names, even) for one in paced]
-    moments = _rows(recall, judged, said, judged[-1], prior_weight)
-    of_paced = _rows(recall, paced, others, None, prior_weight)
+    inputs = [_at(matcher, one, names, even) for one in judged[:-1]]
+    inputs.append(_at(matcher, judged[-1], names, counts))
+    others = [_at(matcher, one, names, even) for one in paced]
+    moments = _rows(matcher, judged, inputs, judged[-1], prior_weight)
+    of_paced = _rows(matcher, paced, others, None, prior_weight)
     return Fusion(
-        tuple(moments), tuple(of_paced), recall, _trajectories(moments[:-1], said[:-1], len(chosen), len(names))
+        tuple(moments), tuple(of_paced), matcher, _trajectories(moments[:-1], inputs[:-1], len(chosen), len(names))
     )
 
 
 def _rows(
-    recall: Recall | None, judged: Sequence[Judged], said: Sequence[_Said], complete: Judged | None, prior_weight: float
+    matcher: TouchMatcher | None,
+    judged: Sequence[HeldOutMoment],
+    inputs: Sequence[_FusionInputs],
+    complete: HeldOutMoment | None,
+    prior_weight: float,
 ) -> list[Moment]:
     """Rows of the table, each drawn to its neighbours."""
     rows = []
     for i, one in enumerate(judged):
-        near = [other for other in said[max(0, i - 1) : i + 2] if len(other.targets) >= FEWEST]
-        rows.append(_fitted(one, said[i], near, recall, prior_weight, complete=one is complete))
+        near = [other for other in inputs[max(0, i - 1) : i + 2] if len(other.targets) >= FEWEST]
+        rows.append(_fitted(one, inputs[i], near, matcher, prior_weight, complete=one is complete))
     return rows
 
 
-def chosen_of(complete: HeldOut, recall: Recall | None) -> tuple[list[bytes], dict[bytes, float]]:
+def chosen_of(complete: HeldOutProbabilities, matcher: TouchMatcher | None) -> tuple[list[bytes], dict[bytes, float]]:
     """The held-out touches that are seen at all moments: of those that are kept, evenly over their keys.
 
     And those that are compared as complete ones, with how many each stands for: beside them the least sure, where it
-    matters what is believed; each of the others stands for many.
+    matters which has the weight; each of the others stands for many.
     """
-    kept = set() if recall is None else recall.rows().keys()
+    kept = set() if matcher is None else matcher.kept.rows().keys()
     ranked = [key for _, key in sorted(zip(complete.margins.tolist(), complete.keys, strict=True)) if key in kept]
     keys, unsure = sorted(ranked), ranked[: MOST_HELD_OUT // 2]
     places = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int)
@@ -260,8 +156,10 @@ def chosen_of(complete: HeldOut, recall: Recall | None) -> tuple[list[bytes], di
     return chosen, dict.fromkeys(unsure, 1.0) | dict.fromkeys(surer, each)
 
 
-def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Mapping[bytes, float]) -> _Said:
-    """What is said at one moment of some touches, and how many each stands for."""
+def _at(
+    matcher: TouchMatcher | None, judged: HeldOutMoment, names: Sequence[str], counts: Mapping[bytes, float]
+) -> _FusionInputs:
+    """The inputs at one moment of some touches, and how many each stands for."""
     chosen = list(counts)
     held = judged.held_out
     among, own = {key: i for i, key in enumerate(held.keys)}, {name: i for i, name in enumerate(held.names)}
@@ -270,119 +168,117 @@ def _at(recall: Recall | None, judged: Judged, names: Sequence[str], counts: Map
     if len(places) < len(names):
         at = []
     found = [among[chosen[number]] for number in at]
-    ways = [judged.matches[chosen[number]] for number in at]
-    matched = [] if recall is None else [match_scores(recall, names, way) for way in ways]
-    scores = np.array(matched).reshape(len(ways), len(names))
-    certainty = np.maximum([way.certainty for way in ways], LEAST_CERTAINTY)
-    usual = float(np.median(certainty)) if ways else 1.0
-    return _Said(
+    matches = [judged.matches[chosen[number]] for number in at]
+    matched = [] if matcher is None else [match_scores(matcher, names, match) for match in matches]
+    scores = np.array(matched).reshape(len(matches), len(names))
+    information = np.maximum([match.information for match in matches], LEAST_INFORMATION)
+    median = float(np.median(information)) if matches else 1.0
+    return _FusionInputs(
         np.array(at, dtype=np.intp),
         np.array([names.index(held.names[held.targets[i]]) for i in found], dtype=np.intp),
         np.array([counts[chosen[number]] for number in at]),
         held.logs[np.ix_(found, places)] if found else np.zeros((0, len(names))),
-        scores * (usual / certainty)[:, None],
-        usual,
+        scores * (median / information)[:, None],
+        median,
         held.novelty[found],
-        np.array([way.surprise for way in ways]),
+        np.array([match.excess_loss for match in matches]),
     )
 
 
-def match_scores(recall: Recall, names: Sequence[str], way: Recollection) -> FloatArray:
-    """What the kept touches say of some materials, (C,); the least of those of which none is kept."""
-    places, least = {name: i for i, name in enumerate(recall.materials)}, float(way.scores.min())
-    return np.array([way.scores[places[name]] if name in places else least for name in names])
-
-
 def _fitted(
-    judged: Judged, said: _Said, near: Sequence[_Said], recall: Recall | None, prior_weight: float, *, complete: bool
+    judged: HeldOutMoment,
+    inputs: _FusionInputs,
+    near: Sequence[_FusionInputs],
+    matcher: TouchMatcher | None,
+    prior_weight: float,
+    *,
+    complete: bool,
 ) -> Moment:
-    """A moment; near: what is said at the moments near it, this one among them, where that is enough."""
+    """A moment; near: the inputs at the moments near it, this one among them, where that is enough."""
     held, columns, stage, calibration = judged.held_out, judged.columns, judged.stage, judged.calibration
     own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
-    alone = _odd_share(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
-    familiar = float(np.quantile(held.distance, USUAL)) if complete and len(held.keys) else np.inf
-    if recall is None or len(said.targets) < FEWEST or said.logs.shape[1] < 2:
+    model_rate = _outlier_rate(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
+    distance_limit = float(np.quantile(held.distance, WITHIN)) if complete and len(held.keys) else np.inf
+    if matcher is None or len(inputs.targets) < FEWEST or inputs.logs.shape[1] < 2:
         # Where nothing can be held out, the kept touches decide only where the readouts do not.
         power = float(calibration.weights.sum()) / prior_weight
-        match = 0.5 if recall is None else match_of(power * UNSEEN, recall.measured.likelihood.table(CLEAN).certainty)
-        spread = 1.0 / UNMEASURED
-        return Moment(columns, stage, calibration, 1.0, match, match, alone, alone, np.inf, 0.0, spread)
+        weight = 0.5
+        if matcher is not None:
+            weight = full_match_weight(power * UNMATCHED, matcher.deviation.likelihood.table(CLEAN).information)
+        rates = model_rate, model_rate
+        return Moment(columns, stage, calibration, 1.0, weight, weight, *rates, np.inf, 0.0, 1.0 / UNMEASURED)
     together = _joined(near)
     prior = np.array([1.0, _worth(together) / 2])
     shared = np.maximum(_weights(together, prior, PRIOR_TOUCHES), LEAST_PRIOR * prior)
-    weights = _weights(said, shared, SHARED_TOUCHES)
-    by_itself = fit_weights(said.scores[:, None], said.targets.tolist(), prior[1:] * 2, ALONE_TOUCHES, said.counts)
-    match, lone = (match_of(float(value), said.certainty) for value in (weights[1], by_itself[0]))
-    surprise = float(np.average(said.surprise, weights=said.counts))
-    spread = max(float(np.average((said.surprise - surprise) ** 2, weights=said.counts)) ** 0.5, LEAST_SPREAD)
-    of_model = float(weights[0])
-    moment = Moment(columns, stage, calibration, of_model, match, lone, 0.0, alone, familiar, surprise, spread)
-    own = _chances(moment, said)[np.arange(len(said.targets)), said.targets]
-    return replace(moment, odd=_odd_share(own, said.logs.shape[1], said.counts))
+    weights = _weights(inputs, shared, SHARED_TOUCHES)
+    by_itself = fit_weights(
+        inputs.scores[:, None], inputs.targets.tolist(), prior[1:] * 2, ALONE_TOUCHES, inputs.counts
+    )
+    match, lone = (full_match_weight(float(value), inputs.information) for value in (weights[1], by_itself[0]))
+    excess_loss = float(np.average(inputs.excess_loss, weights=inputs.counts))
+    spread = max(float(np.average((inputs.excess_loss - excess_loss) ** 2, weights=inputs.counts)) ** 0.5, LEAST_SPREAD)
+    weighted = float(weights[0]), match, lone
+    moment = Moment(columns, stage, calibration, *weighted, 0.0, model_rate, distance_limit, excess_loss, spread)
+    own = _chances(moment, inputs)[np.arange(len(inputs.targets)), inputs.targets]
+    return replace(moment, outlier_rate=_outlier_rate(own, inputs.logs.shape[1], inputs.counts))
 
 
-UNSEEN = 1 / 16_000  # β where nothing can be held out: after one touch of each, beginnings are lost to a larger one
+UNMATCHED = 1 / 16_000  # β where nothing can be held out: after one touch of each, beginnings are lost to a larger one
 
 
-def _worth(said: _Said) -> float:
+def _worth(inputs: _FusionInputs) -> float:
     """The β at which the kept touches by themselves put their best material ahead of the next by AHEAD logits."""
-    best = np.sort(said.scores, axis=1)[:, -2:]
+    best = np.sort(inputs.scores, axis=1)[:, -2:]
     gap = float(np.median(best[:, 1] - best[:, 0]))
     return AHEAD / max(gap, AHEAD)
 
 
-def _joined(said: Sequence[_Said]) -> _Said:
-    """What is said at some moments as that at one; of one median certainty."""
-    parts = [np.concatenate([getattr(one, name) for one in said]) for name in ("targets", "counts", "logs", "scores")]
+def _joined(inputs: Sequence[_FusionInputs]) -> _FusionInputs:
+    """The inputs at some moments as those at one; of one median information."""
+    parts = [np.concatenate([getattr(one, name) for one in inputs]) for name in ("targets", "counts", "logs", "scores")]
     none = np.zeros(0)
-    return _Said(np.zeros(0, np.intp), parts[0], parts[1], parts[2], parts[3], 1.0, none, none)
+    return _FusionInputs(np.zeros(0, np.intp), parts[0], parts[1], parts[2], parts[3], 1.0, none, none)
 
 
-def _weights(said: _Said, prior: FloatArray, touches: float) -> FloatArray:
+def _weights(inputs: _FusionInputs, prior: FloatArray, touches: float) -> FloatArray:
     """g and β."""
-    return fit_weights(np.stack([said.logs, said.scores], axis=1), said.targets.tolist(), prior, touches, said.counts)
+    return fit_weights(
+        np.stack([inputs.logs, inputs.scores], axis=1), inputs.targets.tolist(), prior, touches, inputs.counts
+    )
 
 
-def _chances(moment: Moment, said: _Said) -> FloatArray:
+def _chances(moment: Moment, inputs: _FusionInputs) -> FloatArray:
     """The probability of the materials at a moment, (n, C), before outliers."""
-    logits = moment.model * said.logs + _steepness(moment.match, said.certainty) * said.scores
+    logits = moment.model_weight * inputs.logs + match_weight(moment.match_weight, inputs.information) * inputs.scores
     chances = np.exp(logits - logits.max(axis=1, keepdims=True))
     return np.asarray(chances / chances.sum(axis=1, keepdims=True))
 
 
-def _odd_share(own: FloatArray, materials: int, counts: FloatArray) -> float:
+def _outlier_rate(own: FloatArray, materials: int, counts: FloatArray) -> float:
     """ε of least log loss, where touches have such probabilities for their own material without it (EM)."""
     total = float(counts.sum())
-    odd = ODD / (total + 1)
+    rate = PRIOR_OUTLIERS / (total + 1)
     for _ in range(STEPS):
-        drawn = odd / materials
-        share = float((counts * drawn / ((1 - odd) * own + drawn)).sum())
-        odd = (share + ODD) / (total + 1)
-    return odd
+        drawn = rate / materials
+        outliers = float((counts * drawn / ((1 - rate) * own + drawn)).sum())
+        rate = (outliers + PRIOR_OUTLIERS) / (total + 1)
+    return rate
 
 
-def tempered(chances: FloatArray, odd: float) -> FloatArray:
-    """Probabilities (…, C) of which a share is left for touches that are unlike all others."""
-    return np.asarray((1 - odd) * chances + odd / chances.shape[-1])
+def full_match_weight(weight: float, information: float) -> float:
+    """r, of which β is the weight that was fitted, where the information is that of the touches it was fitted to."""
+    return 1 / (1 + max(1 / max(weight, LEAST_WEIGHT) - 1, 0.0) / max(information, LEAST_INFORMATION))
 
 
-def _steepness(match: float, certainty: float) -> float:
-    """β of r, where the certainty is this."""
-    return 1 / (1 + (1 / match - 1) * certainty)
-
-
-def match_of(steepness: float, certainty: float) -> float:
-    """r, of which β is the steepness that was fitted, where the certainty is that of the touches it was fitted to."""
-    return 1 / (1 + max(1 / max(steepness, LEAST_STEEPNESS) - 1, 0.0) / max(certainty, LEAST_CERTAINTY))
-
-
-def _trajectories(moments: Sequence[Moment], said: Sequence[_Said], touches: int, materials: int) -> Trajectories:
+def _trajectories(
+    moments: Sequence[Moment], inputs: Sequence[_FusionInputs], touches: int, materials: int
+) -> Trajectories:
     chances = np.full((touches, len(moments), materials), np.nan)
     novelty, targets = np.full((touches, len(moments)), np.nan), np.zeros(touches, np.intp)
-    for i, (moment, one) in enumerate(zip(moments, said, strict=True)):
+    for i, (moment, one) in enumerate(zip(moments, inputs, strict=True)):
         if not len(one.reached):
             continue
-        chances[one.reached, i] = tempered(_chances(moment, one), moment.odd)
+        chances[one.reached, i] = tempered(_chances(moment, one), moment.outlier_rate)
         novelty[one.reached, i], targets[one.reached] = one.novelty, one.targets
     reached = np.isfinite(novelty).any(axis=1)
     return Trajectories(chances[reached], novelty[reached], targets[reached])

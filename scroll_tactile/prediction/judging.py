@@ -1,14 +1,13 @@
 """A touch judged: by the readouts, and beside kept touches where it is not as those that were learned.
 
 A touch that the readouts know well is theirs alone. One that lies far from all that was learned, that they are not sure
-of, or that has another length than those learned, is compared with kept touches as well (see `readouts.recall`): with
+of, or that has another length than those learned, is compared with kept touches as well (see `matching.matcher`): with
 their beginnings, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by its
-own row of the table (see `prediction.fusion`), and they weigh exp(COUNTED e), e the evidence for each, per value.
-Channels that never change are filled in with what the kept touches have there, and the touch is judged again. Of noise
+own row of the table (see `prediction.moments`), and they weigh exp(COUNTED e), e the log-likelihood gain per value.
+Channels that never change are filled in with what the kept touches have there, and the touch is judged again. The
+readouts have less weight the more of the touch's deviation from kept ones is noise, t (`Match.noise_share`):
 
-    p_y ∝ exp(g (1 − t) log d_y + β S_y),
-
-t which part of how the touch differs from kept ones is noise (`Recollection.trust`): it takes the readouts' word.
+    p_y ∝ exp(g (1 − t) log d_y + β S_y).
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import LevelArray, levels_of
+from scroll_tactile.matching.match import Match
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.fusion import USUAL, match_scores, tempered
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
-from scroll_tactile.readouts.likelihood import LevelArray, levels_of
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Recollection
+from scroll_tactile.prediction.moments import WITHIN, match_scores, tempered
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.stream import Stream
 
@@ -32,85 +31,88 @@ __all__ = ["fused", "judged", "levels_seen"]
 
 FloatArray = npt.NDArray[np.float64]
 
-COUNTED = 30.0  # values, as which the evidence for a hypothesis counts: neighbours say the same
+COUNTED = 30.0  # values, as which the log-likelihood gain of a hypothesis counts: neighbours say the same
 TINY = 1e-300
 
 
 def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
-    """What a model says of an encoded touch, of which the candidates may be the materials."""
+    """The judgement of an encoded touch by a model; the candidates are what its material may be."""
     fusion, columns = model.fusion, encoded.columns
     assert fusion is not None
     usual: Hypothesis = "complete" if columns >= model.least else "beginning"
     alone = model.judge(candidates, encoded.means, columns, usual)
-    recall = fusion.recall
+    matcher = fusion.matcher
     usual_length = model.least <= len(encoded.stream) <= model.longest
-    if recall is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
+    if matcher is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
         return _by_readouts(model, encoded, alone, usual)
     levels = levels_seen(encoded.stream)
-    ways: list[tuple[Recollection, Hypothesis, bool]] = [(recall.recollect(levels), usual, True)]
-    if levels.shape[1] != recall.longest and fusion.reaches(levels.shape[1]):
-        whole = recall.recollect(levels, whole=True)
-        if whole.evidence > 0:  # at no other pace is it any more like what is kept
-            ways.append((whole, "paced", False))
-    filled = _filled(model, extractor, encoded, max((way for way, *_ in ways), key=lambda way: way.evidence))
+    matches: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
+    if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
+        whole = matcher.match(levels, whole=True)
+        if whole.log_likelihood_gain > 0:  # at no other pace is it any more like what is kept
+            matches.append((whole, "paced", False))
+    filled = _filled(
+        model, extractor, encoded, max((match for match, *_ in matches), key=lambda match: match.log_likelihood_gain)
+    )
     answers = []
-    for way, hypothesis, own_time in ways:
-        said = alone if filled is encoded and hypothesis == usual else None
+    for match, hypothesis, own_time in matches:
+        judgement = alone if filled is encoded and hypothesis == usual else None
         means = filled.means
         if hypothesis == "paced":
             kept = stream_of(levels_seen(filled.stream), extractor.sensor)
             means = extractor.means(extractor.image(kept), model.views)
-        said = said or model.judge(candidates, means, columns if own_time else len(encoded.stream), hypothesis)
-        answers.append(fused(recall, candidates, said, way, own_time=own_time))
-    evidence = np.array([way.evidence for way, *_ in ways])
-    weights = np.exp(COUNTED * (evidence - evidence.max()))
+        judgement = judgement or model.judge(
+            candidates, means, columns if own_time else len(encoded.stream), hypothesis
+        )
+        answers.append(fused(matcher, candidates, judgement, match, own_time=own_time))
+    gains = np.array([match.log_likelihood_gain for match, *_ in matches])
+    weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
     best = int(weights.argmax())
-    unusual = _unusual(model, encoded, ways[best][0], ways[best][1])
+    unusual = _unusual(model, encoded, matches[best][0], matches[best][1])
     return replace(answers[best], probability=probability / probability.sum(), unusual=unusual)
 
 
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
-    """The readouts' word. Where it is that the touch may be of nothing known, kept touches say what sets it apart."""
+    """The judgement by the readouts. Where the touch may be of nothing known, kept touches say what differs."""
     unusual = _of_length(model, encoded)
-    if model.recall is not None and alone.novelty > alone.moment.threshold(1 - USUAL):
-        unusual = _unusual(model, encoded, model.recall.recollect(levels_seen(encoded.stream)), hypothesis)
-    return replace(alone, probability=tempered(alone.probability, alone.moment.odd_model), unusual=unusual)
+    if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - WITHIN):
+        unusual = _unusual(model, encoded, model.matcher.match(levels_seen(encoded.stream)), hypothesis)
+    return replace(alone, probability=tempered(alone.probability, alone.moment.model_outlier_rate), unusual=unusual)
 
 
 def fused(
-    recall: Recall,
+    matcher: TouchMatcher,
     candidates: Sequence[str],
-    said: Judgement,
-    way: Recollection,
+    alone: Judgement,
+    match: Match,
     *,
     own_time: bool,
 ) -> Judgement:
-    """What the readouts and the kept touches say of a touch together.
+    """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts.
 
     own_time: whether it was compared with beginnings, and not with whole touches brought to its length.
     """
-    moment = said.moment
-    familiarity = moment.familiarity(said.distance, own_time)
-    logs = (1 - way.trust) * np.log(np.maximum(said.probability, TINY))
-    logits = familiarity * moment.model * logs + match_scores(recall, candidates, way) * moment.steepness(
-        way, familiarity
-    )
+    moment = alone.moment
+    distance_weight = moment.distance_weight(alone.distance, own_time)
+    logs = (1 - match.noise_share) * np.log(np.maximum(alone.probability, TINY))
+    match_weight = moment.match_weight_at(match, distance_weight)
+    logits = distance_weight * moment.model_weight * logs + match_scores(matcher, candidates, match) * match_weight
     chances = np.exp(logits - logits.max())
-    chances = tempered(chances / chances.sum(), moment.odd)
-    novelty = (1 - way.trust) * said.novelty + way.trust * moment.matched_novelty(way)
-    return replace(said, probability=chances, novelty=float(novelty))
+    chances = tempered(chances / chances.sum(), moment.outlier_rate)
+    novelty = (1 - match.noise_share) * alone.novelty + match.noise_share * moment.matched_novelty(match)
+    return replace(alone, probability=chances, novelty=float(novelty))
 
 
-def _unusual(model: Model, encoded: Encoded, way: Recollection, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
+def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
     """What sets a touch apart from those that were learned, if the kept touches explain it so."""
     found: list[Unusual] = list(_of_length(model, encoded))
     if found and hypothesis == "paced":
         found = ["faster" if found == ["shorter"] else "slower"]
     marks: tuple[tuple[Unusual, bool], ...] = (
-        ("noisy", way.trust > 0.5),
-        ("zero moved", way.moved),
-        ("channels dead", bool(way.stuck.any())),
+        ("noisy", match.noise_share > 0.5),
+        ("zero moved", match.moved),
+        ("channels dead", bool(match.stuck.any())),
     )
     return (*found, *(mark for mark, holds in marks if holds))
 
@@ -127,12 +129,12 @@ def levels_seen(stream: Stream) -> LevelArray:
     return levels_of(readings, stream.sensor)
 
 
-def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, recollection: Recollection) -> Encoded:
+def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: Match) -> Encoded:
     """The touch with its stuck channels as kept touches have them, where that changes any of its levels."""
     stream = encoded.stream
-    readings = recollection.filled(stream.readings, stream.sensor)
+    readings = match.filled(stream.readings, stream.sensor)
     if np.array_equal(levels_of(readings, stream.sensor), levels_of(stream.readings, stream.sensor)):
         return encoded
     readings.setflags(write=False)
-    needed = [*encoded.means]
-    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda columns: needed)
+    scales = [*encoded.means]
+    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda columns: scales)

@@ -12,16 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.fusion import Fusion, Moment
+from scroll_tactile.prediction.moments import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
-from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.leave_one_out import HeldOutScores
 from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
-from scroll_tactile.readouts.recall import Recall
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.sample import SampledTouch
@@ -80,8 +81,8 @@ class Model:
 
     names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there.
     views: the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are
-    read, as far as any touch reached it. fusion: how far readouts and kept touches are believed; None where nothing
-    was learned. conformal: how typical others are of the kept touches. apart: scale → the sampled touches held out;
+    read, as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing
+    was learned. conformal: how typical others are of the kept touches. held_out: scale → the sampled touches held out;
     sample: these. dependence: how far touches of one thing say the same. least: the columns of all but the shortest
     touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
 
@@ -96,7 +97,7 @@ class Model:
     views: list[Scale]
     readouts: dict[Scale, Readout]
     calibrations: list[Calibration]
-    apart: dict[Scale, LeftOut]
+    held_out: dict[Scale, HeldOutScores]
     sample: list[tuple[str, bytes, SampledTouch]]
     fusion: Fusion | None
     dependence: Dependence
@@ -110,9 +111,9 @@ class Model:
         self._of_all: dict[Scale, npt.NDArray[np.intp]] = {}
 
     @property
-    def recall(self) -> Recall | None:
+    def matcher(self) -> TouchMatcher | None:
         """The kept touches."""
-        return None if self.fusion is None else self.fusion.recall
+        return None if self.fusion is None else self.fusion.matcher
 
     @property
     def reads_memory(self) -> bool:
@@ -128,8 +129,8 @@ class Model:
         if readouts is None:
             readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
         other.readouts, other._of_all = readouts, {}
-        if self.fusion is not None and self.fusion.recall is not None and self.conformal is not None:
-            other.fusion = replace(self.fusion, recall=self.fusion.recall.copy())
+        if self.fusion is not None and self.fusion.matcher is not None and self.conformal is not None:
+            other.fusion = replace(self.fusion, matcher=self.fusion.matcher.copy())
             other.conformal = self.conformal.copy()
         return other
 
@@ -155,25 +156,25 @@ class Model:
                 continue
             if scale not in self.readouts or not self.readouts[scale].follow(changes):
                 return False
-        if self.recall is not None and not self._recalls(memory, self.recall):
+        if self.matcher is not None and not self._follow_kept(memory, self.matcher):
             return False
         self.names, self.longest = list(memory.statistics.materials), memory.statistics.longest
         self.known = frozenset(self.names)
         self._of_all = {}
         return True
 
-    def _recalls(self, memory: Memory, recall: Recall) -> bool:
+    def _follow_kept(self, memory: Memory, matcher: TouchMatcher) -> bool:
         """Take in what is kept in the memory now; False where that is nothing."""
         assert self.conformal is not None and self.fusion is not None and memory.kept is not None
-        kept, held = {(material, key) for material, key, _ in memory.kept}, recall.held
+        kept, held = {(material, key) for material, key, _ in memory.kept}, matcher.kept.held
         added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
         if not kept:
             return False
-        if recall.follow(added, held - kept):
+        if matcher.kept.follow(added, held - kept):
             self.conformal.follow(added, held - kept)
         else:  # one is longer than all before it: what they say of themselves stays
             touches = memory.kept.touches()
-            self.fusion = replace(self.fusion, recall=Recall(touches, recall.measured))
+            self.fusion = replace(self.fusion, matcher=TouchMatcher(KeptArrays.of(touches), matcher.deviation))
             self.conformal = Conformal(touches)
         return True
 
@@ -207,7 +208,7 @@ class Model:
             return self.fusion.complete
         return self.fusion.at_pace(columns)
 
-    def needed(self, candidates: Sequence[str], columns: int) -> list[Scale]:
+    def scales_for(self, candidates: Sequence[str], columns: int) -> list[Scale]:
         """The scales that are read to judge these candidates for a touch of so many columns."""
         decided = self._decided(candidates, len(self.plan.stages(columns)))
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]} | set(self.views))
@@ -222,7 +223,7 @@ class Model:
     ) -> Judgement:
         """Weigh the candidates for a touch by the readouts alone.
 
-        means: for each scale that is `needed`, its mean features in the codes' unit, (d,). columns: observed so far.
+        means: for each of the scales of `scales_for`, mean features in the codes' unit, (d,). columns: observed so far.
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
         A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
@@ -284,7 +285,7 @@ class Model:
         names: Sequence[str],
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
-        scales, calibration = self.scales(hypothesis, stage), self._read_by(hypothesis, moment, stage)
+        scales, calibration = self.scales(hypothesis, stage), self.calibration(hypothesis, moment, stage)
         readouts, codes = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
         places = [self._places(scale, names) for scale in scales]
         if len(names) <= EAGER:
@@ -293,19 +294,21 @@ class Model:
                 for readout, own, among in zip(readouts, codes, places, strict=True)
             ]
             best = [int(among[int(scores.argmax())]) for among, scores in zip(places, exact, strict=True)]
-            weights, distance = self._believed(calibration, readouts, codes, best)
+            weights, distance = self._weights_at(calibration, readouts, codes, best)
             return np.asarray(sum(weight * scores for weight, scores in zip(weights, exact, strict=True))), distance
         best = [readout.nearest(own, among)[0] for readout, own, among in zip(readouts, codes, places, strict=True)]
-        weights, distance = self._believed(calibration, readouts, codes, best)
+        weights, distance = self._weights_at(calibration, readouts, codes, best)
         parts = list(zip(weights, readouts, codes, places, strict=True))
 
         def exactly(some: npt.NDArray[np.intp]) -> FloatArray:
-            return np.asarray(sum(weight * readout.exact(own, among[some]) for weight, readout, own, among in parts))
+            return np.asarray(
+                sum(weight * readout.many.exact(own, among[some]) for weight, readout, own, among in parts)
+            )
 
         def bounds(some: npt.NDArray[np.intp], fine: int) -> tuple[FloatArray, FloatArray]:
             # One more scale each time, the views first: it is of them that the least is known before.
             found = [
-                readout.bounds(own, among[some], fine=len(parts) - i <= fine)
+                readout.many.bounds(own, among[some], fine=len(parts) - i <= fine)
                 for i, (_, readout, own, among) in enumerate(parts)
             ]
             guess, most = (sum(weight * one[i] for weight, one in zip(weights, found, strict=True)) for i in (0, 1))
@@ -317,25 +320,25 @@ class Model:
         logits[chosen] = scores
         return logits, distance
 
-    def _believed(
+    def _weights_at(
         self,
         calibration: Calibration,
         readouts: Sequence[Readout],
         codes: Sequence[FloatArray],
         best: Sequence[int],
     ) -> tuple[FloatArray, float]:
-        """How far each scale is believed of a touch, (S,), and the distance of `Judgement`.
+        """The weight of each scale for a touch, (S,), and the distance of `Judgement`.
 
         codes: of the touch, by scale; best: the place of the nearest material.
         """
-        if not np.isfinite(calibration.usual).all():
+        if not np.isfinite(calibration.median_distances).all():
             return calibration.weights, 0.0
         distances = np.array(
-            [readout.strangeness(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
+            [readout.diagonal_distance(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
         )
-        return calibration.believed(distances), float(calibration.relative(distances).min())
+        return calibration.weights_at(distances), float(calibration.relative(distances).min())
 
-    def _read_by(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
+    def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """How scores are read at a stage: of the moment's, or of materials that were never felt for so long.
 
         Or of a beginning where touches are so short that no moment comes before they are complete.
@@ -354,7 +357,7 @@ class Model:
     ) -> float:
         """The standardised novelty of a touch judged at a stage, if it is one of these materials that it may be."""
         distances = self._distances(self.scales(hypothesis, stage), means, names)
-        return float(self._read_by(hypothesis, moment, stage).novelty(distances))
+        return float(self.calibration(hypothesis, moment, stage).novelty(distances))
 
     def novelty(self, stage: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch by the windows of a stage alone."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.memory.gate import MemoryStore
-from scroll_tactile.memory.identity import Identity, usual_recall
+from scroll_tactile.memory.identity import Identity, default_kept_touches
 from scroll_tactile.memory.kept import Keeping, usual_kept
 from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
@@ -46,9 +46,9 @@ def reembedding(store: Store, embedding: Embedding) -> Reembedding:
     made = Identity.read(store)
     usual = usual_kept(made.sensor) if made.views else 0
     # As many as were asked for, none too; where nobody asked, as many as are usual with the embedding that it gets.
-    recall = usual_recall(made.sensor, embedding) if made.recall == usual else made.recall
-    identity = Identity.of(made.sensor, embedding, made.exemplars, made.augmentation, recall)
-    keeping = Keeping(made.sensor, recall)
+    kept_touches = default_kept_touches(made.sensor, embedding) if made.kept_touches == usual else made.kept_touches
+    identity = Identity.of(made.sensor, embedding, made.exemplars, made.augmentation, kept_touches)
+    keeping = Keeping(made.sensor, kept_touches)
     plan = window_plan(made.sensor, embedding)
     extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
 

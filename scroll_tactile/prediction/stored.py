@@ -21,17 +21,19 @@ from scroll_tactile import __version__
 from scroll_tactile.embeddings.banks import MOST_CHANNELS, ROUND, THRESHOLDS, Bank, bank_size
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.likelihood import LEVELS, Likelihood
+from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.fusion import Fusion, Moment, Trajectories
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.moments import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
-from scroll_tactile.readouts.conformal import Conformal
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.likelihood import LEVELS, Likelihood
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept, Measured
+from scroll_tactile.readouts.readout_arrays import readout_from_arrays, readout_to_arrays
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
 from store import Checkpoint
@@ -42,10 +44,21 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 NAME = "model"
-MADE_BY = f"{__version__}, 1"  # the release, and how it is written: the judge may differ in another
+MADE_BY = f"{__version__}, 2"  # the release, and how it is written: the judge may differ in another
 MOST_BANKS = 64
-OF_MOMENT = ("columns", "stage", "model", "match", "alone", "odd", "odd_model", "familiar", "surprise", "spread")
-OF_CALIBRATION = ("weights", "scale_novelty", "usual", "novelties")
+OF_MOMENT = (
+    "columns",
+    "stage",
+    "model_weight",
+    "match_weight",
+    "lone_match_weight",
+    "outlier_rate",
+    "model_outlier_rate",
+    "distance_limit",
+    "mean_excess_loss",
+    "loss_spread",
+)
+OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties")
 
 
 def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
@@ -59,7 +72,7 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     arrays: dict[str, npt.NDArray[Any]] = {
         "moments": np.array([[getattr(row, name) for name in OF_MOMENT] for row in rows], dtype=np.float64),
         "novelty-counts": np.array([len(each.novelties) for each in calibrations], dtype=np.int64),
-        "dependence": np.array([model.dependence.evidence, model.dependence.novelty]),
+        "dependence": np.array([model.dependence.log_probability, model.dependence.novelty]),
         "chances": fusion.trajectories.chances,
         "novelty": fusion.trajectories.novelty,
         "targets": fusion.trajectories.targets.astype(np.int64),
@@ -67,9 +80,9 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     arrays |= {name: np.concatenate([getattr(each, name) for each in calibrations]) for name in OF_CALIBRATION}
     for scale, readout in model.readouts.items():
         arrays[f"names-{scale}"] = np.array([places[name] for name in readout.names], dtype=np.int64)
-        arrays |= {f"{name}-{scale}": part for name, part in readout.to_arrays().items()}
-    if model.recall is not None and model.conformal is not None:
-        arrays |= _kept_to_arrays(model.recall, model.conformal, places)
+        arrays |= {f"{name}-{scale}": part for name, part in readout_to_arrays(readout).items()}
+    if model.matcher is not None and model.conformal is not None:
+        arrays |= _kept_to_arrays(model.matcher, model.conformal, places)
     attributes = {
         "made_by": MADE_BY,
         "readout": model.kind,
@@ -118,17 +131,19 @@ def with_banks(embedding: Embedding, arrays: Arrays) -> Embedding:
     return embedding.with_banks(banks)
 
 
-def _kept_to_arrays(recall: Recall, conformal: Conformal, places: Mapping[str, int]) -> dict[str, npt.NDArray[Any]]:
-    measured, rows = recall.measured, {touch: row for row, touch in enumerate(recall.touches)}
+def _kept_to_arrays(
+    matcher: TouchMatcher, conformal: Conformal, places: Mapping[str, int]
+) -> dict[str, npt.NDArray[Any]]:
+    deviation, rows = matcher.deviation, {touch: row for row, touch in enumerate(matcher.kept.touches)}
     return {
-        "kept-keys": np.array([list(key) for _, key in recall.touches], dtype=np.uint8),
-        "kept-materials": np.array([places[material] for material, _ in recall.touches], dtype=np.int64),
+        "kept-keys": np.array([list(key) for _, key in matcher.kept.touches], dtype=np.uint8),
+        "kept-materials": np.array([places[material] for material, _ in matcher.kept.touches], dtype=np.int64),
         "kept-order": np.array([rows[touch] for touch in conformal.touches], dtype=np.int64),
-        "kept-longest": np.array([recall.longest], dtype=np.int64),
-        "measured": np.array([measured.coherence, measured.energy, measured.most]),
-        "spread": measured.likelihood.spread,
-        "read": measured.likelihood.weights,
-        **{f"recall-{name}": part for name, part in recall.to_arrays().items()},
+        "kept-longest": np.array([matcher.kept.longest], dtype=np.int64),
+        "deviation": np.array([deviation.coherence, deviation.energy, deviation.most]),
+        "spread": deviation.likelihood.spread,
+        "read": deviation.likelihood.weights,
+        **{f"matcher-{name}": part for name, part in matcher.kept.to_arrays().items()},
         **{f"conformal-{name}": part for name, part in conformal.to_arrays().items()},
     }
 
@@ -151,9 +166,9 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     views = [view for view in memory.plan.views if view in readouts]
     reached = whole("calibrations", about.get("calibrations"), 1, len(stages))
     expect(all(scale in readouts for stage in stages[:reached] for scale in stage), "scales", "of stages", [*readouts])
-    recall, conformal = reader.kept() if "kept-keys" in arrays else (None, None)
-    expect(recall is None or bool(views), "kept-keys", "none without views", "some")
-    calibrations, fusion = reader.table(stages[:reached], views, recall)
+    matcher, conformal = reader.kept() if "kept-keys" in arrays else (None, None)
+    expect(matcher is None or bool(views), "kept-keys", "none without views", "some")
+    calibrations, fusion = reader.table(stages[:reached], views, matcher)
     dependence = reader.floats("dependence", (2,), 0.0, 1.0).tolist()
     return Model(
         kind=kind,
@@ -163,7 +178,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
         views=views,
         readouts=readouts,
         calibrations=calibrations,
-        apart={},
+        held_out={},
         sample=[],
         fusion=fusion,
         dependence=Dependence(*dependence),
@@ -234,9 +249,9 @@ class _Reader:
         expect(parts["shape"][0] < 1, f"shape-{scale}", "a share below 1", parts["shape"])
         own = parts["held"][:references]
         expect(bool((own == parts["reference"]).all()), f"held-{scale}", "the reference first", own)
-        return Readout.from_arrays(scale, names, parts, statistics)
+        return readout_from_arrays(scale, names, parts, statistics)
 
-    def kept(self) -> tuple[Recall, Conformal]:
+    def kept(self) -> tuple[TouchMatcher, Conformal]:
         """What is made of the kept touches, of those that the memory has still."""
         memory = self._memory.kept
         if memory is None:
@@ -244,29 +259,28 @@ class _Reader:
         levels, channels = {(touch.material, touch.key): touch.levels for touch in memory.touches()}, 0
         count = self._length("kept-materials", memory.capacity)
         keys = array(self._arrays, "kept-keys", ("uint8",), (count, KEY_BYTES))
-        own = counts("kept-materials", self._arrays["kept-materials"], 0, len(self._names) - 1)
-        touches = [(self._names[place], key.tobytes()) for place, key in zip(own.tolist(), keys, strict=True)]
+        materials = counts("kept-materials", self._arrays["kept-materials"], 0, len(self._names) - 1)
+        touches = [(self._names[place], key.tobytes()) for place, key in zip(materials.tolist(), keys, strict=True)]
         expect(len(set(touches)) == count, "kept-keys", "different touches", count)
         there = [row for row, touch in enumerate(touches) if touch in levels]
         expect(len(there) == len(levels) if self._same else bool(there), "kept-keys", "those that are kept", len(there))
         expect(len(there) == count or not self._same, "kept-keys", "no others than are kept", count)
-        kept = {row: Kept(*touches[row], levels[touches[row]]) for row in there}
+        kept = {row: KeptTouch(*touches[row], levels[touches[row]]) for row in there}
         channels, most = memory.made.sensor.channels, memory.made.most_columns
         longest = int(counts("kept-longest", array(self._arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
         lengths = {row: touch.levels.shape[1] for row, touch in kept.items()}
         expect(max(lengths.values()) <= longest, "kept-longest", "the longest", longest)
-        parts = self._parts("recall", Recall.parts(count, channels, longest))
+        parts = self._parts("matcher", KeptArrays.parts(count, channels, longest))
         columns = parts["columns"][there].tolist()
-        expect(columns == list(lengths.values()), "recall-columns", "their lengths", "others")
-        expect(bool(np.isfinite(parts["squares"]).all()), "recall-squares", "finite numbers", "others")
+        expect(columns == list(lengths.values()), "matcher-columns", "their lengths", "others")
+        expect(bool(np.isfinite(parts["squares"]).all()), "matcher-squares", "finite numbers", "others")
         spread, read = self.floats("spread", (LEVELS,), 1.0, LEVELS), self.floats("read", (LEVELS,), 0.0, 1.0)
         expect(read.sum() > 0, "read", "a level or more", "none")
-        coherence, energy, usual = self.floats("measured", (3,), 1e-9).tolist()
-        expect(max(coherence, energy) < 1e300, "measured", "finite numbers", [coherence, energy])
-        measured = Measured(Likelihood.of(spread, read), coherence, energy, usual)
-        recall = Recall.from_arrays(
-            list(kept.values()), {name: part[there] for name, part in parts.items()}, longest, measured
-        )
+        coherence, energy, most_energy = self.floats("deviation", (3,), 1e-9).tolist()
+        expect(max(coherence, energy) < 1e300, "deviation", "finite numbers", [coherence, energy])
+        deviation = NaturalDeviation(Likelihood.of(spread, read), coherence, energy, most_energy)
+        own = {name: part[there] for name, part in parts.items()}
+        matcher = TouchMatcher(KeptArrays.from_arrays(list(kept.values()), own, longest), deviation)
         order = self._places("kept-order", count, count).tolist()
         standing = [place for place, row in enumerate(order) if row in kept]
         parts = self._parts("conformal", Conformal.parts(count, channels, longest))
@@ -275,7 +289,7 @@ class _Reader:
         conformal = Conformal.from_arrays(
             [kept[order[place]] for place in standing], {name: part[standing] for name, part in parts.items()}, longest
         )
-        return recall, conformal
+        return matcher, conformal
 
     def _parts(self, what: str, expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[str, npt.NDArray[Any]]:
         return {
@@ -283,7 +297,7 @@ class _Reader:
         }
 
     def table(
-        self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], recall: Recall | None
+        self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], matcher: TouchMatcher | None
     ) -> tuple[list[Calibration], Fusion]:
         """How scores are read at each stage that touches reached, and at each moment."""
         rows = array(self._arrays, "moments", ("float64",), (None, len(OF_MOMENT)))
@@ -297,14 +311,14 @@ class _Reader:
         of_rows = [list(stages[int(stage)]) for stage in rows[:count, 1]]
         of_rows[-1] = [*stages[-1], *views]
         expect(rows[count - 1, 1] == len(stages) - 1, "moments", "the last stage, of a complete touch", rows[:, 1])
-        of_rows += [of_rows[-1] if recall is None else list(views)] * (len(rows) - count)
+        of_rows += [of_rows[-1] if matcher is None else list(views)] * (len(rows) - count)
         found = list(self._calibrations([*stages, *of_rows]))
         moments = [
             Moment(int(columns), int(stage), calibration, *rest)
             for (columns, stage, *rest), calibration in zip(rows.tolist(), found[len(stages) :], strict=True)
         ]
         trajectories = self._trajectories(count - 1)
-        fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), recall, trajectories)
+        fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), matcher, trajectories)
         return found[: len(stages)], fusion
 
     def _calibrations(self, scales: Sequence[Sequence[Scale]]) -> Iterator[Calibration]:
@@ -314,7 +328,7 @@ class _Reader:
         total, measuring = edges[-1]
         lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))
         counts("novelty-counts", lengths, 0, MOST_ROWS)
-        weights, usual = self.floats("weights", (total,), 0.0, 1e300), self.floats("usual", (total,), 0.0)
+        weights, medians = self.floats("weights", (total,), 0.0, 1e300), self.floats("median_distances", (total,), 0.0)
         shapes = self.floats("scale_novelty", (measuring, 2))
         expect(bool((shapes[:, 1] > 0).all()), "scale_novelty", "spreads above 0", "others")
         novelties = self.floats("novelties", (int(lengths.sum()),))
@@ -323,7 +337,7 @@ class _Reader:
             own, measured = (slice(edges[i][j], edges[i + 1][j]) for j in (0, 1))
             known = novelties[ends[i] : ends[i + 1]]
             expect(bool((np.diff(known) >= 0).all()), "novelties", "ascending", "others")
-            yield Calibration(weights[own], shapes[measured], known, usual[own])
+            yield Calibration(weights[own], shapes[measured], known, medians[own])
 
     def _trajectories(self, moments: int) -> Trajectories:
         chances = array(self._arrays, "chances", ("float64",), (None, moments, None))

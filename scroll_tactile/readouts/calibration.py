@@ -1,17 +1,17 @@
-"""Calibration: from scores to probabilities, and from distances to "never observed", by touches left out.
+"""Calibration: from scores to probabilities, and from distances to novelty, by held-out touches.
 
 Each sampled touch is scored by readouts that never observed it (`leave_one_out`). On these scores s one weight w_k a
-scale is fitted, which says how far each scale is to be believed and is a temperature (Platt 1999; Guo et al. 2017,
+scale is fitted, which is a temperature (Platt 1999; Guo et al. 2017,
 arXiv 1706.04599):
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
 w⁰ the prior and ρ the touches that it counts as: first one weight is fitted that all scales have in common, and then
 one each that is drawn to it. Scores of left-out touches are nearly collinear, and by themselves the weights run into a
-corner: all on one scale, that a longer touch may spoil. Where a touch is viewed in several ways, each is believed less
-the stranger the touch looks in it: its scores count as min(1, u_k / r_k) s_k, r_k its `strangeness` and u_k the median
-of that of touches left out. So the view that a change of speed, of zero or of length has spoilt leaves the word to
-others.
+corner: all on one scale, that a longer touch may spoil. Where a touch is viewed in several ways, a view has less weight
+the further the touch lies from its nearest material there: the view's scores count as min(1, u_k / r_k) s_k, r_k the
+squared Mahalanobis distance with diagonal scatter (`Readout.diagonal_distance`) and u_k its median over held-out
+touches. So a view that a change of speed, of zero or of length has spoilt leaves the decision to others.
 
 The novelty of known materials' touches is measured likewise, and an alarm's threshold is their conformal quantile (Vovk
 et al. 2005). All are functions of the statistics and the sample, so of what was observed and nothing else.
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import LeftOut
+from scroll_tactile.readouts.leave_one_out import HeldOutScores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 
 __all__ = [
@@ -65,22 +65,23 @@ class Calibration:
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
     scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
     novelties: sorted standardised novelty of known, left-out touches, shape (touches,).
-    usual: the median strangeness of known touches at each scale, shape (S,); infinite where none is doubted.
+    median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
+    touch counts alike.
     """
 
     weights: FloatArray
     scale_novelty: FloatArray
     novelties: FloatArray
-    usual: FloatArray
+    median_distances: FloatArray
 
-    def believed(self, strangeness: FloatArray, power: float = 1.0) -> FloatArray:
-        """The weights of the scales for touches of a strangeness, both of shape (…, S)."""
-        return np.asarray(self.weights * np.minimum(1.0, self.usual / np.maximum(strangeness, TINY)) ** power)
+    def weights_at(self, distances: FloatArray) -> FloatArray:
+        """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
+        return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
 
-    def relative(self, strangeness: FloatArray) -> FloatArray:
-        """Strangeness beside that of a usual known touch, both of shape (…, S)."""
+    def relative(self, distances: FloatArray) -> FloatArray:
+        """Diagonal distances in units of the median of known touches, both of shape (…, S)."""
         with np.errstate(over="ignore"):  # where known touches are all the same
-            return np.asarray(strangeness / np.maximum(self.usual, TINY))
+            return np.asarray(distances / np.maximum(self.median_distances, TINY))
 
     def novelty(self, distances: FloatArray) -> FloatArray:
         """Standardised novelty, shape (…,), of distances at the scales that measure it, shape (…, S')."""
@@ -112,7 +113,7 @@ UNMEASURED = 5.0  # spreads: where too little could be left out to measure the d
 def calibrate_stage(
     stage: int,
     materials: Sequence[str],
-    scales: Sequence[tuple[Readout, LeftOut]],
+    scales: Sequence[tuple[Readout, HeldOutScores]],
     kind: ReadoutName,
     *,
     viewed: bool = False,
@@ -120,49 +121,52 @@ def calibrate_stage(
     """Calibrate one stage.
 
     materials: of the sampled touches. scales: of those that judge, ascending, the readout and what it left out.
-    viewed: whether each is doubted where a touch looks strange in it.
+    viewed: whether a scale's weight falls with a touch's diagonal distance.
     """
-    apart = [left for _, left in scales]
+    held_out = [left for _, left in scales]
     measuring = [(readout, left) for readout, left in scales if readout.scale.measures_novelty]
-    names = common_names(apart)
-    touches = judged_touches(stage, apart) if len(names) > 1 else []
-    usual = np.full(len(apart), np.inf)
+    names = common_names(held_out)
+    touches = judged_touches(stage, held_out) if len(names) > 1 else []
+    medians = np.full(len(held_out), np.inf)
     if not touches:
-        unheld = np.full(len(apart), _unheld(names, scales, kind))
-        return Calibration(unheld, _assumed(measuring), np.zeros(0), usual)
-    scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in apart], axis=1)
+        unheld = np.full(len(held_out), _unheld(names, scales, kind))
+        return Calibration(unheld, _assumed(measuring), np.zeros(0), medians)
+    scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in held_out], axis=1)
     measured = [_picked(left, left.distances, names, touches, stage).min(axis=1) for _, left in measuring]
     distances = np.stack(measured, axis=1)
     own = {name: i for i, name in enumerate(names)}
     if viewed:
-        strange = np.stack([left.strangeness[[left.rows[touch, stage] for touch in touches]] for left in apart], axis=1)
-        usual = np.median(strange, axis=0)
-        scores *= np.minimum(1.0, usual / np.maximum(strange, TINY))[:, :, None]
-    weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(apart))
+        rows = [[left.rows[touch, stage] for touch in touches] for left in held_out]
+        away = np.stack(
+            [left.diagonal_distances[own_rows] for left, own_rows in zip(held_out, rows, strict=True)], axis=1
+        )
+        medians = np.median(away, axis=0)
+        scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
+    weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(held_out))
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed(measuring), np.zeros(0), usual)
+        return Calibration(weights, _assumed(measuring), np.zeros(0), medians)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
-    unsorted = Calibration(weights, shape, np.zeros(0), usual).novelty(distances)
+    unsorted = Calibration(weights, shape, np.zeros(0), medians).novelty(distances)
     # The mean of scales that agree only in part spreads less than one: back to units of its own spread.
     spread = shape[:, 1] * max(float(unsorted.std()), 1e-9)
     shape = np.stack([shape[:, 0], spread], axis=1)
-    own_novelty = Calibration(weights, shape, np.zeros(0), usual).novelty(distances)
-    return Calibration(weights, shape, np.sort(own_novelty), usual)
+    own_novelty = Calibration(weights, shape, np.zeros(0), medians).novelty(distances)
+    return Calibration(weights, shape, np.sort(own_novelty), medians)
 
 
-def common_names(apart: Sequence[LeftOut]) -> list[str]:
+def common_names(held_out: Sequence[HeldOutScores]) -> list[str]:
     """The reference materials of all of some scales, in alphabetical order."""
-    return sorted(set.intersection(*(set(left.names) for left in apart)))
+    return sorted(set.intersection(*(set(left.names) for left in held_out)))
 
 
-def judged_touches(stage: int, apart: Sequence[LeftOut]) -> list[int]:
+def judged_touches(stage: int, held_out: Sequence[HeldOutScores]) -> list[int]:
     """The sampled touches, by their place in the sample, that all of some scales left out at a stage."""
-    found = [{touch for touch, reached in left.rows if reached == stage} for left in apart]
+    found = [{touch for touch, reached in left.rows if reached == stage} for left in held_out]
     return sorted(set.intersection(*found))
 
 
-def _picked(left: LeftOut, values: FloatArray, names: list[str], touches: list[int], stage: int) -> FloatArray:
+def _picked(left: HeldOutScores, values: FloatArray, names: list[str], touches: list[int], stage: int) -> FloatArray:
     """The values of some touches at a stage for some of the materials, shape (touches, names)."""
     own = {name: i for i, name in enumerate(left.names)}
     rows = np.array([left.rows[touch, stage] for touch in touches], dtype=np.intp)
@@ -226,11 +230,11 @@ def fit_weights(
     return weights
 
 
-def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kind: ReadoutName) -> float:
+def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, HeldOutScores]], kind: ReadoutName) -> float:
     """The weight of each scale where no touch can be left out, most materials having one.
 
     Within-class scatter is then that within a touch alone, and touches of a material differ by far more: how far the
-    scores are to be believed nothing says but the scores between the materials. So a touch that is the mean of its
+    scores are to weigh nothing says but the scores between the materials. So a touch that is the mean of its
     material is ahead by so many logits, and what lies between two materials is as likely to be either.
     """
     share = PRIOR_WEIGHT[kind] / len(scales)
@@ -246,7 +250,7 @@ def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, LeftOut]], kin
     return min(share, AHEAD / max(float(np.median(ahead.min(axis=1))), TINY))
 
 
-def _assumed(scales: Sequence[tuple[Readout, LeftOut]]) -> FloatArray:
+def _assumed(scales: Sequence[tuple[Readout, HeldOutScores]]) -> FloatArray:
     """Without touches left out: the distances of the class means themselves, spread by their own mean size."""
     shapes = []
     for readout, _ in scales:

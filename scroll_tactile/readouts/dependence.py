@@ -1,8 +1,8 @@
-"""Several touches of one thing: how far they say the same, by touches of one material left out.
+"""Several touches of one thing: how far they are correlated, by held-out touches of one material.
 
 Touches of one material err alike, so k of them are not k independent witnesses. With ρ the correlation of two, the
-evidence of k counts as that of k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and the mean of k novelties spreads
-by √((1 + (k − 1) ρ') / k) of what one does:
+log-probabilities of k count as those of k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and the mean of k
+novelties spreads by √((1 + (k − 1) ρ') / k) of what one does:
 
     log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
 
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 __all__ = ["Dependence", "dependence_of"]
 
@@ -33,16 +33,16 @@ TINY = 1e-300
 
 @dataclass(frozen=True)
 class Dependence:
-    """How far touches of one material say the same: the correlations ρ of evidence and ρ' of novelty, from 0 to 1."""
+    """Correlations of two touches of one material, from 0 to 1: ρ of their log-probabilities, ρ' of their novelties."""
 
-    evidence: float = USUAL
+    log_probability: float = USUAL
     novelty: float = USUAL
 
     def probability(self, chances: Sequence[FloatArray]) -> FloatArray:
         """The probability of the candidates, (C,), from those by each touch."""
         # math.fsum is exact before it rounds: any order of the touches gives the same bits.
         logs = np.log(np.maximum(np.array(chances), TINY))
-        logits = np.array([math.fsum(column) for column in logs.T]) / (1 + (len(logs) - 1) * self.evidence)
+        logits = np.array([math.fsum(column) for column in logs.T]) / (1 + (len(logs) - 1) * self.log_probability)
         together = np.exp(logits - logits.max())
         return np.asarray(together / together.sum())
 
@@ -52,7 +52,7 @@ class Dependence:
         return math.fsum(novelties) / math.sqrt(count * (1 + (count - 1) * self.novelty))
 
 
-def dependence_of(held: HeldOut) -> Dependence:
+def dependence_of(held: HeldOutProbabilities) -> Dependence:
     """Fit both to held-out touches."""
     groups: dict[int, list[int]] = {}
     for row in sorted(range(len(held.keys)), key=held.keys.__getitem__):

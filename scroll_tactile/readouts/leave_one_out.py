@@ -33,7 +33,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["LeftOut", "Sampled", "left_out", "rows_at"]
+__all__ = ["HeldOutScores", "Sampled", "held_out_scores", "rows_at"]
 
 FloatArray = npt.NDArray[np.float64]
 Sampled = Iterable[tuple[str, bytes, SampledTouch]]
@@ -43,12 +43,12 @@ TOGETHER = 32  # touches: each step of all at once takes 8 MB
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class HeldOutScores:
     """What a scale says of the sampled touches, each left out, of N rows and the R reference materials.
 
     rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
     about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
-    strangeness: shape (N,), see `Readout.strangeness`, from the material of the highest score.
+    diagonal_distances: shape (N,), see `Readout.diagonal_distance`, from the material of the highest score.
     """
 
     rows: dict[tuple[int, int], int]
@@ -56,19 +56,19 @@ class LeftOut:
     scores: FloatArray
     z: FloatArray
     distances: FloatArray
-    strangeness: FloatArray
+    diagonal_distances: FloatArray
 
 
-def left_out(
+def held_out_scores(
     readout: Readout,
     sample: Sampled,
     stages: Sequence[Sequence[Scale]],
     kind: ReadoutName,
-    asked: Mapping[int, Mapping[int, FloatArray]] | None = None,
-) -> LeftOut:
+    queries: Mapping[int, Mapping[int, FloatArray]] | None = None,
+) -> HeldOutScores:
     """Leave each sampled touch out of the readout of a scale, which has followed nothing yet.
 
-    stages: the scales that judge at each stage, ascending. asked: by the touch's place in the sample, by any number,
+    stages: the scales that judge at each stage, ascending. queries: by the touch's place in the sample, by any number,
     what is scored in place of its own rows, codes (d,): numbers then stand for stages. Touches of materials that have
     no others are not there.
     """
@@ -77,14 +77,14 @@ def left_out(
     groups: dict[tuple[int, int], list[tuple[int, list[int], FloatArray, float, int, FloatArray]]] = {}
     for number, (material, _, touch) in enumerate(sample):
         judged = rows_at(touch, stages, readout.scale)
-        if not judged or material not in own or (asked is not None and not asked.get(number)):
+        if not judged or material not in own or (queries is not None and not queries.get(number)):
             continue
         weight = float(max(touch.learned[judged[0]], len(judged)))
         if readout.counts[readout.reference[own[material]]] > weight:
             rows = touch.rows[judged] - readout.origin
             at, scored = touch.pairs[judged, 0].tolist(), rows
-            if asked is not None:
-                at, scored = sorted(asked[number]), np.stack([asked[number][i] for i in sorted(asked[number])])
+            if queries is not None:
+                at, scored = sorted(queries[number]), np.stack([queries[number][i] for i in sorted(queries[number])])
                 scored = scored - readout.origin
             groups.setdefault((len(judged), len(at)), []).append((number, at, rows, weight, own[material], scored))
     index: dict[tuple[int, int], int] = {}
@@ -96,10 +96,10 @@ def left_out(
                 index[number, stage] = len(index)
         rows, weights, owners, scored = (np.stack([member[i] for member in members]) for i in (2, 3, 4, 5))
         assert leaving is not None
-        parts.append(leaving.out(rows, weights, owners, None if asked is None else scored))
+        parts.append(leaving.out(rows, weights, owners, None if queries is None else scored))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
-    strangeness = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
-    return LeftOut(index, names, joined[0], joined[1], joined[2], strangeness)
+    diagonal = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
+    return HeldOutScores(index, names, joined[0], joined[1], joined[2], diagonal)
 
 
 def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:
@@ -137,21 +137,21 @@ class _Leaving:
         rows: FloatArray,
         weights: FloatArray,
         own: npt.NDArray[np.intp],
-        asked: FloatArray | None = None,
+        queries: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Scores, z and distances, each of shape (M·q, R), and strangeness (M·q,), without the rows of each touch.
+        """Scores, z, distances, each of shape (M·q, R), and diagonal distances (M·q,), without the rows of each touch.
 
         rows: that each touch added, about the origin, (M, k, d). weights: the rows of the statistics that it stands
-        for, (M,). own: its material among the reference, (M,). asked: what is scored, about the origin, (M, q, d); the
-        rows themselves unless given.
+        for, (M,). own: its material among the reference, (M,). queries: what is scored, about the origin, (M, q, d);
+        the rows themselves unless given.
         """
         touches, count, dimension = rows.shape
-        asked = rows if asked is None else asked
-        queries = asked.shape[1]
+        queries = rows if queries is None else queries
+        count_scored = queries.shape[1]
         with one_thread():
             white = self.readout.system.whiten(rows.reshape(-1, dimension)).reshape(rows.shape)
-            scored = white if asked is rows else self.readout.system.whiten(asked.reshape(-1, dimension))
-            scored = scored.reshape(asked.shape)
+            scored = white if queries is rows else self.readout.system.whiten(queries.reshape(-1, dimension))
+            scored = scored.reshape(queries.shape)
             counts = self.counts[own]
             stretch = np.sqrt(weights * counts / (counts - weights))[:, None]
             share = np.sqrt(weights / count)[:, None, None]
@@ -172,12 +172,12 @@ class _Leaving:
         lda = gamma * (z - sizes[:, None, :] / 2)
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
         gain = self._as_new(white, columns, inner, weights, own)
-        lda[i, :, own] += gain if asked is rows else gain[:, -1:]  # what is asked counts as the complete touch
+        lda[i, :, own] += gain if queries is rows else gain[:, -1:]  # a query counts as the complete touch
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
         scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
-        strange = self._strangeness(rows, asked, weights, own, scores.argmax(axis=2))
-        flat = [part.reshape(touches * queries, -1) for part in (scores, centred, distances)]
-        return flat[0], flat[1], flat[2], strange.reshape(-1)
+        diagonal = self._diagonal_distances(rows, queries, weights, own, scores.argmax(axis=2))
+        flat = [part.reshape(touches * count_scored, -1) for part in (scores, centred, distances)]
+        return flat[0], flat[1], flat[2], diagonal.reshape(-1)
 
     def _as_new(
         self,
@@ -198,22 +198,22 @@ class _Leaving:
         far = np.square(away).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto @ inner)
         return np.asarray(self.readout.gamma * np.square(weights / counts)[:, None] * far / 2)
 
-    def _strangeness(
+    def _diagonal_distances(
         self,
         rows: FloatArray,
-        asked: FloatArray,
+        queries: FloatArray,
         weights: FloatArray,
         own: npt.NDArray[np.intp],
         best: npt.NDArray[np.intp],
     ) -> FloatArray:
-        """Of what is asked, (M, q, d), from the material `best` of each, (M, q), without the touch's own rows."""
+        """Diagonal distances of queries (M, q, d) from the material `best` of each, (M, q), without their touch."""
         means, counts = self.readout.means_solved()[0], self.counts[own]
         nearest = means[best]
         back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
         nearest -= (best == own[:, None])[:, :, None] * back[:, None]
-        strangeness: FloatArray = np.square(asked - nearest) @ self.readout.precision
+        distances: FloatArray = np.square(queries - nearest) @ self.readout.precision
         as_new = 1 - np.square(weights / counts)[:, None]
-        return np.where(best == own[:, None], as_new * strangeness, strangeness)
+        return np.where(best == own[:, None], as_new * distances, distances)
 
     def _whole(
         self, white: FloatArray, scored: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray
@@ -223,7 +223,7 @@ class _Leaving:
         And B of the touch's rows, (M, k, k), and of what is scored with them, (M, q, k). leaving: the columns that
         leave K, whitened, shape (M, k, d).
         """
-        count, half, asked = white.shape[1], white - self.center, scored - self.center
+        count, half, queries = white.shape[1], white - self.center, scored - self.center
         rest = (self.total - weights)[:, None]
         middle = half.mean(axis=1)
         columns = np.sqrt(self.excess) * _columns(half, share, np.sqrt(weights[:, None] * self.total / rest) * middle)
@@ -231,12 +231,12 @@ class _Leaving:
         if self.excess > 1:
             columns = np.concatenate([columns, np.sqrt(self.excess - 1) * leaving], axis=1)
             signs = np.repeat([-1.0, 1.0], count)
-        moved = asked + (weights[:, None] / rest * middle)[:, None, :]
+        moved = queries + (weights[:, None] / rest * middle)[:, None, :]
         inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
         onto = self._products(moved, columns)
         length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
         whole = length - np.einsum("nki,nki->nk", onto, onto @ inner)
-        leverage, across = (np.square(share) * (self._products(of, half) + 1 / self.total) for of in (half, asked))
+        leverage, across = (np.square(share) * (self._products(of, half) + 1 / self.total) for of in (half, queries))
         return whole, leverage, across
 
     def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
@@ -253,12 +253,12 @@ class _Leaving:
         across: FloatArray,
         weights: FloatArray,
     ) -> FloatArray:
-        fitted, asked = (self._fitted(rows) for rows in (white, scored))
+        fitted, queries = (self._fitted(rows) for rows in (white, scored))
         targets = np.zeros_like(fitted)
         targets[np.arange(len(own)), :, own] = 1.0
-        scores = asked + across @ np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - targets)
+        scores = queries + across @ np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - targets)
         # With the shares of all touches, as a new one is judged: that a material lacks the very touch that is judged
-        # would be all that a heavily shrunk ridge says, and its scores would be believed not at all.
+        # would be all that a heavily shrunk ridge says, and its scores would have no weight.
         counts = self.counts - weights[:, None] * np.eye(len(self.counts))[own]
         shares = counts / (self.total - weights)[:, None]
         return np.asarray(scores + (self.readout.shares - shares)[:, None, :])

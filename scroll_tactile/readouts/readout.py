@@ -22,170 +22,82 @@ H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.derived import Derived
-from scroll_tactile.readouts.pruning import Compared, PruningTable, likeliest, principal_directions
-from scroll_tactile.readouts.shrinkage import shrinkage
+from scroll_tactile.readouts.held_means import HeldMeans, class_means
+from scroll_tactile.readouts.many_materials import ManyMaterials
+from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
+from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
-__all__ = ["EAGER", "Change", "Readout", "ReadoutName", "Task"]
+__all__ = ["EAGER", "Change", "Numbers", "Readout", "ReadoutName", "held_at_first"]
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Places = npt.NDArray[np.intp]
 ReadoutName = Literal["lda", "ridge"]
 Change = tuple[str, npt.NDArray[np.int32], int]
 """A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
 EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
-FIRST_KNOWN = 256  # materials
-AT_ONCE = 64  # materials whose means are read at once: they stay in the processor's cache
 MOST_HELD = 2 * EAGER  # then those that were asked for are let go
 
 
-@dataclass(frozen=True)
-class Task:
-    """What a readout is solved from: the statistics at one moment, so that solving waits for nobody.
+def held_at_first(reference: Places, count: int) -> Places:
+    """The places that a readout of so many materials holds at first: the reference, and all where they are few."""
+    every: Places = np.arange(count if count <= EAGER else 0)
+    return np.concatenate([reference, np.setdiff1d(every, reference)])
 
-    packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
-    shape (C, d). reference: the places of the materials that novelty and calibration rest on. touches: n.
-    times: how many times as far as the formula says the scatter is shrunk.
+
+class Numbers(NamedTuple):
+    """What a readout was solved with and for.
+
+    reference: places. origin: shape (d,), in codes. counts: rows, shape (C,). share: ρ. penalty: P. precision: one over
+    the variance of each feature within materials as it was solved, shape (d,).
     """
 
-    scale: Scale
-    packed: IntArray
-    names: list[str]
-    counts: IntArray
-    sums: Sums
     reference: Places
-    touches: int
-    times: float = 1.0
-
-    @classmethod
-    def of(cls, statistics: Statistics, scale: Scale, reference: Sequence[str], times: float = 1.0) -> Task:
-        """The task of a scale that has rows. reference: materials, of which those with rows at the scale count."""
-        names = statistics.names(scale)
-        places = {name: place for place, name in enumerate(names)}
-        # Of no touch that was sampled may any have rows here: then the first materials that have.
-        known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
-        own = np.array(known, dtype=np.intp)
-        packed, (counts, sums) = statistics.second(scale).packed(), statistics.totals(scale)
-        return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
-
-    @property
-    def scatter(self) -> FloatArray:
-        """S_w, shape (d, d): the lower triangle, formed anew each time."""
-        return within_scatter(self.packed, self.counts, self.sums)
-
-    @property
-    def origin(self) -> FloatArray:
-        """The mean of all rows, shape (d,)."""
-        return np.asarray(
-            (self.sums.sum(axis=0, dtype=np.int64).astype(np.longdouble) / self.counts.sum()).astype(np.float64)
-        )
-
-
-def _class_means(counts: IntArray | FloatArray, sums: Sums, origin: FloatArray) -> FloatArray:
-    """The means of materials about an origin, shape (C, d), in codes."""
-    # About the integers next to the origin, exactly: a class mean keeps the digits that its distance from it needs.
-    near = np.rint(origin)
-    means: FloatArray = (sums - np.outer(counts.astype(np.int64), near.astype(np.int64))) / counts[:, None]
-    means -= origin - near
-    return means
+    origin: FloatArray
+    counts: FloatArray
+    share: float
+    penalty: float
+    precision: FloatArray
 
 
 class Readout:
     """The readout of one scale: of a task, and of the touches that came and went since.
 
-    names: the materials; one is known by its place among them. reference: places. origin: shape (d,), in codes.
-    counts: rows, shape (C,). share: ρ. penalty: P. precision: one over the variance of each feature within materials as
-    it was solved, shape (d,).
+    names: the materials; one is known by its place among them. The numbers are those of `Numbers`.
 
     Any number of threads may ask one of at most EAGER materials at once, and one thread one of more. It follows where
     nobody asks: otherwise a copy does.
 
     Some materials are held, with all that scores need: the reference first. The others are read from `statistics`.
-
-    Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """
 
-    def __init__(self, task: Task, statistics: Statistics | Snapshot, like: Readout | None = None) -> None:
-        """Solve it. like: an earlier one of the same reference, to which scores stay comparable."""
-        self.scale = task.scale
-        self.names = list(task.names)
-        self.places = {name: place for place, name in enumerate(self.names)}
-        self.reference = task.reference
-        self.origin = task.origin
-        self.counts = task.counts.astype(np.float64)
-        self.statistics = statistics
-        matrix = task.scatter
-        trace, dimension = float(np.trace(matrix)), len(matrix)
-        self.share = 0.0
-        if trace > 0:
-            self.share = shrinkage(matrix, task.touches, task.times) if like is None else like.share
-        all_places: Places = np.arange(len(self.names) if len(self.names) <= EAGER else 0)
-        places = np.concatenate([task.reference, np.setdiff1d(all_places, task.reference)])
-        means = _class_means(task.counts[places], task.sums[places], self.origin)
-        # Of single touches there is no scatter: then the nearest mean answers.
-        spread = trace / dimension * self.share / (1 - self.share)
-        self.penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
-        matrix[np.diag_indices(dimension)] += self.penalty
-        self.precision: FloatArray = self.counts.sum() / np.diagonal(matrix) if like is None else like.precision
-        self._held: dict[int, int] = {}  # place → row of these
-        self._room = np.empty((0, 2, dimension))
-        self._means, self._solved = self._room[:, 0], self._room[:, 1]  # m about the origin, and K⁻¹ m
-        self._sizes = np.empty(0)  # mᵀ K⁻¹ m
+    def __init__(
+        self,
+        scale: Scale,
+        names: Sequence[str],
+        statistics: Statistics | Snapshot,
+        system: System,
+        held_means: HeldMeans,
+        numbers: Numbers,
+        places: dict[str, int] | None = None,
+    ) -> None:
+        """places: material → its place, taken over like all arrays; of the names unless given."""
+        self.scale, self.names, self.statistics, self.system = scale, list(names), statistics, system
+        self.places = {name: place for place, name in enumerate(names)} if places is None else places
+        self.held_means = held_means
+        self.reference, self.origin, self.counts, self.share, self.penalty, self.precision = numbers
         self._derived: Derived | None = None
-        self._table: PruningTable | None = None
-        self._most_lost: float | None = None
-        self._compared: tuple[FloatArray, Compared] | None = None
-        with one_thread():
-            self.system = System(matrix)
-            self._hold(places, means)
-
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """What the answers for the materials that are held rest on: all but the names and K.
-
-        reference: places, (R,). held: places in the order of what is held, (H,). rows: their means about the origin,
-        and K⁻¹ times these, (H, 2, d). sizes: (H,). origin, precision: (d,). counts: (C,). shape: share and penalty.
-        """
-        return {
-            "reference": self.reference,
-            "held": np.array(sorted(self._held, key=self._held.__getitem__), dtype=np.int64),
-            "rows": self._room[: len(self._held)],
-            "sizes": self._sizes,
-            "origin": self.origin,
-            "precision": self.precision,
-            "counts": self.counts,
-            "shape": np.array([self.share, self.penalty]),
-        }
-
-    @classmethod
-    def from_arrays(
-        cls, scale: Scale, names: Sequence[str], arrays: Mapping[str, npt.NDArray[Any]], statistics: Statistics
-    ) -> Readout:
-        """The readout of which `to_arrays` gave the arrays, which are taken over; it can follow nothing."""
-        readout = cls.__new__(cls)
-        readout.scale, readout.names, readout.statistics = scale, list(names), statistics
-        readout.places = {name: place for place, name in enumerate(names)}
-        readout.reference, readout.origin, readout.counts = arrays["reference"], arrays["origin"], arrays["counts"]
-        readout.share, readout.penalty = arrays["shape"].tolist()
-        readout.precision, readout._sizes, readout._room = arrays["precision"], arrays["sizes"], arrays["rows"]
-        readout._held = {place: row for row, place in enumerate(arrays["held"].tolist())}
-        readout._means, readout._solved = readout._room[:, 0], readout._room[:, 1]
-        readout._derived = readout._table = readout._most_lost = readout._compared = None
-        readout.system = System.unkept(len(readout.origin))
-        return readout
+        self._many: ManyMaterials | None = None
 
     @property
     def gamma(self) -> float:
@@ -206,38 +118,22 @@ class Readout:
     def means_solved(self) -> tuple[FloatArray, FloatArray]:
         """The means of the reference materials about the origin, and K⁻¹ times them, each of shape (R, d)."""
         count = len(self.reference)
-        return self._means[:count], self._solved[:count]
+        return self.held_means.means[:count], self.held_means.solved[:count]
 
     def _hold(self, places: Sequence[int] | Places, means: FloatArray) -> None:
         """Hold more materials, whose means about the origin are these, shape (k, d)."""
-        solved, first = self.system.solve(means), len(self._held)
-        last = first + len(means)
-        if last > len(self._room):
-            # Room for half as many more, if there are any: materials that are asked for come one by one. All of it
-            # before any is kept: there may be no memory for it.
-            room = np.empty((last if not first else last + last // 2, 2, means.shape[1]))
-            room[:first] = self._room[:first]
-            self._room = room
-        self._room[first:last, 0], self._room[first:last, 1] = means, solved
-        self._sizes = np.append(self._sizes[:first], np.einsum("hd,hd->h", means, solved))
-        self._means, self._solved = self._room[:last, 0], self._room[:last, 1]
-        self._held |= {int(place): first + i for i, place in enumerate(places)}
+        self.held_means.add(places, means, self.system.solve(means))
 
     def held(self, places: Sequence[int] | Places) -> Places:
         """Where the materials at some places are held; those that were not are from now on."""
-        absent = [int(place) for place in places if int(place) not in self._held]
+        absent = [int(place) for place in places if int(place) not in self.held_means.rows]
         if absent:
-            if len(self._held) + len(absent) > MOST_HELD:
-                self._let_go()
-                absent = [int(place) for place in places if int(place) not in self._held]
+            if len(self.held_means.rows) + len(absent) > MOST_HELD:
+                self.held_means.keep(self.reference)
+                absent = [int(place) for place in places if int(place) not in self.held_means.rows]
             with one_thread():
-                self._hold(absent, self._read_means(absent))
-        return np.array([self._held[int(place)] for place in places], dtype=np.intp)
-
-    def _let_go(self) -> None:
-        count = len(self.reference)
-        self._held = {int(place): i for i, place in enumerate(self.reference)}
-        self._means, self._solved, self._sizes = self._means[:count], self._solved[:count], self._sizes[:count]
+                self._hold(absent, self.read_means(absent))
+        return np.array([self.held_means.rows[int(place)] for place in places], dtype=np.intp)
 
     def follow(self, changes: Sequence[Change]) -> bool:
         """Take in touches that came and went, which the statistics have already.
@@ -247,7 +143,9 @@ class Readout:
         """
         if sum(len(rows) for _, rows, _ in changes) > self.system.room:
             return False
-        self._derived = self._compared = self._most_lost = None
+        self._derived = None
+        if self._many is not None:
+            self._many.forget()
         come: dict[str, list[FloatArray]] = {}
         for material, rows, sign in changes:
             if sign > 0:
@@ -269,8 +167,7 @@ class Readout:
     def copy(self) -> Readout:
         """Another readout of the same: what comes to it does not come to this one."""
         other = self._branch()
-        other.names, other.places = [*self.names], dict(self.places)
-        other._derived, other._table = self._derived, None if self._table is None else self._table.copy()
+        other._derived, other._many = self._derived, None if self._many is None else self._many.copy(other)
         return other
 
     def without(self, material: str, rows: npt.NDArray[np.float64]) -> Readout:
@@ -284,52 +181,49 @@ class Readout:
         return other
 
     def _branch(self) -> Readout:
-        """Another readout, which follows by itself as long as no material is new to it."""
-        other = copy.copy(self)
-        other.system = self.system.branch()
-        other.counts, other._held, other._sizes = self.counts.copy(), dict(self._held), self._sizes.copy()
-        other._room = np.stack([self._means, self._solved], axis=1)
-        other._means, other._solved = other._room[:, 0], other._room[:, 1]
-        other._derived = other._compared = other._table = other._most_lost = None
-        return other
+        """Another readout with nothing derived, which follows by itself."""
+        numbers = Numbers(self.reference, self.origin, self.counts.copy(), self.share, self.penalty, self.precision)
+        system, held = self.system.branch(), self.held_means.copy()
+        return Readout(self.scale, self.names, self.statistics, system, held, numbers, dict(self.places))
 
     def _hold_before(self, changes: Sequence[Change]) -> None:
         """Hold the materials that will change, as they were before."""
         absent: dict[str, list[Change]] = {}
         for change in changes:
             place = self.places.get(change[0])
-            if place is not None and place not in self._held:
+            if place is not None and place not in self.held_means.rows:
                 absent.setdefault(change[0], []).append(change)
         for name, pending in absent.items():
             later = sum((sign * rows.sum(axis=0, dtype=np.int64) for _, rows, sign in pending), np.int64(0))
             total, place = self.statistics.sums(self.scale, [name]) - later, self.places[name]
-            self._hold([place], _class_means(self.counts[[place]], total, self.origin))
+            self._hold([place], class_means(self.counts[[place]], total, self.origin))
 
     def _follow(self, changed: Mapping[str, FloatArray], sign: int) -> None:
         """Take in rows of some materials, (k, d) about the origin, at once: one product in place of many thin ones."""
+        held_means = self.held_means
         columns, known, fresh = [], [], []
-        for material, rows in changed.items():
-            place, mean = self.places.get(material), rows.mean(axis=0)
+        for material, came in changed.items():
+            place, mean = self.places.get(material), came.mean(axis=0)
             if place is None:
-                columns.append(columns_of(rows, None))
-                fresh.append((material, mean, len(rows)))
+                columns.append(columns_of(came, None))
+                fresh.append((material, mean, len(came)))
                 continue
-            held, before = self._held[place], self.counts[place]
-            self.counts[place] = after = before + sign * len(rows)
-            step = mean - self._means[held]
-            columns.append(columns_of(rows, np.sqrt(before * len(rows) / after) * step))
-            known.append((place, held, sign * len(rows) / after * step))
-        self._border(np.concatenate([self._means[:0], *columns]), sign)
+            held, before = held_means.rows[place], self.counts[place]
+            self.counts[place] = after = before + sign * len(came)
+            step = mean - held_means.means[held]
+            columns.append(columns_of(came, np.sqrt(before * len(came) / after) * step))
+            known.append((place, held, sign * len(came) / after * step))
+        self._border(np.concatenate([held_means.means[:0], *columns]), sign)
         for _, held, step in known:
-            self._means[held] += step
-        rows_held = [held for _, held, _ in known]
-        self._solved[rows_held] = self.system.solve(self._means[rows_held])
-        self._sizes[rows_held] = np.einsum("hd,hd->h", self._means[rows_held], self._solved[rows_held])
+            held_means.means[held] += step
+        rows = [held for _, held, _ in known]
+        held_means.solved[rows] = self.system.solve(held_means.means[rows])
+        held_means.sizes[rows] = np.einsum("hd,hd->h", held_means.means[rows], held_means.solved[rows])
         for material, mean, count in fresh:
             self._hold([self._new_place(material, count)], mean[None])
-        if self._table is not None:
+        if self._many is not None:
             places = np.array([self.places[material] for material in changed], dtype=np.intp)
-            self._table.put(places, self.system.whiten(self._means[self.held(places)]))
+            self._many.put(places, self.system.whiten(held_means.means[self.held(places)]))
 
     def _new_place(self, material: str, count: int) -> int:
         place = self.places[material] = len(self.names)
@@ -344,10 +238,17 @@ class Readout:
         if not len(columns):
             return
         leaving, corner = self.system.border(columns, sign)
-        onto = self._means @ leaving.T
+        onto = self.held_means.means @ leaving.T
         moved = onto @ corner
-        self._solved -= moved @ leaving
-        self._sizes -= (moved * onto).sum(axis=1)
+        self.held_means.solved -= moved @ leaving
+        self.held_means.sizes -= (moved * onto).sum(axis=1)
+
+    @property
+    def many(self) -> ManyMaterials:
+        """All of many materials, of which not all are held, by bounds of their scores."""
+        if self._many is None:
+            self._many = ManyMaterials(self)
+        return self._many
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""
@@ -358,7 +259,7 @@ class Readout:
 
     def _reference_z(self, codes: FloatArray) -> FloatArray:
         """z of the reference materials about the origin, shape (R,)."""
-        return np.asarray(self.gamma * (self._solved[: len(self.reference)] @ (codes - self.origin)))
+        return np.asarray(self.gamma * (self.held_means.solved[: len(self.reference)] @ (codes - self.origin)))
 
     def scores(self, codes: FloatArray, places: Sequence[int] | Places, kind: ReadoutName) -> FloatArray:
         """The scores of the materials at some places, not too many to hold, for codes of shape (d,), shape (k,)."""
@@ -370,19 +271,19 @@ class Readout:
         return np.asarray(self.gamma * self._scores(codes, self.held(places)))
 
     def _scores(self, codes: FloatArray, held: Places) -> FloatArray:
-        solved = self._solved if 4 * len(held) > len(self._solved) else None  # picking rows copies them
+        every, sizes = self.held_means.solved, self.held_means.sizes
         row = codes - self.origin
-        z = self._solved[held] @ row if solved is None else (solved @ row)[held]
-        return np.asarray(z - self._sizes[held] / 2)
+        z = (every @ row)[held] if 4 * len(held) > len(every) else every[held] @ row  # picking rows copies them
+        return np.asarray(z - sizes[held] / 2)
 
-    def strangeness(self, codes: FloatArray, place: int) -> float:
-        """The squared distance of codes (d,) from a material's mean, in variances of each feature as it was fitted.
+    def diagonal_distance(self, codes: FloatArray, place: int) -> float:
+        """The squared Mahalanobis distance of codes (d,) from a material's mean, by diagonal scatter as fitted.
 
         It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
         differs in.
         """
-        held = self._held.get(place)
-        mean = self._read_means([place])[0] if held is None else self._means[held]
+        held = self.held_means.rows.get(place)
+        mean = self.read_means([place])[0] if held is None else self.held_means.means[held]
         away = codes - self.origin - mean
         return float(np.square(away) @ self.precision)
 
@@ -390,8 +291,8 @@ class Readout:
         """The scores of materials as weights (d, k) of codes about the origin, and offsets (k,); see `scores`."""
         held = self.held([self.places[name] for name in names])
         if kind == "lda":
-            return self.gamma * self._solved[held].T, -self.gamma * self._sizes[held] / 2
-        derived, weights = self.derived(), self.gamma * self._solved[: len(self.reference)].T
+            return self.gamma * self.held_means.solved[held].T, -self.gamma * self.held_means.sizes[held] / 2
+        derived, weights = self.derived(), self.gamma * self.held_means.solved[: len(self.reference)].T
         background = derived.background[held]
         mixing = background - np.outer(background.sum(axis=1), self.shares)
         return weights @ mixing.T, np.asarray(self.shares[held] - background @ derived.towards)
@@ -411,8 +312,8 @@ class Readout:
     def _beyond_nearest(self, codes: FloatArray) -> tuple[int, FloatArray]:
         """The nearest of the reference materials, by its place among them, and v, shape (R,)."""
         count, row = len(self.reference), codes - self.origin
-        near = int((self._solved[:count] @ row - self._sizes[:count] / 2).argmax())
-        beyond = self.gamma * (self._solved[:count] @ (row - self._means[near]))
+        near = int((self.held_means.solved[:count] @ row - self.held_means.sizes[:count] / 2).argmax())
+        beyond = self.gamma * (self.held_means.solved[:count] @ (row - self.held_means.means[near]))
         beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
         return near, np.asarray(beyond - self.shares @ beyond)
 
@@ -422,55 +323,15 @@ class Readout:
         if len(chosen) <= EAGER:
             scores = self.scores(codes, chosen, "lda")
         else:
+            many = self.many
             chosen, scores = likeliest(
-                chosen, lambda some, fine: self.bounds(codes, some, fine=fine > 0), lambda some: self.exact(codes, some)
+                chosen, lambda some, fine: many.bounds(codes, some, fine=fine > 0), lambda some: many.exact(codes, some)
             )
         best = int(scores.argmax())
         return int(chosen[best]), float(scores[best])
 
-    def bounds(self, codes: FloatArray, places: Places, *, fine: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Guesses of the scores "lda" of some of many materials, and what they are at most, each of shape (k,)."""
-        compared = self._beside(codes)
-        if fine:
-            compared.refine(places)
-        return compared.guess[places], compared.most[places]
-
-    def _beside(self, codes: FloatArray) -> Compared:
-        """Codes (d,) beside all of many materials; the latest are kept."""
-        if self._compared is None or self._compared[0] is not codes:
-            with one_thread():
-                if self._table is None:
-                    self._table = self._tabled()
-                if self._most_lost is None:
-                    self._most_lost = self.system.most_lost
-                white = self.system.towards((codes - self.origin)[None])
-                solved = self.system.solve_whitened(white)[0]
-                compared = self._table.compared(white[0], self._most_lost, self.gamma, solved)
-            compared.take(self.reference, self.scores(codes, self.reference, "lda"))  # they are held
-            self._compared = codes, compared
-        return self._compared[1]
-
-    def exact(self, codes: FloatArray, places: Places) -> FloatArray:
-        """The scores "lda" of any of many materials, which are not held for it, for codes of shape (d,), shape (k,)."""
-        compared = self._beside(codes)
-        unknown = places[~compared.known[places]]
-        with one_thread():
-            for first in range(0, len(unknown), AT_ONCE):
-                some = unknown[first : first + AT_ONCE]
-                means, sizes = self._read_means(some), compared.table.sizes[some]
-                if self.system.rank:
-                    sizes = sizes - self.system.lost(self.system.whiten(means))
-                compared.take(some, self.gamma * (means @ compared.solved - sizes / 2))
-        return compared.guess[places]
-
-    def _read_means(self, places: Iterable[int]) -> FloatArray:
+    def read_means(self, places: Iterable[int]) -> FloatArray:
         """The means of materials at some places about the origin, (k, d), from the memory."""
         names = [self.names[place] for place in places]
         counts, sums = self.statistics.counts(self.scale, names), self.statistics.sums(self.scale, names)
-        return _class_means(counts, sums, self.origin)
-
-    def _tabled(self) -> PruningTable:
-        whiten, count = self.system.whiten, len(self.names)
-        blocks = (range(first, min(first + EAGER, count)) for first in range(0, count, EAGER))
-        directions = principal_directions(whiten(self.means_solved()[0]))
-        return PruningTable(directions, (whiten(self._read_means(block)) for block in blocks), count)
+        return class_means(counts, sums, self.origin)

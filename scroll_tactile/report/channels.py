@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 
 __all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "Channel", "channels_of", "drift"]
 

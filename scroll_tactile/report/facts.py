@@ -18,12 +18,12 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.held_out_touches import HeldOutTouch, held_out_touches
 from scroll_tactile.prediction.model import Model, enough_memory
-from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.drawing import as_counted
 from scroll_tactile.report.growing import Growing, Soon, chosen, growing, soon
 from scroll_tactile.report.knowledge import MOST_NEAR, Mistake, Trust, mistakes, separations, trust_in
@@ -85,19 +85,19 @@ class MemoryFacts:
                 return Draft.of(self.learner.memory, self.learner.settings.readout).fit(None)
 
     @cached_property
-    def unseen(self) -> list[UnseenTouch]:
+    def held_out(self) -> list[HeldOutTouch]:
         """What is said of touches that were left out."""
-        return [] if self.model is None else unseen_touches(self.model, self.learner.settings.false_alarms)
+        return [] if self.model is None else held_out_touches(self.model, self.learner.settings.false_alarms)
 
     @cached_property
     def trust(self) -> Trust | None:
         """How far answers can be believed; None where nothing could be left out."""
-        return trust_in(self.unseen) if self.unseen else None
+        return trust_in(self.held_out) if self.held_out else None
 
     @cached_property
     def mistakes(self) -> list[Mistake]:
         """All confusions, the most frequent first."""
-        return mistakes(self.unseen)
+        return mistakes(self.held_out)
 
     @cached_property
     def near(self) -> tuple[list[str], npt.NDArray[np.float64]]:
@@ -107,7 +107,7 @@ class MemoryFacts:
         return separations(self.learner, self.model)
 
     @cached_property
-    def kept(self) -> list[Kept]:
+    def kept(self) -> list[KeptTouch]:
         """The kept touches, in the order of observation where that is known."""
         touches = self.learner.memory.kept.touches() if self.learner.memory.kept is not None else []
         place = {row.key: row.sequence for row in self.journal}
@@ -132,7 +132,7 @@ class MemoryFacts:
     @cached_property
     def rule(self) -> DecisionRule | None:
         """When an answer is safe to act on; None where nothing can be left out, or embedded."""
-        if self.model is None or not self.unseen or self.unread:
+        if self.model is None or not self.held_out or self.unread:
             return None
         return decision_rule(self.model, self.risk)
 
@@ -146,13 +146,13 @@ class MemoryFacts:
     @cached_property
     def growing(self) -> tuple[list[Growing], str]:
         """How answers to a few left-out touches grow, or why there are none."""
-        if self.model is None or not self.unseen:
+        if self.model is None or not self.held_out:
             return [], self.nothing_left_out
         if self.rule is None:
             return [], "the embedding is not at hand; see below."
         sensor, kept = self.learner.sensor, {touch.key: touch for touch in self.kept}
         held = {} if kept else {exemplar.key: exemplar for own in self.exemplars.values() for exemplar in own}
-        touches = chosen(self.unseen, kept or held, sensor.camera)
+        touches = chosen(self.held_out, kept or held, sensor.camera)
         if not touches:
             return [], "of no touch that could be left out the readings are kept."
         streams = {

@@ -11,13 +11,13 @@ import numpy as np
 from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.prediction.answer import answer
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.held_out_touches import HeldOutTouch
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.unseen import UnseenTouch
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.readouts.leave_one_out import rows_at
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.statistics.moments import one_thread
@@ -101,14 +101,14 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
     return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(said.targets))
 
 
-def chosen(unseen: Sequence[UnseenTouch], keys: Iterable[bytes], camera: bool) -> list[UnseenTouch]:
+def chosen(held_out: Sequence[HeldOutTouch], keys: Iterable[bytes], camera: bool) -> list[HeldOutTouch]:
     """A few touches to look at: the two hardest, and others from hard to easy, of different materials if there are."""
     known = set(keys)
     ranked = sorted(
-        (touch for touch in unseen if touch.key in known),
+        (touch for touch in held_out if touch.key in known),
         key=lambda touch: (touch.probability[touch.names.index(touch.material)], touch.key),
     )
-    count, picked, materials = CAMERA_TOUCHES if camera else TOUCHES, list[UnseenTouch](), set[str]()
+    count, picked, materials = CAMERA_TOUCHES if camera else TOUCHES, list[HeldOutTouch](), set[str]()
     wanted = [0, 1, *(round(i) for i in np.linspace(0.1, 0.95, count - 2) * (len(ranked) - 1))] if ranked else []
     for place in wanted[:count]:
         rest = [touch for touch in ranked[place:] if touch not in picked]
@@ -124,7 +124,7 @@ def growing(
     model: Model,
     extractor: FeatureExtractor,
     rule: DecisionRule,
-    touches: Sequence[UnseenTouch],
+    touches: Sequence[HeldOutTouch],
     streams: Mapping[bytes, Stream],
 ) -> list[Growing]:
     """The answers to some touches, each as if it had never been observed. streams: the touches, by key.
@@ -143,21 +143,21 @@ def growing(
 
 
 @contextmanager
-def _without(model: Model, touch: UnseenTouch) -> Iterator[Model]:
+def _without(model: Model, touch: HeldOutTouch) -> Iterator[Model]:
     """The model as if it had never observed a touch, nor kept it, but for how it is calibrated."""
     sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
     with one_thread():
         other = _left_by(model, touch.material, sampled)
-    recall = model.recall
-    if recall is None or (touch.material, touch.key) not in recall.held:
+    matcher = model.matcher
+    if matcher is None or (touch.material, touch.key) not in matcher.kept.held:
         yield other
         return
-    kept = Kept(touch.material, touch.key, recall.levels(recall.rows()[touch.key]))
-    recall.follow((), [(touch.material, touch.key)])
+    kept = KeptTouch(touch.material, touch.key, matcher.kept.levels(matcher.kept.rows()[touch.key]))
+    matcher.kept.follow((), [(touch.material, touch.key)])
     try:
         yield other
     finally:
-        recall.follow([kept])
+        matcher.kept.follow([kept])
 
 
 def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:
@@ -182,6 +182,6 @@ def _answers(
     counts = {round(part * len(stream)) for part in parts} if len(rule.moments) < 2 else {*rule.moments, len(stream)}
     for count in sorted({min(max(fewest_readings(sensor), first + 1, count), len(stream)) for count in counts}):
         beginning = stream.first(count / sensor.rate)
-        encoded = extractor.encode(beginning, model.longest, lambda columns: model.needed(names, columns))
+        encoded = extractor.encode(beginning, model.longest, lambda columns: model.scales_for(names, columns))
         prediction = answer(model, extractor, names, [(encoded, None)], learner.settings.false_alarms)
         yield encoded.columns, prediction

@@ -57,7 +57,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     trust = facts.trust
     if trust is None:
         return facts.lacks("What it mixes up", facts.nothing_left_out)
-    tested = {touch.material for touch in facts.unseen}
+    tested = {touch.material for touch in facts.held_out}
     words = (
         f"{trust.count} touches of {len(tested)} materials were left out one by one: {trust.right:.1%} right "
         f"(95% interval {trust.low:.1%} to {trust.high:.1%})."
@@ -79,7 +79,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     names += sorted(tested - set(names))
     place = {name: i for i, name in enumerate(names)}
     counts = np.zeros((len(names), len(names)), np.int64)
-    for touch in facts.unseen:
+    for touch in facts.held_out:
         if touch.answer in place:
             counts[place[touch.material], place[touch.answer]] += 1
     caption = (
@@ -92,7 +92,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
 def _by_name(facts: MemoryFacts) -> str:
     """The touches that were called something else, by where they came from; nothing where nobody noted it."""
     sources = {row.key: row.source for row in facts.journal if row.source is not None}
-    wrong = sorted((touch for touch in facts.unseen if touch.answer != touch.material), key=lambda touch: touch.key)
+    wrong = sorted((touch for touch in facts.held_out if touch.answer != touch.material), key=lambda touch: touch.key)
     rows = [[sources[t.key], t.material, t.answer, f"{t.confidence:.0%}"] for t in wrong if t.key in sources]
     if not rows:
         return ""
@@ -110,8 +110,8 @@ def trusted(facts: MemoryFacts) -> str:
         f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is usual of perfect answers. "
         "Upright lines are 95% intervals."
     )
-    drawn = reliability(bins_of(facts.unseen), [touch.confidence for touch in facts.unseen])
-    strange = unknown_by(facts.unseen)
+    drawn = reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out])
+    strange = unknown_by(facts.held_out)
     words = (
         f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} are meant to be. A "
         "material far above that varies more than it was shown to: teach more of it."

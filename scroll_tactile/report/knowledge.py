@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.prediction.held_out_touches import HeldOutTouch
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.unseen import UnseenTouch
 from scroll_tactile.report.charts import Bin
 from scroll_tactile.statistics.moments import one_thread
 
@@ -64,11 +64,11 @@ class Mistake:
     confidence: float
 
 
-def mistakes(unseen: Sequence[UnseenTouch]) -> list[Mistake]:
+def mistakes(held_out: Sequence[HeldOutTouch]) -> list[Mistake]:
     """All confusions, the most frequent first."""
-    tested = Counter(touch.material for touch in unseen)
+    tested = Counter(touch.material for touch in held_out)
     wrong: dict[tuple[str, str], list[float]] = {}
-    for touch in unseen:
+    for touch in held_out:
         if touch.answer != touch.material:
             wrong.setdefault((touch.material, touch.answer), []).append(touch.confidence)
     found = [
@@ -112,15 +112,15 @@ class Trust:
         return self.error > max(0.05, 2 * self.chance)
 
 
-def trust_in(unseen: Sequence[UnseenTouch]) -> Trust:
+def trust_in(held_out: Sequence[HeldOutTouch]) -> Trust:
     """How far answers can be believed, by one or more touches left out."""
-    confidence = np.array([touch.confidence for touch in unseen])
-    right = np.array([touch.answer == touch.material for touch in unseen])
-    count = len(unseen)
+    confidence = np.array([touch.confidence for touch in held_out])
+    right = np.array([touch.answer == touch.material for touch in held_out])
+    count = len(held_out)
     low, high = interval(int(right.sum()), count)
     draws = np.random.default_rng(0).random((200, count)) < confidence
     chance = float(np.mean([_error(confidence, drawn) for drawn in draws]))
-    unknown = float(np.mean([not touch.known for touch in unseen]))
+    unknown = float(np.mean([not touch.known for touch in held_out]))
     mean = float(confidence.mean())
     return Trust(count, float(right.mean()), low, high, mean, _error(confidence, right), chance, unknown)
 
@@ -135,10 +135,10 @@ def _error(confidence: FloatArray, right: npt.NDArray[np.bool_]) -> float:
     return float(np.abs(gaps).sum() / len(confidence))
 
 
-def bins_of(unseen: Sequence[UnseenTouch]) -> list[Bin]:
+def bins_of(held_out: Sequence[HeldOutTouch]) -> list[Bin]:
     """Answers by their probability, in equal steps of it."""
-    confidence = np.array([touch.confidence for touch in unseen])
-    right = np.array([touch.answer == touch.material for touch in unseen])
+    confidence = np.array([touch.confidence for touch in held_out])
+    right = np.array([touch.answer == touch.material for touch in held_out])
     places, found = _places(confidence), []
     for place in np.unique(places):
         own = places == place
@@ -147,9 +147,9 @@ def bins_of(unseen: Sequence[UnseenTouch]) -> list[Bin]:
     return found
 
 
-def unknown_by(unseen: Sequence[UnseenTouch]) -> list[tuple[str, int, int]]:
+def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
     """Material, its left-out touches that were called unknown, and all of them; the largest share first."""
-    tested = Counter(touch.material for touch in unseen)
-    strange = Counter(touch.material for touch in unseen if not touch.known)
+    tested = Counter(touch.material for touch in held_out)
+    strange = Counter(touch.material for touch in held_out if not touch.known)
     found = [(name, strange[name], count) for name, count in tested.items()]
     return sorted(found, key=lambda row: (-row[1] / row[2], row[0]))

@@ -121,7 +121,7 @@ def _trusts(facts: MemoryFacts) -> Card:
         f"Mean probability {trust.confidence:.1%}, ECE {trust.error:.3f}. It would call {trust.unknown:.0%} of its own "
         "touches unknown."
     )
-    tested = len({touch.material for touch in facts.unseen})
+    tested = len({touch.material for touch in facts.held_out})
     more += f" Measured among {tested} of {len(facts.counts)} materials." if tested < len(facts.counts) else ""
     if trust.count < FEW:
         return "look", heading, f"{trust.right:.0%} right, by only {trust.count} touches", more
@@ -163,8 +163,8 @@ def _known(facts: MemoryFacts) -> str:
     for row in facts.journal:
         if row.state != "retracted":
             first.setdefault(row.material, row.time)
-    tested = Counter(touch.material for touch in facts.unseen)
-    right = Counter(touch.material for touch in facts.unseen if touch.answer == touch.material)
+    tested = Counter(touch.material for touch in facts.held_out)
+    right = Counter(touch.material for touch in facts.held_out if touch.answer == touch.material)
     rows = [
         [
             name,

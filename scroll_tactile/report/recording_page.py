@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from scroll_tactile import __version__
 from scroll_tactile.errors import FieldError, InputError
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.recordings import Contents, Interval, Recording, describe, read, touches
 from scroll_tactile.recordings.presets import find
 from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, Channel, channels_of

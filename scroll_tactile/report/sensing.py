@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, Channel, channels_of
 from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
 from scroll_tactile.report.page import Card, name_of, note, table
@@ -34,7 +34,7 @@ def listed(channels: Sequence[Channel], most: int = 8) -> str:
     return ", ".join(numbers[:most]) + (f" and {len(numbers) - most} more" if len(numbers) > most else "")
 
 
-def channel_card(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> Card:
+def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> Card:
     """What is to be seen first of the channels."""
     if sensor.camera:
         return "none", "Channels", "a camera", "Its pixels are not looked at one by one."
@@ -57,20 +57,20 @@ def card_of(found: Sequence[Channel], by: str) -> Card:
     return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
-def _channels(sensor: Sensor, kept: Sequence[Kept], ordered: bool) -> list[Channel]:
+def _channels(sensor: Sensor, kept: Sequence[KeptTouch], ordered: bool) -> list[Channel]:
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
     levels, materials = [touch.levels for touch in kept], [touch.material for touch in kept]
     return channels_of(levels, materials, (low < 0) & (high > 0), ordered=ordered)
 
 
-def channel_section(sensor: Sensor, kept: Sequence[Kept], *, ordered: bool) -> str:
+def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> str:
     """All channels, and their levels over the touches."""
     if sensor.camera:
         return note("Not shown: a camera has no channels that could be dead one by one; look at its frames below.")
     if not kept:
         return note(
             "Not shown: no readings of touches are kept. A memory has some once it observed touches, unless it was "
-            "made with recall=0."
+            "made with kept_touches=0."
         )
     found = _channels(sensor, kept, ordered)
     means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)
@@ -164,7 +164,7 @@ def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str
     return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
 
 
-def exemplar_pictures(sensor: Sensor, kept: Sequence[Kept], exemplars: Mapping[str, Sequence[Exemplar]]) -> str:
+def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapping[str, Sequence[Exemplar]]) -> str:
     """A small picture of one touch of each material, of as many as there is room for."""
     found: dict[str, str] = {}
     if sensor.camera:
@@ -176,7 +176,7 @@ def exemplar_pictures(sensor: Sensor, kept: Sequence[Kept], exemplars: Mapping[s
             if touch.material not in found and len(found) < MOST_PICTURES:
                 found[touch.material] = png(_thinned(_touch(touch.levels), LONGEST))
     if not found:
-        return note("Not shown: no readings are kept, neither as exemplars nor for recall.")
+        return note("Not shown: no readings are kept, neither as exemplars nor to match with.")
     names = {*exemplars, *(touch.material for touch in kept)}
     what = (
         "The middle frame of one touch of each material."

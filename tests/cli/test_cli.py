@@ -67,7 +67,7 @@ class TestMemory:
         text = run("inspect", memory).stdout
         assert digest_of(text) == found["digest"]
         assert "4 of 2 materials" in text
-        assert "kept for recall: 4 touches" in text
+        assert "kept touches: 4" in text
 
     def test_what_it_is_made_of_is_described_and_composed(self, memory: Path, files: Path) -> None:
         assert "nothing was described yet" in run("compose", memory, files / "silk.csv").output

@@ -156,7 +156,7 @@ class History(RuleBasedStateMachine):
     def agrees(self, learner: Any) -> None:
         """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""
         assert seen(learner) == expected(self.state)
-        made = {"embedding": EMBEDDINGS[self.state.embedding], "readout": learner.settings.readout, "recall": 5}
+        made = {"embedding": EMBEDDINGS[self.state.embedding], "readout": learner.settings.readout, "kept_touches": 5}
         whole = fed(self.state.pairs, learner.descriptions, again=True, **made)
         if self.state.tuned is None:
             assert contents(learner) == contents(whole)

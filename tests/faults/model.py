@@ -60,7 +60,7 @@ def warm() -> None:
 
 
 # Fewer kept touches than are observed, so that what was left out of them has to come back.
-_settings: dict[str, Any] = SETTINGS | {"recall": 5}
+_settings: dict[str, Any] = SETTINGS | {"kept_touches": 5}
 
 
 def settings() -> dict[str, Any]:
@@ -381,7 +381,7 @@ def _pool(learner: TactileLearner) -> str:
 
 
 def _kept(learner: TactileLearner) -> str:
-    """A digest of the arrays of the touches kept for recall."""
+    """A digest of the arrays of the kept touches."""
     arrays, materials = learner._ledger.memory.kept.to_arrays()
     digest = hashlib.sha256(repr(materials).encode())
     for name in sorted(arrays):

@@ -39,7 +39,7 @@ class Tiny:
 
 
 EMBEDDINGS = {name: Tiny(name) for name in ("own", "other")}
-SETTINGS: dict[str, Any] = {"sensor": PAD, "exemplars": 1, "recall": 3}
+SETTINGS: dict[str, Any] = {"sensor": PAD, "exemplars": 1, "kept_touches": 3}
 
 
 @functools.cache

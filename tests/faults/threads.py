@@ -53,7 +53,7 @@ from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import DescriptionError, InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.readouts.likelihood import LEVELS, Likelihood
+from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.sample import TouchSample
@@ -139,8 +139,8 @@ def learned_by(model: Any) -> Learned:
     for scale, readout in model.readouts.items():
         sums = np.empty((len(readout.names), len(readout.origin)))
         for place, name in enumerate(readout.names):
-            if (held := readout._held.get(place)) is not None:
-                sums[place] = (readout._means[held] + readout.origin) * readout.counts[place]
+            if (held := readout.held_means.rows.get(place)) is not None:
+                sums[place] = (readout.held_means.means[held] + readout.origin) * readout.counts[place]
             else:
                 sums[place] = readout.statistics.sums(scale, [name])[0]
         found[int(scale)] = learned_of(readout.names, readout.counts, sums)

@@ -13,16 +13,21 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.rows import DESCRIBE, OBSERVE, RETRACT, unspanned
-from scroll_tactile.readouts.conformal import Conformal
-from scroll_tactile.readouts.recollection import Kept
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
 Array = npt.NDArray[np.float64]
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=0.0, high=1.0, unit="N", duration=0.4)
-SETTINGS: dict[str, Any] = {"sensor": SKIN, "embedding": Kernels(seed=0, dimension=64), "exemplars": 4, "recall": 500}
+SETTINGS: dict[str, Any] = {
+    "sensor": SKIN,
+    "embedding": Kernels(seed=0, dimension=64),
+    "exemplars": 4,
+    "kept_touches": 500,
+}
 LENGTH = 20  # readings of a touch
 
 
@@ -123,7 +128,8 @@ class Truth:
         keeping = self._learner._empty_memory().kept.made  # type: ignore[union-attr]
         if row not in self._conformal:
             kept = [
-                Kept(name, key, keeping.levels(self.stream(key).readings)) for name, key in self.states[row].touches
+                KeptTouch(name, key, keeping.levels(self.stream(key).readings))
+                for name, key in self.states[row].touches
             ]
             self._conformal[row] = Conformal(kept)
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}

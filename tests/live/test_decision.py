@@ -10,7 +10,7 @@ from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
-from scroll_tactile.prediction.fusion import Trajectories
+from scroll_tactile.prediction.moments import Trajectories
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction
 
@@ -111,7 +111,7 @@ def test_few_touches_are_decided_at_their_end_alone(touches):
 
 
 def test_a_memory_that_keeps_no_touches_has_a_rule():
-    rule = rule_of(learned(recall=0), 0.05)
+    rule = rule_of(learned(kept_touches=0), 0.05)
     assert len(rule.moments) == 1
     assert not rule.decided(Prediction("oak", 0.99, (("oak", 0.99),), 0.0, True, 0.1), rule.moments[0] - 1)
 

@@ -90,7 +90,7 @@ def content(learner):
 
 
 def kept(learner):
-    """The touches kept for recall, each as its material and key, and a digest of their levels."""
+    """The kept touches, each as its material and key, and a digest of their levels."""
     touches = learner.memory.kept.touches()
     levels = hashlib.sha256(b"".join(touch.levels.tobytes() for touch in touches)).hexdigest()
     return [[[touch.material, touch.key.hex()] for touch in touches], levels]

@@ -8,9 +8,9 @@ from touches import OBSERVED, PAD, Windowed, contents, fed, filled, kept_of, req
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.kept import Keeping, KeptTouches, usual_kept
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
 from store import Store
 
@@ -71,22 +71,23 @@ def test_a_touch_without_readings_is_not_kept():
 
 @pytest.mark.parametrize("theirs", [0, 3, None])
 def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_path, theirs):
-    ours, _ = filled(tmp_path / "m", recall=FEW)
-    other, _ = filled(tmp_path / "other", SPARE, recall=theirs)
+    ours, _ = filled(tmp_path / "m", kept_touches=FEW)
+    other, _ = filled(tmp_path / "other", SPARE, kept_touches=theirs)
     with ours:
         ours.merge(other, shared="once")
-        require_same(ours, [*OBSERVED, *SPARE], recall=FEW)
+        require_same(ours, [*OBSERVED, *SPARE], kept_touches=FEW)
         ours.forget("d")
         other.compact()
+        many = other.settings.kept_touches
         other.close()
         before = contents(ours)
-        with pytest.raises(MismatchError, match=rf"compacted and keeps {other.settings.recall} touches.*keeps {FEW}"):
+        with pytest.raises(MismatchError, match=rf"compacted and keeps {many} touches.*keeps {FEW}"):
             ours.merge(tmp_path / "other", shared="once")
         assert contents(ours) == before
 
 
 def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):
-    ours, _ = filled(tmp_path / "m", recall=0)
+    ours, _ = filled(tmp_path / "m", kept_touches=0)
     other, _ = filled(tmp_path / "other", SPARE)
     other.compact()
     other.close()
@@ -98,16 +99,16 @@ def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):
 
 @pytest.mark.parametrize("made", [None, 0, FEW])
 def test_how_many_is_chosen_once(tmp_path, made):
-    learner, _ = filled(tmp_path / "m", recall=made)
+    learner, _ = filled(tmp_path / "m", kept_touches=made)
     count = usual_kept(PAD) if made is None else made
-    assert learner.settings.recall == count
+    assert learner.settings.kept_touches == count
     learner.close()
     for mode in ("write", "read"):
-        for asked in ({}, {"recall": count}):
+        for asked in ({}, {"kept_touches": count}):
             with TactileLearner.open(tmp_path / "m", mode=mode, **asked) as again:
-                assert again.settings.recall == count
-        with pytest.raises(MismatchError, match=rf"recall={count}; it was opened with 7.*leave recall out"):
-            TactileLearner.open(tmp_path / "m", mode=mode, recall=7)
+                assert again.settings.kept_touches == count
+        with pytest.raises(MismatchError, match=rf"kept_touches={count}; it was opened with 7.*leave kept_touches out"):
+            TactileLearner.open(tmp_path / "m", mode=mode, kept_touches=7)
     with Store.open(tmp_path / "m", mode="read") as store:
         identity = Identity.read(store)
     assert Identity.model_validate(identity.to_json()) == identity
@@ -120,12 +121,12 @@ def test_none_are_kept_where_they_are_of_no_use():
     assert 1 <= usual_kept(large) < 20
     windowed = TactileLearner(sensor=PAD, embedding=Windowed(dimension=64))
     windowed.observe("a", stream((0, 60)))
-    assert windowed.settings.recall == 0
+    assert windowed.settings.kept_touches == 0
     assert kept_of(windowed) is None
-    assert kept_of(fed(OBSERVED, recall=0)) is None
+    assert kept_of(fed(OBSERVED, kept_touches=0)) is None
 
 
-@pytest.mark.parametrize("recall", [-1, 2.5, "all", True])
-def test_it_is_a_whole_number(recall):
-    with pytest.raises(InputError, match="recall"):
-        TactileLearner(sensor=PAD, embedding=Kernels(dimension=64), recall=recall)
+@pytest.mark.parametrize("kept_touches", [-1, 2.5, "all", True])
+def test_it_is_a_whole_number(kept_touches):
+    with pytest.raises(InputError, match="kept_touches"):
+        TactileLearner(sensor=PAD, embedding=Kernels(dimension=64), kept_touches=kept_touches)

@@ -80,9 +80,9 @@ class TestMerging:
             assert not {name for name in held if name.startswith(("kept", "exemplar", "readings", "nbytes"))}
         shown = [stream(touch).astype(np.float32).tobytes()[:64] for _, touch in OBSERVED]
         assert not any(part in file.read_bytes() for part in shown)
-        with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": 0, "recall": 0}) as learner:
+        with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": 0, "kept_touches": 0}) as learner:
             learner.merge(file, shared="once")
-            require_same(learner, OBSERVED, exemplars=False, recall=0)
+            require_same(learner, OBSERVED, exemplars=False, kept_touches=0)
         with TactileLearner.open(tmp_path / "other", **SETTINGS) as learner:
             with pytest.raises(MismatchError, match="keeps exemplars"):
                 learner.merge(file, shared="once")

@@ -12,7 +12,7 @@ from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.readouts.attributes import solve
-from scroll_tactile.readouts.readout import Task
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.statistics import Statistics

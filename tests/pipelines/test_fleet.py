@@ -83,7 +83,7 @@ class TestSameBytes:
 
     def test_an_embedding_that_is_not_exact_keeps_its_codes_and_a_memory_without_readings_none(self, tmp_path):
         touch_files(tmp_path / "in", TOUCHES + TOUCHES[:3])
-        for name, settings in {"codes": {"exemplars": 0, "recall": 0}, "kept": {"exemplars": 0}}.items():
+        for name, settings in {"codes": {"exemplars": 0, "kept_touches": 0}, "kept": {"exemplars": 0}}.items():
             done = run(tmp_path / name, [tmp_path / "in"], **settings)
             assert done.observations == 12
             require_learned(tmp_path / name, **settings)

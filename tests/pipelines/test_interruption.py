@@ -89,12 +89,20 @@ def state(learner):
     """All that a memory without a path holds, to the byte."""
     memory, kept = learner.memory, learner.memory.kept
     pool = [(name, key, touch.rows.tobytes()) for name, key, touch in memory.sample]
-    recalled = [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
-    return learner.digest(), learner.materials, learner.exemplars, pool, recalled, learner.descriptions, memory.sequence
+    kept_levels = [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
+    return (
+        learner.digest(),
+        learner.materials,
+        learner.exemplars,
+        pool,
+        kept_levels,
+        learner.descriptions,
+        memory.sequence,
+    )
 
 
 def without_a_path(touches):
-    learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=2, recall=4)
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=2, kept_touches=4)
     learner.memory.sample = SmallSample(4)
     for touch in touches:
         learner.observe(*touch)

@@ -22,9 +22,9 @@ from scroll_tactile.errors import CapacityError, InputError
 from scroll_tactile.prediction import current
 from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts import readout as readouts
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.system import System
+from scroll_tactile.readouts.task import Task
 
 OBSERVED = tuple((name, seed) for seed in range(8) for name in "abc")
 FEWER = OBSERVED[:15]
@@ -194,8 +194,9 @@ def test_readouts_solved_again_are_those_of_a_fit(monkeypatch):
     names, codes = sorted(memory.statistics.materials), np.arange(SMALL.dimension, dtype=float)
     for scale, readout in renewed.readouts.items():
         # As a fit solves it that would shrink the scatter as far.
-        monkeypatch.setattr(readouts, "shrinkage", lambda *_, share=before.readouts[scale].share: share)
-        other = Readout(Task.of(memory.statistics, scale, names), memory.statistics)
+        share = before.readouts[scale].share
+        monkeypatch.setattr("scroll_tactile.readouts.task.shrinkage", lambda *_, share=share: share)
+        other = Task.of(memory.statistics, scale, names).solve(memory.statistics)
         for kind in ("lda", "ridge"):
             places = [[each.places[name] for name in names] for each in (readout, other)]
             assert (readout.scores(codes, places[0], kind) == other.scores(codes, places[1], kind)).all()

@@ -7,12 +7,12 @@ import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace
+from scroll_tactile.prediction.held_out_touches import held_out_touches
 from scroll_tactile.prediction.judging import judged
-from scroll_tactile.prediction.unseen import unseen_touches
 from scroll_tactile.readouts.calibration import FEWEST
-from scroll_tactile.readouts.likelihood import MISSING
 from scroll_tactile.report.growing import _without
 from scroll_tactile.statistics.moments import one_thread
 
@@ -57,7 +57,8 @@ def table(model):
     rows = (*model.fusion.moments, *model.fusion.paced)
     said = model.fusion.trajectories
     numbers = [
-        (row.columns, row.stage, row.model, row.match, row.alone, row.odd, row.odd_model, row.familiar) for row in rows
+        [value for name, value in vars(row).items() if name not in ("calibration", "mean_excess_loss", "loss_spread")]
+        for row in rows
     ]
     arrays = [said.chances, said.novelty, *(part for row in rows for part in vars(row.calibration).values())]
     return numbers, [array.tobytes() for array in arrays]
@@ -83,15 +84,15 @@ def test_a_readout_without_a_touch_is_one_that_followed_its_going(model, extract
 def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model, extractor):
     """Of each beginning of a touch that readouts and kept touches never observed, as the table reads it."""
     said, fusion, apart = model.fusion.trajectories, model.fusion, []
-    rows = fusion.recall.rows()
+    rows = fusion.matcher.kept.rows()
     keys = sorted(rows)  # all of them are held out: they are fewer than that
     assert len(said.targets) == len(keys) == len(TOUCHES)
-    for touch in unseen_touches(model, 0.05)[::7]:
-        stream = stream_of(fusion.recall.levels(rows[touch.key]), SKIN)
+    for touch in held_out_touches(model, 0.05)[::7]:
+        stream = stream_of(fusion.matcher.kept.levels(rows[touch.key]), SKIN)
         with _without(model, touch) as other, one_thread():
             for i, moment in enumerate(fusion.moments[:-1]):
                 beginning = stream.first(moment.columns / SKIN.rate)
-                encoded = extractor.encode(beginning, model.longest, lambda at: model.needed(NAMES, at))
+                encoded = extractor.encode(beginning, model.longest, lambda at: model.scales_for(NAMES, at))
                 alone = other.judge(sorted(NAMES), encoded.means, moment.columns, "beginning")
                 found = judged(other, extractor, sorted(NAMES), encoded)
                 if alone.probability.max() < 0.99:
@@ -150,19 +151,19 @@ def test_beginnings_are_right_sooner_than_later_and_no_surer_than_that(model):
 
 
 def test_nothing_is_held_out_where_nothing_is_kept_or_too_few_are(extractor):
-    for few in (learned(recall=0), learned(TOUCHES[:2]), learned(TOUCHES[:4]), learned(TOUCHES[:1])):
+    for few in (learned(kept_touches=0), learned(TOUCHES[:2]), learned(TOUCHES[:4]), learned(TOUCHES[:1])):
         fusion = few.model().fusion
         assert len(fusion.trajectories.targets) < FEWEST
-        assert fusion.complete.model == 1.0
+        assert fusion.complete.model_weight == 1.0
         assert few.predict(TOUCHES[0][1]).material == TOUCHES[0][0]
         for asked in (LATER[0][1], LATER[0][1].first(0.06), faster(LATER[0][1].readings, 2.0)):
             assert np.isfinite(few.predict(asked).novelty)
 
 
-@pytest.mark.parametrize("recall", [0, None])
+@pytest.mark.parametrize("kept_touches", [0, None])
 @pytest.mark.parametrize("readings", [2, 3, 5, 9])
-def test_touches_too_short_for_any_moment_before_their_end(recall, readings):
-    short = learned([(name, touch.first(readings / SKIN.rate)) for name, touch in TOUCHES], recall=recall)
+def test_touches_too_short_for_any_moment_before_their_end(kept_touches, readings):
+    short = learned([(name, touch.first(readings / SKIN.rate)) for name, touch in TOUCHES], kept_touches=kept_touches)
     for _, touch in LATER[:3]:
         for count in range(2, readings + 3):
             prediction = short.predict(touch.first(count / SKIN.rate))

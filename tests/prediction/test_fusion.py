@@ -1,14 +1,22 @@
-"""How far readouts and kept touches are believed at each moment, fitted to what was said of touches held out."""
+"""The weights of readouts and kept touches at each moment, fitted to held-out touches."""
 
 import numpy as np
 import pytest
 
-from scroll_tactile.prediction.fusion import ODD, Judged, Moment, chosen_of, fuse, match_of, moments_of, tempered
+from scroll_tactile.matching.deviation import matcher_of
+from scroll_tactile.matching.likelihood import CLEAN
+from scroll_tactile.matching.match import KeptTouch, Match
+from scroll_tactile.prediction.fusion import (
+    PRIOR_OUTLIERS,
+    HeldOutMoment,
+    chosen_of,
+    full_match_weight,
+    fuse,
+    moments_of,
+)
+from scroll_tactile.prediction.moments import Moment, tempered
 from scroll_tactile.readouts.calibration import FEWEST, Calibration
-from scroll_tactile.readouts.deviation import recall_of
-from scroll_tactile.readouts.held_out import HeldOut
-from scroll_tactile.readouts.likelihood import CLEAN
-from scroll_tactile.readouts.recollection import Kept, Recollection
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]
 C = len(NAMES)
@@ -19,13 +27,13 @@ def touches(each=24):
     """Kept touches of which only the keys and materials matter."""
     rng = np.random.default_rng(0)
     return [
-        Kept(name, bytes([i, seed]) * 16, rng.integers(0, 254, (2, 8)).astype(np.uint8))
+        KeptTouch(name, bytes([i, seed]) * 16, rng.integers(0, 254, (2, 8)).astype(np.uint8))
         for i, name in enumerate(NAMES)
         for seed in range(each)
     ]
 
 
-RECALL = recall_of(touches())
+MATCHER = matcher_of(touches())
 KEYS = sorted(touch.key for touch in touches())
 OWN = {touch.key: NAMES.index(touch.material) for touch in touches()}
 
@@ -36,30 +44,30 @@ def evidence(rng, keys, step=TRUE, odd=0.0):
     return step * (rng.normal(size=(len(keys), C)) + step * np.eye(C)[felt])
 
 
-def recollection(scores, certainty=0.5, trust=0.0):
+def match(scores, information=0.5, noise_share=0.0):
     unseen = np.full((2, 8), np.nan)
-    return Recollection(scores, certainty, CLEAN, np.zeros(2, bool), unseen, trust, False, -1.0, 1.0, 0.0)
+    return Match(scores, information, CLEAN, np.zeros(2, bool), unseen, noise_share, False, -1.0, 1.0, 0.0)
 
 
-def judged(columns, logits, scores, keys=KEYS, certainty=0.5):
+def judged(columns, logits, scores, keys=KEYS, information=0.5):
     """What readouts (logits) and kept touches (scores) say of some touches; either may be None, and says nothing."""
     logs = np.zeros((len(keys), C)) if logits is None else logits
     logs = logs - np.log(np.exp(logs).sum(axis=1, keepdims=True))
     novelty = np.random.default_rng(columns).normal(size=len(keys))
     calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(novelty), np.ones(1))
     targets = np.array([OWN[key] for key in keys], dtype=np.intp)
-    held = HeldOut(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
+    held = HeldOutProbabilities(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
     said = np.zeros((len(keys), C)) if scores is None else scores
-    matches = {key: recollection(row, certainty=certainty) for key, row in zip(keys, said, strict=True)}
-    return Judged(columns, 0, calibration, held, matches)
+    matches = {key: match(row, information=information) for key, row in zip(keys, said, strict=True)}
+    return HeldOutMoment(columns, 0, calibration, held, matches)
 
 
 def fused(*moments, keys=KEYS):
-    return fuse(RECALL, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0), 1.0)
+    return fuse(MATCHER, moments, moments[-1:], keys, dict.fromkeys(keys, 1.0), 1.0)
 
 
-def beta(moment, certainty=0.5):
-    return 1 / (1 + (1 / moment.match - 1) * certainty)
+def beta(moment, information=0.5):
+    return 1 / (1 + (1 / moment.match_weight - 1) * information)
 
 
 def test_moments_are_few_and_hold_the_milestones():
@@ -74,7 +82,7 @@ def test_moments_are_few_and_hold_the_milestones():
 def test_the_readouts_are_believed_as_far_as_they_are_right(sharpness):
     rng = np.random.default_rng(0)
     fusion = fused(judged(10, evidence(rng, KEYS) / sharpness, None))
-    assert fusion.complete.model == pytest.approx(sharpness, rel=0.35)
+    assert fusion.complete.model_weight == pytest.approx(sharpness, rel=0.35)
 
 
 @pytest.mark.parametrize("useless", ["readouts", "kept touches"])
@@ -84,11 +92,11 @@ def test_what_says_nothing_of_the_material_gets_no_weight(useless):
     fusion = fused(judged(10, noise, sound) if useless == "readouts" else judged(10, sound, noise))
     moment = fusion.complete
     if useless == "readouts":
-        assert moment.model < 0.1
+        assert moment.model_weight < 0.1
         assert beta(moment) > 0.3
     else:
         assert beta(moment) < 0.1
-        assert moment.model > 0.5
+        assert moment.model_weight > 0.5
 
 
 def test_no_fewer_outliers_are_assumed_than_so_many_touches_can_rule_out():
@@ -97,10 +105,10 @@ def test_no_fewer_outliers_are_assumed_than_so_many_touches_can_rule_out():
     for keys in (KEYS, KEYS[::4], KEYS[::10]):
         rows = [KEYS.index(key) for key in keys]
         moment = fused(judged(10, obvious[rows], None, keys), keys=keys).complete
-        assert ODD / (len(keys) + 1) <= moment.odd < 2 / len(keys)
-        assert ODD / (len(keys) + 1) <= moment.odd_model < 2 / len(keys)
+        assert PRIOR_OUTLIERS / (len(keys) + 1) <= moment.outlier_rate < 2 / len(keys)
+        assert PRIOR_OUTLIERS / (len(keys) + 1) <= moment.model_outlier_rate < 2 / len(keys)
     odd = fused(judged(10, evidence(rng, KEYS, 8.0, odd=0.3), None)).complete
-    assert 0.1 < odd.odd_model < 0.6
+    assert 0.1 < odd.model_outlier_rate < 0.6
 
 
 def test_a_share_of_every_probability_is_left_for_outliers():
@@ -109,17 +117,17 @@ def test_a_share_of_every_probability_is_left_for_outliers():
 
 
 def test_a_moment_is_drawn_to_its_neighbours():
-    """The same few touches by themselves, and between two moments at which the readouts are believed far less."""
+    """The same few touches by themselves, and between two moments at which the readouts have far less weight."""
     rng = np.random.default_rng(3)
     few = KEYS[::10]
     scarce = judged(20, evidence(rng, few), None, few)
     near = [judged(columns, evidence(rng, KEYS) * 8, None) for columns in (10, 30)]
     last = judged(40, evidence(rng, KEYS), None)
     counts = dict.fromkeys(KEYS, 1.0)
-    between = fuse(RECALL, [near[0], scarce, near[1], last], [last], KEYS, counts, 1.0).moments[1]
-    alone = fuse(RECALL, [scarce, last], [last], KEYS, counts, 1.0).moments[0]
-    expected = [fuse(RECALL, [one, last], [last], KEYS, counts, 1.0).moments[0].model for one in near]
-    assert max(expected) < between.model < alone.model
+    between = fuse(MATCHER, [near[0], scarce, near[1], last], [last], KEYS, counts, 1.0).moments[1]
+    alone = fuse(MATCHER, [scarce, last], [last], KEYS, counts, 1.0).moments[0]
+    expected = [fuse(MATCHER, [one, last], [last], KEYS, counts, 1.0).moments[0].model_weight for one in near]
+    assert max(expected) < between.model_weight < alone.model_weight
 
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST - 1])
@@ -128,17 +136,17 @@ def test_where_too_few_were_held_out_the_readouts_decide(count):
     scores = evidence(rng, keys)
     for own in (judged(10, scores, scores, keys), judged(10, None, scores, keys)):
         moment = fused(own, keys=keys).complete
-        assert moment.model == 1.0
+        assert moment.model_weight == 1.0
         assert beta(moment) < 1e-3
-        assert moment.familiarity(1e9, own_time=True) == 1.0
-        assert (moment.odd > 0) == (moment.odd_model > 0) == (count > 0)
+        assert moment.distance_weight(1e9, own_time=True) == 1.0
+        assert (moment.outlier_rate > 0) == (moment.model_outlier_rate > 0) == (count > 0)
 
 
 def test_without_kept_touches_the_readouts_have_the_word():
     rng = np.random.default_rng(5)
     own = judged(10, evidence(rng, KEYS), None)
     fusion = fuse(None, [own], [own], [], {}, 1.0)
-    assert fusion.complete.model == 1.0
+    assert fusion.complete.model_weight == 1.0
     assert fusion.trajectories.novelty.size == 0
 
 
@@ -147,7 +155,7 @@ def test_the_moment_of_a_touch_is_the_latest_that_it_reached():
     fusion = fused(*(judged(columns, evidence(rng, KEYS), None) for columns in (10, 20, 40)))
     assert [fusion.at(columns).columns for columns in (1, 10, 19, 20, 500)] == [10, 10, 10, 20, 40]
     paced = [judged(columns, evidence(rng, KEYS), None) for columns in (20, 80)]
-    fusion = fuse(RECALL, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
+    fusion = fuse(MATCHER, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
     assert [fusion.at_pace(columns).columns for columns in (2, 39, 41, 900)] == [20, 20, 80, 80]
 
 
@@ -161,7 +169,7 @@ def test_trajectories_are_what_is_then_said_of_the_touches():
     assert said.chances.shape == (len(KEYS), 2, C)
     np.testing.assert_allclose(said.chances[:, 0].sum(axis=1), 1.0)
     assert np.isnan(said.chances[1::2, 1]).all() and not np.isnan(said.chances[::2, 1]).any()
-    assert np.nanmax(said.chances) <= max([1 - m.odd * (1 - 1 / C) for m in fusion.moments[:-1]])
+    assert np.nanmax(said.chances) <= max([1 - m.outlier_rate * (1 - 1 / C) for m in fusion.moments[:-1]])
     right = (said.chances[:, 0].argmax(axis=1) == said.targets).mean()
     assert said.chances[:, 0].max(axis=1).mean() == pytest.approx(right, abs=0.08)
 
@@ -173,14 +181,15 @@ def test_it_is_a_function_of_the_set():
     one = fused(judged(10, *rows)).complete
     turned = judged(10, rows[0][order], rows[1][order], [KEYS[i] for i in order])
     other = fused(turned).complete
-    assert (other.model, other.match, other.odd) == (one.model, one.match, one.odd)
+    assert (other.model_weight, other.match_weight) == (one.model_weight, one.match_weight)
+    assert other.outlier_rate == one.outlier_rate
 
 
 def test_touches_are_chosen_evenly_and_the_least_sure_beside_them(monkeypatch):
     monkeypatch.setattr("scroll_tactile.prediction.fusion.MOST_HELD_OUT", 20)
     rng = np.random.default_rng(9)
     held = judged(10, evidence(rng, KEYS), None).held_out
-    chosen, counts = chosen_of(held, RECALL)
+    chosen, counts = chosen_of(held, MATCHER)
     assert chosen == sorted(chosen) and len(chosen) == 20
     least = [held.keys[i] for i in np.argsort(held.margins)[:10]]
     assert set(least) <= counts.keys() and set(chosen) <= counts.keys()
@@ -189,25 +198,25 @@ def test_touches_are_chosen_evenly_and_the_least_sure_beside_them(monkeypatch):
     assert chosen_of(held, None) == ([], {})
 
 
-@pytest.mark.parametrize("certainty", [1.0, 0.8, 0.044])
-@pytest.mark.parametrize("steepness", [1e-7, 1e-4, 0.3])
-def test_kept_touches_are_believed_as_was_fitted_where_touches_are_as_certain_as_those(steepness, certainty):
-    match = match_of(steepness, certainty)
-    assert 1 / (1 + (1 / match - 1) * certainty) == pytest.approx(steepness)
+@pytest.mark.parametrize("information", [1.0, 0.8, 0.044])
+@pytest.mark.parametrize("weight", [1e-7, 1e-4, 0.3])
+def test_kept_touches_are_believed_as_was_fitted_where_touches_are_as_certain_as_those(weight, information):
+    match = full_match_weight(weight, information)
+    assert 1 / (1 + (1 / match - 1) * information) == pytest.approx(weight)
 
 
 def test_noise_leaves_the_word_to_kept_touches_by_themselves():
     """Beside readouts that know everything they are of no use, and yet they answer where these have nothing to say."""
     rng = np.random.default_rng(10)
     moment = fused(judged(10, evidence(rng, KEYS, 6.0), evidence(rng, KEYS, 2.0))).complete
-    assert moment.alone > moment.match
+    assert moment.lone_match_weight > moment.match_weight
 
-    def way(trust):
-        return recollection(np.zeros(C), trust=trust)
+    def way(noise_share):
+        return match(np.zeros(C), noise_share=noise_share)
 
-    assert moment.steepness(way(0.0), 1.0) == pytest.approx(beta(moment))
-    assert moment.steepness(way(1.0), 1.0) == pytest.approx(1 / (1 + (1 / moment.alone - 1) * 0.5))
-    assert moment.steepness(way(0.0), 0.5) > moment.steepness(way(0.0), 1.0)
+    assert moment.match_weight_at(way(0.0), 1.0) == pytest.approx(beta(moment))
+    assert moment.match_weight_at(way(1.0), 1.0) == pytest.approx(1 / (1 + (1 / moment.lone_match_weight - 1) * 0.5))
+    assert moment.match_weight_at(way(0.0), 0.5) > moment.match_weight_at(way(0.0), 1.0)
 
 
 def test_the_threshold_of_a_moment_is_the_conformal_quantile_of_its_touches():

@@ -11,9 +11,9 @@ from touches import PAD, SMALL
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live import session
+from scroll_tactile.matching.likelihood import Likelihood, Noise
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.readouts.likelihood import Likelihood, Noise
 from scroll_tactile.statistics.sample import TouchSample
 from store import StoreClosedError
 
@@ -109,7 +109,7 @@ def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypa
         live.begin()
         live.push(touch("a", 9, 30))
         model = live._under_way.frozen.model
-        likelihood = model.recall.measured.likelihood
+        likelihood = model.matcher.deviation.likelihood
 
         def copied(noise, memo):
             if not count:
@@ -165,7 +165,7 @@ def many(monkeypatch, tmp_path):
 def read_later(model):
     """The materials that a model has yet to read."""
     readout = min(model.readouts.items())[1]
-    return [name for place, name in enumerate(readout.names) if place not in readout._held]
+    return [name for place, name in enumerate(readout.names) if place not in readout.held_means.rows]
 
 
 def require_alike(prediction, expected):
@@ -287,8 +287,8 @@ def _arrays(model):
         found |= {f"{scale} {name}": getattr(readout, name) for name in ("counts", "_means", "_solved", "_sizes")}
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
-    recall, conformal = model.recall, model.conformal
-    found |= {f"kept {name}": getattr(recall, name) for name in ("_blocks", "_brought", "_squares", "_labels")}
+    matcher, conformal = model.matcher, model.conformal
+    found |= {f"kept {name}": getattr(matcher.kept, name) for name in ("blocks", "wide_blocks", "squares", "labels")}
     found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
     return found
 

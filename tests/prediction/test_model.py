@@ -36,14 +36,14 @@ def learner_of(touches=3, sensor=PAD, embedding=SMALL, **settings):
 
 
 @cache
-def shared(readout, embedding=SMALL, recall=None):
+def shared(readout, embedding=SMALL, kept_touches=None):
     """A learner that no test changes."""
-    return learner_of(readout=readout, embedding=embedding, recall=recall)
+    return learner_of(readout=readout, embedding=embedding, kept_touches=kept_touches)
 
 
 @cache
-def model_of(readout, embedding=SMALL, recall=None):
-    return shared(readout, embedding, recall).model()
+def model_of(readout, embedding=SMALL, kept_touches=None):
+    return shared(readout, embedding, kept_touches).model()
 
 
 scenes = st.sets(st.sampled_from(NAMES), min_size=1)
@@ -62,20 +62,20 @@ def require_same_odds(part, whole, scene, odd):
 def test_the_probabilities_of_a_scene_are_those_of_its_materials_alone(readout, scene, seed):
     whole = shared(readout, WINDOWED).predict(stream(seed % 12, seed))
     part = shared(readout, WINDOWED).predict(stream(seed % 12, seed), scene=sorted(scene, reverse=True))
-    require_same_odds(part, whole, scene, model_of(readout, WINDOWED).fusion.complete.odd_model)
+    require_same_odds(part, whole, scene, model_of(readout, WINDOWED).fusion.complete.model_outlier_rate)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(["lda", "ridge"]), scenes, st.integers(50, 90))
 def test_how_strange_a_view_looks_depends_on_what_can_be_there(readout, scene, seed):
     """So the odds within a scene are those of all only where it holds the best of every scale."""
-    learner, probe = shared(readout, recall=0), stream(seed % 12, seed)
-    model, image = model_of(readout, recall=0), tactile_image(validate(probe, PAD))
+    learner, probe = shared(readout, kept_touches=0), stream(seed % 12, seed)
+    model, image = model_of(readout, kept_touches=0), tactile_image(validate(probe, PAD))
     means = FeatureExtractor(PAD, SMALL, learner.plan, None).means(image, learner.plan.scales)
     for scale in learner.plan.scales:
         scores = model.readouts[scale].scores(means[scale], np.arange(len(NAMES)), readout)
         scene = scene | {NAMES[int(scores.argmax())]}
-    odd = model.fusion.complete.odd_model
+    odd = model.fusion.complete.model_outlier_rate
     require_same_odds(learner.predict(probe, scene=sorted(scene)), learner.predict(probe), scene, odd)
 
 

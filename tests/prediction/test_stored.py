@@ -229,7 +229,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
         changes.append((name, of_array(name, lambda array: np.repeat(array, 2, axis=0))))
         changes.append((name, of_array(name, lambda array: array.astype(np.complex64).view(np.float32))))
         changes.append((name, of_array(name, lambda array: array[None])))
-    for name in ("rows-15", "moments", "weights", "spread", "dependence", "scale_novelty", "measured", "origin-15"):
+    for name in ("rows-15", "moments", "weights", "spread", "dependence", "scale_novelty", "deviation", "origin-15"):
         changes.append((name, of_array(name, lambda array: np.full_like(array, np.nan))))
     for name in ("names-15", "reference-15", "held-15", "kept-order", "kept-materials", "targets", "bank-rows-0"):
         changes.append((name, of_array(name, lambda array: array + 2**40)))

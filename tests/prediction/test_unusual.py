@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from prediction.test_recalling import CHANNELS, REACH, SCENE, lasting, learned, some, uniform
+from prediction.test_matched import CHANNELS, REACH, SCENE, lasting, learned, some, uniform
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.results import Prediction
@@ -53,7 +53,7 @@ def test_of_several_touches_all_that_sets_any_apart_is_said(learner):
 
 
 def test_without_kept_touches_the_length_is_said():
-    made = learned(recall=0, names=NAMES)
+    made = learned(kept_touches=0, names=NAMES)
     assert made.predict(LATER[0][:25]).unusual == ("shorter",)
     assert made.predict(LATER[0]).unusual == ()
     assert made.predict(lasting(LATER[0], 2.0)).unusual == ("longer",)
@@ -92,7 +92,7 @@ class TestCandidates:
             assert len(found) < len(NAMES)
 
     def test_of_a_memory_without_kept_touches_all_are_candidates_and_too_few(self):
-        found = learned(recall=0, names=NAMES).predict(LATER[0]).candidates()
+        found = learned(kept_touches=0, names=NAMES).predict(LATER[0]).candidates()
         assert set(found) == set(found.too_few) == set(NAMES)
 
     @pytest.mark.parametrize("error", [0, 1, -0.1, float("nan")])

@@ -1,6 +1,6 @@
 """What views are for: touches at another speed, of another length, over a small part of the range.
 
-Without kept touches beside them: for those see `test_recalling`.
+Without kept touches beside them: for those see `test_matched`.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ ASKED = [(name, SCENE.touch(name, i)) for i in range(20, 26) for name in NAMES]
 
 
 def learned(touches, embedding):
-    learner = TactileLearner(sensor=PAD, embedding=embedding, exemplars=0, recall=0)
+    learner = TactileLearner(sensor=PAD, embedding=embedding, exemplars=0, kept_touches=0)
     for material, readings in touches:
         learner.observe(material, readings)
     return learner

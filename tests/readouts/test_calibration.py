@@ -18,8 +18,8 @@ from scroll_tactile.readouts.calibration import (
     fit_weights,
     scale_weights,
 )
-from scroll_tactile.readouts.leave_one_out import left_out
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.leave_one_out import held_out_scores
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
@@ -48,8 +48,8 @@ def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000
 def stages_of(statistics, pool, kind="lda", stages=STAGES):
     scales = sorted({scale for stage in stages for scale in stage})
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
-    readouts = {task.scale: Readout(task, statistics) for task in tasks}
-    apart = {scale: left_out(readout, pool, stages, kind) for scale, readout in readouts.items()}
+    readouts = {task.scale: task.solve(statistics) for task in tasks}
+    apart = {scale: held_out_scores(readout, pool, stages, kind) for scale, readout in readouts.items()}
     materials = [material for material, *_ in pool]
     return [
         calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
@@ -131,7 +131,7 @@ def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(un
     for stage, scales in zip(stages_of(statistics, sample), STAGES, strict=True):
         ahead = np.zeros((6, 6))
         for weight, scale in zip(stage.weights, scales, strict=True):
-            readout = Readout(Task.of(statistics, scale, statistics.names(scale)), statistics)
+            readout = Task.of(statistics, scale, statistics.names(scale)).solve(statistics)
             own = [readout.scores(mean, range(6), "lda") for mean in readout.means_solved()[0] + readout.origin]
             ahead += weight * (np.diagonal(own)[:, None] - own)
         np.fill_diagonal(ahead, np.inf)
@@ -153,7 +153,7 @@ def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are
     statistics, sample = scene(materials=2, touches=4)
     (stage,) = stages_of(statistics, sample, stages=STAGES[:1])
     assert len(stage.novelties) == 0
-    readout = Readout(Task.of(statistics, SCALES[0], ["0", "1"]), statistics)
+    readout = Task.of(statistics, SCALES[0], ["0", "1"]).solve(statistics)
     means = statistics.sums(SCALES[0], ["0", "1"]) / statistics.counts(SCALES[0], ["0", "1"])[:, None]
     typical = np.mean([readout.novelty(mean, [0, 1]) for mean in means])
     size = np.diagonal(readout.derived().gram).mean()
@@ -224,32 +224,32 @@ positive = st.floats(1e-3, 1e6)
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.floats(0, 9), positive, st.floats(0, 1e6)), min_size=1, max_size=4), st.floats(0.5, 2))
-def test_a_scale_is_believed_less_the_stranger_a_touch_looks_in_it(scales, power):
-    weights, usual, strange = map(np.array, zip(*scales, strict=True))
-    calibration = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), usual)
-    expected = [w if s <= u else w * (u / s) ** power for w, u, s in scales]
-    np.testing.assert_allclose(calibration.believed(strange, power), expected)
-    stranger = calibration.believed(2 * strange + 1, power)
-    assert (stranger <= calibration.believed(strange, power)).all()
-    assert calibration.believed(np.stack([strange, strange]), power).shape == (2, len(weights))
+@given(st.lists(st.tuples(st.floats(0, 9), positive, st.floats(0, 1e6)), min_size=1, max_size=4))
+def test_a_scale_is_weighed_less_the_further_away_a_touch_is_in_it(scales):
+    weights, medians, away = map(np.array, zip(*scales, strict=True))
+    calibration = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), medians)
+    expected = [w if s <= u else w * (u / s) for w, u, s in scales]
+    np.testing.assert_allclose(calibration.weights_at(away), expected)
+    further = calibration.weights_at(2 * away + 1)
+    assert (further <= calibration.weights_at(away)).all()
+    assert calibration.weights_at(np.stack([away, away])).shape == (2, len(weights))
     undoubted = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), np.full(len(weights), np.inf))
-    assert undoubted.believed(strange, power).tolist() == weights.tolist()
+    assert undoubted.weights_at(away).tolist() == weights.tolist()
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_will_be(kind):
     statistics, sample = scene(noises=(20_000, 60_000), touches=60)
-    readouts = [Readout(Task.of(statistics, scale, statistics.names(scale)), statistics) for scale in SCALES]
-    apart = [left_out(readout, sample, STAGES, kind) for readout in readouts]
+    readouts = [Task.of(statistics, scale, statistics.names(scale)).solve(statistics) for scale in SCALES]
+    apart = [held_out_scores(readout, sample, STAGES, kind) for readout in readouts]
     materials = [material for material, *_ in sample]
     scales = list(zip(readouts, apart, strict=True))
     plain, viewed = (calibrate_stage(1, materials, scales, kind, viewed=flag) for flag in (False, True))
-    assert np.isinf(plain.usual).all()
-    strange = np.array([[left.strangeness[left.rows[i, 1]] for left in apart] for i in range(60)])
-    assert viewed.usual.tolist() == np.median(strange, axis=0).tolist()
+    assert np.isinf(plain.median_distances).all()
+    away = np.array([[left.diagonal_distances[left.rows[i, 1]] for left in apart] for i in range(60)])
+    assert viewed.median_distances.tolist() == np.median(away, axis=0).tolist()
     scores = np.array([[left.scores[left.rows[i, 1]] for left in apart] for i in range(60)])
-    doubted = scores * np.minimum(1, viewed.usual / strange)[:, :, None]
+    doubted = scores * np.minimum(1, viewed.median_distances / away)[:, :, None]
     targets = [apart[0].names.index(material) for material in materials]
     expected = scale_weights(doubted, targets, PRIOR_WEIGHT[kind] / 2)
     np.testing.assert_allclose(viewed.weights, expected, rtol=1e-9)

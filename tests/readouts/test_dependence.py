@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile.readouts.dependence import USUAL, Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOut
+from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(12)]
 
@@ -31,7 +31,9 @@ def held(rows):
     logits = np.array([row[2] for row in rows]).reshape(len(rows), len(NAMES))
     logs = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
     targets, novelty = np.array([row[1] for row in rows], dtype=np.intp), np.array([row[3] for row in rows])
-    return HeldOut(NAMES, [*range(len(rows))], [row[0] for row in rows], targets, logs, np.ones(len(rows)), novelty)
+    return HeldOutProbabilities(
+        NAMES, [*range(len(rows))], [row[0] for row in rows], targets, logs, np.ones(len(rows)), novelty
+    )
 
 
 def picked(found, places):
@@ -42,8 +44,8 @@ def picked(found, places):
 
 def test_touches_that_say_the_same_count_less():
     loose, tight = dependence_of(apart(0.0)), dependence_of(apart(0.9))
-    assert loose.evidence < tight.evidence <= 1
-    assert loose.evidence < 0.25
+    assert loose.log_probability < tight.log_probability <= 1
+    assert loose.log_probability < 0.25
     assert loose.novelty == pytest.approx(0.0, abs=0.1)
     assert tight.novelty == pytest.approx(0.9, abs=0.15)
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from readouts.dense import Dense, require_near
 
-from scroll_tactile.readouts.leave_one_out import left_out
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.leave_one_out import held_out_scores
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
@@ -69,7 +69,7 @@ def require_left_out(found, place, row, own, without, every, material, weight, r
     total = float(readout.counts.sum())
     variances = [(float(every.scatter[j][j]) + readout.penalty) / total for j in range(WIDTH)]
     far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
-    require_near(found.strangeness[place], far * (1 - share**2) if best == material else far)
+    require_near(found.diagonal_distances[place], far * (1 - share**2) if best == material else far)
 
 
 @settings(max_examples=25, deadline=None)
@@ -90,8 +90,8 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     statistics, sample = learned(touches, unsampled, again)
     reference = [name for name in statistics.names(SCALE) if name not in unsampled]
     task = Task.of(statistics, SCALE, reference)
-    readout = Readout(task, statistics)
-    found = left_out(readout, sample, STAGES, kind)
+    readout = task.solve(statistics)
+    found = held_out_scores(readout, sample, STAGES, kind)
     assert found.names == reference
     total = Fraction(int(statistics.second(SCALE).rows))
     excess = total / sum(int(count) for count in statistics.counts(SCALE, reference))
@@ -120,7 +120,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
     touches = touches_of(kinds, seed, offset)
     statistics, sample = learned(touches, again=again)
     reference = statistics.names(SCALE)
-    readout = Readout(Task.of(statistics, SCALE, reference), statistics)
+    readout = Task.of(statistics, SCALE, reference).solve(statistics)
     total = Fraction(int(statistics.second(SCALE).rows))
     places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
     rng = np.random.default_rng(seed + 1)
@@ -128,7 +128,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
         place: {2 * at: np.rint(rng.normal(size=WIDTH) * 60_000 + offset) for at in range(int(rng.integers(0, 4)))}
         for place in places.values()
     }
-    found = left_out(readout, sample, STAGES, kind, asked)
+    found = held_out_scores(readout, sample, STAGES, kind, asked)
     every = Dense(groups_of(touches), readout.penalty, readout.share)
     judged = set()
     for i, (material, key, rows, copies) in enumerate(touches):
@@ -147,7 +147,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
 def test_of_few_touches_the_left_out_scores_find_the_materials(kind):
     """The shares of what is left would tell against the material of the touch that is judged, and outdo the rest."""
     statistics, sample = learned(touches_of([(i % 4, 1, 1) for i in range(20)], 3, 0))
-    found = left_out(heavily_shrunk(statistics), sample, STAGES, kind)
+    found = held_out_scores(heavily_shrunk(statistics), sample, STAGES, kind)
     owners = ["abcd".index(material) for material, *_ in sample]
     best = found.scores.argmax(axis=1)
     assert np.mean([best[found.rows[i, 0]] == owner for i, owner in enumerate(owners)]) > 0.7
@@ -155,8 +155,8 @@ def test_of_few_touches_the_left_out_scores_find_the_materials(kind):
 
 def heavily_shrunk(statistics):
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("scroll_tactile.readouts.readout.shrinkage", lambda *_: 0.999)
-        return Readout(Task.of(statistics, SCALE, [*"abcd"]), statistics)
+        monkeypatch.setattr("scroll_tactile.readouts.task.shrinkage", lambda *_: 0.999)
+        return Task.of(statistics, SCALE, [*"abcd"]).solve(statistics)
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
@@ -164,10 +164,12 @@ def test_materials_of_one_touch_and_stages_that_were_not_reached_are_not_there(k
     touches = touches_of([(0, 3, 1), (0, 1, 1), (1, 2, 1)], 0, 0)
     statistics, sample = learned(touches)
     task = Task.of(statistics, SCALE, ["a", "b"])
-    found = left_out(Readout(task, statistics), sample, STAGES, kind)
+    found = held_out_scores(task.solve(statistics), sample, STAGES, kind)
     assert sorted(found.rows) == [(0, 0), (0, 1), (0, 2), (1, 0)]
-    assert found.scores.shape == found.z.shape == found.distances.shape == (*found.strangeness.shape, 2) == (4, 2)
+    assert (
+        found.scores.shape == found.z.shape == found.distances.shape == (*found.diagonal_distances.shape, 2) == (4, 2)
+    )
     alone, none = learned(touches[2:])
     task = Task.of(alone, SCALE, ["b"])
-    empty = left_out(Readout(task, alone), none, STAGES, kind)
+    empty = held_out_scores(task.solve(alone), none, STAGES, kind)
     assert (empty.rows, empty.scores.shape) == ({}, (0, 1))

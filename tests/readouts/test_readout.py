@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from readouts.dense import Dense, groups_of, require_near
 
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.statistics.statistics import Statistics
 
 EDGE, SCALE, WIDTH = 2**20, 7, 5
@@ -32,7 +32,7 @@ def statistics_of(touches):
 
 
 def readout_of(statistics, reference=None):
-    return Readout(Task.of(statistics, SCALE, reference or statistics.names(SCALE)), statistics)
+    return Task.of(statistics, SCALE, reference or statistics.names(SCALE)).solve(statistics)
 
 
 def require_textbook(readout, touches, probes, tolerance=1e-9):
@@ -194,7 +194,7 @@ def test_pruning_keeps_its_bounds(monkeypatch, followed, materials):
     readout = readout_of(statistics, names[:2])
     probe = rng.integers(-EDGE, EDGE, WIDTH).astype(float)
     every = np.arange(materials)
-    readout.bounds(probe, every)
+    readout.many.bounds(probe, every)
     if followed:
         for name in ("000", names[-1], "new", "new"):
             rows = rng.integers(-EDGE, EDGE, (2, WIDTH), dtype=np.int32)
@@ -202,18 +202,18 @@ def test_pruning_keeps_its_bounds(monkeypatch, followed, materials):
             assert readout.follow([(name, rows, 1)])
     every = np.arange(len(readout.names))
     exact = copy.deepcopy(readout).scores(probe, every, "lda")
-    assert readout.exact(probe, every) == pytest.approx(exact, rel=1e-11)
-    loose = np.median(readout.bounds(probe, every)[1] - exact)
+    assert readout.many.exact(probe, every) == pytest.approx(exact, rel=1e-11)
+    loose = np.median(readout.many.bounds(probe, every)[1] - exact)
     for fine in (False, True):
-        assert (exact <= readout.bounds(probe, every, fine=fine)[1]).all()
-    assert np.median(readout.bounds(probe, every)[1] - exact) <= loose
+        assert (exact <= readout.many.bounds(probe, every, fine=fine)[1]).all()
+    assert np.median(readout.many.bounds(probe, every)[1] - exact) <= loose
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 10**6)
     plain = readout.novelty(probe, np.arange(len(readout.names)))
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
     assert readout.novelty(probe, np.arange(len(readout.names))) == pytest.approx(plain, rel=1e-12)
 
 
-def test_the_strangeness_from_a_material_that_was_not_held_is_that_of_one_that_was(monkeypatch):
+def test_the_diagonal_distance_from_a_material_that_was_not_held_is_that_of_one_that_was(monkeypatch):
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
     rng = np.random.default_rng(0)
     statistics = Statistics(WIDTH, [SCALE])
@@ -222,6 +222,6 @@ def test_the_strangeness_from_a_material_that_was_not_held_is_that_of_one_that_w
     probe = rng.integers(-EDGE, EDGE, WIDTH).astype(float)
     few, again = (readout_of(statistics, ["000", "001"]) for _ in range(2))
     again.held(range(40))
-    assert [few.strangeness(probe, place) for place in range(40)] == [
-        again.strangeness(probe, place) for place in range(40)
+    assert [few.diagonal_distance(probe, place) for place in range(40)] == [
+        again.diagonal_distance(probe, place) for place in range(40)
     ]

@@ -8,10 +8,10 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
 from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.live.decision import DecisionRule, decision_rule
+from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
-from scroll_tactile.prediction.unseen import UnseenTouch, unseen_touches
-from scroll_tactile.readouts.likelihood import levels_of
+from scroll_tactile.prediction.held_out_touches import HeldOutTouch, held_out_touches
 from scroll_tactile.report.channels import channels_of, drift
 from scroll_tactile.report.growing import chosen, growing, soon
 from scroll_tactile.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
@@ -36,12 +36,12 @@ def learner():
 
 
 def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
-    unseen = {touch.key: touch for touch in unseen_touches(learner.model(), 0.05)}
-    assert len(unseen) == 24
+    held_out = {touch.key: touch for touch in held_out_touches(learner.model(), 0.05)}
+    assert len(held_out) == 24
     for name, i in [(NAMES[0], 0), (NAMES[1], 3), (NAMES[3], 5)]:
         touch = SCENE.touch(name, i, seconds=1.0)
         answer = taught(leave=(name, i)).predict(touch)
-        said = unseen[touch.key]
+        said = held_out[touch.key]
         assert said.material == name
         assert said.answer == answer.material
         # The calibration is that of all, and not of all others.
@@ -53,9 +53,9 @@ def grown(learner, touches, rule=None):
     model = learner.model()
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
     streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
-    unseen = [touch for touch in unseen_touches(model, 0.05) if touch.key in touches]
+    held_out = [touch for touch in held_out_touches(model, 0.05) if touch.key in touches]
     rule = rule or decision_rule(model, 0.05)
-    return model, growing(learner, model, extractor, rule, unseen, streams)
+    return model, growing(learner, model, extractor, rule, held_out, streams)
 
 
 def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
@@ -69,8 +69,8 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
         expected = dict(other.predict(touch.first(seconds)).ranking)
         assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
     # The model has not lost the touch.
-    assert (name, touch.key) in model.recall.held
-    assert len(model.recall) == 24
+    assert (name, touch.key) in model.matcher.kept.held
+    assert len(model.matcher.kept) == 24
 
 
 def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
@@ -83,13 +83,13 @@ def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
 
 
 def test_a_few_touches_of_different_materials_are_chosen(learner):
-    unseen = unseen_touches(learner.model(), 0.05)
-    few = chosen(unseen, [touch.key for touch in unseen], camera=False)
+    held_out = held_out_touches(learner.model(), 0.05)
+    few = chosen(held_out, [touch.key for touch in held_out], camera=False)
     assert len(few) == 6
     assert {touch.material for touch in few} == set(NAMES)
-    least = min(unseen, key=lambda touch: touch.probability[touch.names.index(touch.material)])
+    least = min(held_out, key=lambda touch: touch.probability[touch.names.index(touch.material)])
     assert few[0].key == least.key
-    assert chosen(unseen, [], camera=False) == []
+    assert chosen(held_out, [], camera=False) == []
 
 
 def test_how_soon_answers_come_is_counted(learner):
@@ -127,7 +127,7 @@ def touch(material, answer, confidence, known=True):
     names = tuple(sorted({material, answer, "z"}))
     rest = (1 - confidence) / (len(names) - 1)
     chances = np.array([confidence if name == answer else rest for name in names])
-    return UnseenTouch(material, material.encode(), names, chances, 0.0 if known else 9.0, 5.0)
+    return HeldOutTouch(material, material.encode(), names, chances, 0.0 if known else 9.0, 5.0)
 
 
 def test_trust_is_counted():
@@ -205,4 +205,4 @@ def test_a_small_memory_of_two_channels_is_left_out_too():
     learner = fed([(name, (seed, 60)) for seed in range(3) for name in "ab"])
     assert learner.sensor == PAD
     assert learner.embedding.fingerprint == SMALL.fingerprint
-    assert len(unseen_touches(learner.model(), 0.05)) == 6
+    assert len(held_out_touches(learner.model(), 0.05)) == 6

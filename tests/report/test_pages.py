@@ -179,7 +179,7 @@ def test_single_touches_leave_nothing_out():
 
 def test_a_compacted_memory_and_one_that_keeps_no_readings(tmp_path):
     scene = Scene(sensor=PAD)
-    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, recall=0, exemplars=0) as learner:
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, kept_touches=0, exemplars=0) as learner:
         for i in range(4):
             for name in scene.materials[:3]:
                 learner.observe(name, scene.touch(name, i))

@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from examples.benchmarks.numerics.memories import Memory
 from examples.benchmarks.numerics.truth import Answers, TrueReadout
-from scroll_tactile.readouts.leave_one_out import left_out
-from scroll_tactile.readouts.readout import Change, Readout, Task
+from scroll_tactile.readouts.leave_one_out import held_out_scores
+from scroll_tactile.readouts.readout import Change, Readout
 from scroll_tactile.readouts.shrinkage import LARGEST, LEAST
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
@@ -63,7 +64,7 @@ def name_of(place: int) -> str:
 
 def solved(statistics: Statistics) -> Readout:
     """The readout of statistics, all materials its reference."""
-    return Readout(Task.of(statistics, SCALE, statistics.names(SCALE)), statistics)
+    return Task.of(statistics, SCALE, statistics.names(SCALE)).solve(statistics)
 
 
 def asked(readout: Readout, codes: npt.NDArray[np.integer]) -> Answers:
@@ -197,7 +198,7 @@ def _left_out_error(memory: Memory, readout: Readout) -> float | None:
     pairs = np.array([(stage, 0, rows) for stage in range(rows)])
     for i, (place, codes) in enumerate(zip(memory.places.tolist(), memory.codes, strict=True)):
         sample.add(name_of(place), i.to_bytes(4, "big"), SampledTouch(codes, pairs))
-    apart = {kind: left_out(readout, sample, stages, kind) for kind in ("lda", "ridge")}
+    apart = {kind: held_out_scores(readout, sample, stages, kind) for kind in ("lda", "ridge")}
     worst = 0.0
     for number, (_, key, _) in list(enumerate(sample))[:LEFT_OUT]:
         if (number, 0) not in apart["lda"].rows:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.attributes import GAMMAS, solve
-from scroll_tactile.readouts.readout import Task
 from scroll_tactile.readouts.system import System
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics

@@ -12,7 +12,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from examples.paper.transfer.shared_features import Features
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import in_units, to_codes
@@ -168,7 +169,7 @@ class OneReadout(_Touches):
             raise InputError("expected touches to have been learned; there are none. Call observe first")
         statistics = parts[0] if len(parts) == 1 else parts[0] + parts[1]
         names = statistics.names(WHOLE)
-        readout = Readout(Task.of(statistics, WHOLE, names), statistics)
+        readout = Task.of(statistics, WHOLE, names).solve(statistics)
         return readout, [i for i, name in enumerate(names) if not name.startswith(_OLD)]
 
 

@@ -14,7 +14,8 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.readouts.readout import Readout, Task
+from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
@@ -101,7 +102,7 @@ class WidestReadout:
         names = self._statistics.names(WHOLE)
         if not names:
             raise InputError("expected a readout that has learned something; it has not. Call observe first")
-        self._readout = self._readout or Readout(Task.of(self._statistics, WHOLE, names), self._statistics)
+        self._readout = self._readout or Task.of(self._statistics, WHOLE, names).solve(self._statistics)
         mean = in_units(self._features(stream), self._features.embedding.bound).mean(axis=0)
         return names[int(self._readout.scores(mean, range(len(names)), "lda").argmax())]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, MOST_TABLES, UNIT, Likelihood, Noise, levels_of
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, MOST_TABLES, UNIT, Likelihood, Noise, levels_of
 from scroll_tactile.sensors import Sensor
 
 NOISES = [CLEAN, Noise(400), Noise(784), Noise(920), Noise(12, True), Noise(34, True)]
@@ -42,12 +42,12 @@ def test_what_is_missing_says_nothing(likelihood):
 
 
 def test_noise_hides_how_touches_differ(likelihood):
-    certainty = [
-        likelihood.table(noise).certainty for noise in (CLEAN, Noise(8, True), Noise(20, True), Noise(36, True))
+    information = [
+        likelihood.table(noise).information for noise in (CLEAN, Noise(8, True), Noise(20, True), Noise(36, True))
     ]
-    assert certainty[0] == pytest.approx(1, abs=0.3)
-    assert certainty == sorted(certainty, reverse=True)
-    assert certainty[-1] < 0.01
+    assert information[0] == pytest.approx(1, abs=0.3)
+    assert information == sorted(information, reverse=True)
+    assert information[-1] < 0.01
 
 
 def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):

@@ -14,9 +14,9 @@ ASKED = [(name, SCENE.touch(name, i).readings) for i in range(50, 58) for name i
 CHANNELS, REACH = SKIN.channels, 100.0
 
 
-def learned(recall=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
+def learned(kept_touches=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
     scene = Scene(sensor=sensor, seed=1)
-    learner = TactileLearner(sensor=sensor, embedding=Kernels(dimension=256), recall=recall, **settings)
+    learner = TactileLearner(sensor=sensor, embedding=Kernels(dimension=256), kept_touches=kept_touches, **settings)
     for i in range(of_each):
         for name in names:
             learner.observe(name, scene.touch(name, i))
@@ -24,13 +24,13 @@ def learned(recall=None, of_each=8, names=NAMES, sensor=SKIN, **settings):
 
 
 @pytest.fixture(scope="module")
-def recalling():
+def matching():
     return learned()
 
 
 @pytest.fixture(scope="module")
 def alone():
-    return learned(recall=0)
+    return learned(kept_touches=0)
 
 
 def uniform(values, rng, reach=0.5):
@@ -77,47 +77,48 @@ def right(learner, change):
 
 
 @pytest.mark.parametrize("kind", LOST)
-def test_what_is_lost_without_recall_is_recalled(recalling, alone, kind):
+def test_what_is_lost_without_kept_touches_is_known_with_them(matching, alone, kind):
     change, least, most = LOST[kind]
-    assert right(recalling, change) >= least
+    assert right(matching, change) >= least
     assert right(alone, change) <= most
 
 
 @pytest.mark.parametrize("kind", HELD)
-def test_what_is_known_without_recall_stays_known(recalling, alone, kind):
-    assert right(recalling, HELD[kind]) >= max(0.9, right(alone, HELD[kind]) - 1 / len(ASKED))
+def test_what_is_known_without_kept_touches_stays_known(matching, alone, kind):
+    assert right(matching, HELD[kind]) >= max(0.9, right(alone, HELD[kind]) - 1 / len(ASKED))
 
 
-def test_noise_alone_and_what_was_never_touched_is_unknown(recalling):
+def test_noise_alone_and_what_was_never_touched_is_unknown(matching):
     rng = np.random.default_rng(0)
-    alone = [recalling.predict(rng.uniform(0, REACH, (80, CHANNELS))).known for _ in range(20)]
-    strange = [recalling.predict(SCENE.touch(SCENE.materials[10], i)).known for i in range(10)]
-    usual = [recalling.predict(values).known for _, values in ASKED]
+    alone = [matching.predict(rng.uniform(0, REACH, (80, CHANNELS))).known for _ in range(20)]
+    strange = [matching.predict(SCENE.touch(SCENE.materials[10], i)).known for i in range(10)]
+    usual = [matching.predict(values).known for _, values in ASKED]
     assert sum(alone) == sum(strange) == 0
     assert np.mean(usual) >= 0.9
 
 
-def test_a_touch_that_the_model_is_sure_of_is_its_alone(recalling, alone):
-    most = 1 - alone.model().fusion.complete.odd_model * (1 - 1 / len(NAMES))  # what forty touches can vouch for
+def test_a_touch_that_the_model_is_sure_of_is_its_alone(matching, alone):
+    outliers = alone.model().fusion.complete.model_outlier_rate
+    most = 1 - outliers * (1 - 1 / len(NAMES))  # what forty touches can vouch for
     sure = [values for _, values in ASKED if alone.predict(values).probability > 0.999 * most]
     assert len(sure) > len(ASKED) / 2
-    same = [recalling.predict(values).ranking == alone.predict(values).ranking for values in sure]
+    same = [matching.predict(values).ranking == alone.predict(values).ranking for values in sure]
     assert np.mean(same) > 0.8
 
 
-def test_a_scene_restricts_recall(recalling):
+def test_a_scene_restricts_matching(matching):
     rng = np.random.default_rng(0)
     for name, values in ASKED[:10]:
         scene = sorted({name, NAMES[0], NAMES[1]})
-        prediction = recalling.predict(uniform(values, rng), scene=scene)
+        prediction = matching.predict(uniform(values, rng), scene=scene)
         assert sorted(material for material, _ in prediction.ranking) == scene
         assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
-        assert recalling.predict(uniform(values, rng), scene=[name]).probability == 1
+        assert matching.predict(uniform(values, rng), scene=[name]).probability == 1
 
 
 def test_a_material_without_kept_touches_is_weighed():
     """Where there is room for fewer touches than materials."""
-    learner = learned(recall=3)
+    learner = learned(kept_touches=3)
     kept = {material for material, *_ in learner.memory.kept}
     assert len(kept) == 3 < len(NAMES)
     assert right(learner, HELD["clean"]) >= 0.9
@@ -140,7 +141,7 @@ def test_one_material_and_few_touches(names, of_each):
             assert learner.predict(values).material == without.predict(values).material == name
 
 
-def test_touches_far_longer_than_usual_are_kept_in_part_and_recalled(recalling):
+def test_touches_far_longer_than_usual_are_kept_in_part_and_known(matching):
     learner = learned(of_each=4)
     for i in range(4):
         learner.observe("long", lasting(SCENE.touch(SCENE.materials[7], i).readings, 5))
@@ -166,7 +167,11 @@ def test_each_channel_has_noise_of_its_own_range():
 
 def test_one_channel():
     sensor = SKIN.model_copy(update={"channels": 1})
-    learner, without, scene = learned(sensor=sensor), learned(recall=0, sensor=sensor), Scene(sensor=sensor, seed=1)
+    learner, without, scene = (
+        learned(sensor=sensor),
+        learned(kept_touches=0, sensor=sensor),
+        Scene(sensor=sensor, seed=1),
+    )
     rng, noisy, clean, lost = np.random.default_rng(0), [], [], []
     for name, i in [(name, i) for name in NAMES for i in range(50, 54)]:
         values = scene.touch(name, i).readings
@@ -179,7 +184,7 @@ def test_one_channel():
         assert np.isfinite(learner.predict(np.full((80, 1), flat)).novelty)
 
 
-def test_ragged_touches(recalling):
+def test_ragged_touches(matching):
     learner = learned(of_each=2)
     for i in range(2, 10):
         for name in NAMES:
@@ -189,38 +194,38 @@ def test_ragged_touches(recalling):
 
 
 def present(learner):
-    """The recall that answers now."""
-    return learner._current.present(learner._ledger).recall
+    """The matcher that answers now."""
+    return learner._current.present(learner._ledger).matcher
 
 
-def test_a_model_that_followed_recalls_what_one_fitted_anew_does(tmp_path):
+def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
     """What was measured and fitted stays until the next fit; what is kept is that of now."""
     with TactileLearner.open(tmp_path / "m", sensor=SKIN, embedding=Kernels(dimension=256)) as learner:
         receipts = [learner.observe(name, SCENE.touch(name, i)) for i in range(14) for name in NAMES]
         learner.settle()
-        measured = present(learner).measured
+        measured = present(learner).deviation
         receipt = learner.observe("new", SCENE.touch(SCENE.materials[8], 0))
         learner.observe(NAMES[0], SCENE.touch(NAMES[0], 30))
         learner.retract(receipts[3])
         followed = present(learner)
-        assert followed.measured is measured
+        assert followed.deviation is measured
         kept = {(material, key) for material, key, _ in learner.memory.kept}
-        assert followed.held == kept
+        assert followed.kept.held == kept
         rng = np.random.default_rng(0)
         asked = [learner.memory.keeping.levels(uniform(values, rng)) for _, values in ASKED[:8]]
-        before = [followed.recollect(levels) for levels in asked]
+        before = [followed.match(levels) for levels in asked]
         learner.settle()
         anew = present(learner)
-        assert (anew.held, anew.materials) == (kept, sorted({*NAMES, "new"}))
-        anew.measured = measured
+        assert (anew.kept.held, anew.kept.materials) == (kept, sorted({*NAMES, "new"}))
+        anew.deviation = measured
         for levels, found in zip(asked, before, strict=True):
-            again = anew.recollect(levels)
+            again = anew.match(levels)
             assert again.noise == found.noise
             assert np.allclose(again.scores, found.scores, rtol=1e-9)
-            numbers = [[each.trust, each.evidence, each.surprise] for each in (again, found)]
+            numbers = [[each.noise_share, each.log_likelihood_gain, each.excess_loss] for each in (again, found)]
             assert np.allclose(*numbers, rtol=1e-9)
         learner.retract(receipt)
-        assert "new" not in present(learner).materials
+        assert "new" not in present(learner).kept.materials
         assert "new" not in {material for material, _ in learner.predict(ASKED[0][1]).ranking}
 
 
@@ -230,7 +235,7 @@ def test_answers_are_the_same_bytes_for_any_order_of_the_touches():
     asked = [change(values, rng) for _, values in ASKED[:6] for change, *_ in LOST.values()]
     answers = []
     for seed in range(2):
-        learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=256), recall=20)
+        learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=256), kept_touches=20)
         for place in np.random.default_rng(seed).permutation(len(touches)):
             learner.observe(touches[place][0], SCENE.touch(*touches[place]))
         learner.settle()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.conformal import APART, Conformal
-from scroll_tactile.readouts.likelihood import MISSING
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.conformal import OTHER_WEIGHT, Conformal
+from scroll_tactile.matching.likelihood import MISSING
+from scroll_tactile.matching.match import KeptTouch
 
 CHANNELS, COLUMNS = 3, 40
 
@@ -21,7 +21,7 @@ def touch(material, seed, columns=COLUMNS):
 
 
 def kept(materials=4, of_each=25, first=0):
-    return [Kept(f"m{m}", bytes([m, i]), touch(m, first + i)) for m in range(materials) for i in range(of_each)]
+    return [KeptTouch(f"m{m}", bytes([m, i]), touch(m, first + i)) for m in range(materials) for i in range(of_each)]
 
 
 def plain(touches, conformal, asked, reach):
@@ -30,16 +30,16 @@ def plain(touches, conformal, asked, reach):
     new = conformal._steps_of([asked])[0][: reach * CHANNELS].astype(float)
     labels = [kept.material for kept in touches]
 
-    def strangeness(i, bag, own):
+    def nonconformity(i, bag, own):
         far = [(np.square(bag[i][0] - other).sum(), label) for j, (other, label) in enumerate(bag) if j != i]
         near = min((d for d, label in far if label == own), default=np.inf)
         other = min((d for d, label in far if label != own), default=0.0)
-        return (1 + APART) * np.log1p(near) - APART * np.log1p(other)
+        return (1 + OTHER_WEIGHT) * np.log1p(near) - OTHER_WEIGHT * np.log1p(other)
 
     found = {}
     for own in sorted(set(labels)):
         bag = [*zip(steps, labels, strict=True), (new, own)]
-        scores = np.array([strangeness(i, bag, own if own == bag[i][1] else bag[i][1]) for i in range(len(bag))])
+        scores = np.array([nonconformity(i, bag, own if own == bag[i][1] else bag[i][1]) for i in range(len(bag))])
         same = np.array([label == own for _, label in bag])
         found[own] = (
             np.mean(scores[same] >= scores[-1]),
@@ -128,7 +128,7 @@ def test_few_touches_exclude_nothing_and_one_material_is_always_typical():
 def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
     touches = kept(of_each=20)
     assert set(
-        Conformal([Kept("m", b"0", np.zeros((1, 10_000), np.uint8))]).p_values(np.zeros((1, 2), np.uint8)).values()
+        Conformal([KeptTouch("m", b"0", np.zeros((1, 10_000), np.uint8))]).p_values(np.zeros((1, 2), np.uint8)).values()
     ) == {(1.0, 1.0, 1.0, 1.0)}
     conformal = Conformal(touches)
     gap = touch(2, 300).copy()
@@ -136,5 +136,5 @@ def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
     assert conformal.p_values(gap)["m2"].share > 0.05
     gap[:] = MISSING
     assert set(conformal.p_values(gap)) == {"m0", "m1", "m2", "m3"}
-    ragged = Conformal([*touches[:-1], Kept("m3", b"s", touch(3, 400, 15))])
+    ragged = Conformal([*touches[:-1], KeptTouch("m3", b"s", touch(3, 400, 15))])
     assert ragged.p_values(touch(3, 401))["m3"].share > 0.05

@@ -1,12 +1,12 @@
 """Sets that hold the truth: how typical a touch is of each material, by the touches that are kept of it.
 
-A touch x is stranger to a material y the further it lies from the nearest kept touch of y, and the nearer to one of
+A touch x conforms less to a material y the further it lies from the nearest kept touch of y, and the nearer to one of
 another material (nearest-neighbour nonconformity; Vovk, Gammerman and Shafer 2005):
 
     α(x, y) = log(d_y(x) + 1) + 2 (log(d_y(x) + 1) − log(d_other(x) + 1)),
 
 d squared distances of the beginnings that both have. If x is of y, then x and the n touches kept of y could have come
-in any order, so the share of these n + 1 that are as strange as x,
+in any order, so the share of these n + 1 that conform no better than x,
 
     p_y = (#{i kept of y : α(i, y) ≥ α(x, y)} + 1) / (n + 1),    each i compared with all others and with x,
 
@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.match import KeptTouch
 
 __all__ = ["Conformal", "Typicality"]
 
@@ -37,7 +37,7 @@ BLOCKS, EARLIER = 25, 1.5  # of a touch, in time: their edges grow with this pow
 MOST_VALUES = 1024  # of a touch: sums of the squares of so many steps are below 2²⁴, and exact in single precision
 STEPS, UNREAD = 63, 255  # of a block's mean, log(1 + level) over all levels; and where nothing was read
 AT_ONCE = 128  # touches: of their distances from a thousand a step takes 1 MB
-APART = 2.0  # times that a touch's being nearer to another material counts
+OTHER_WEIGHT = 2.0  # times that a touch's being nearer to another material counts
 
 
 class Typicality(NamedTuple):
@@ -60,7 +60,7 @@ class Conformal:
     nobody asks: otherwise a copy does.
     """
 
-    def __init__(self, touches: Sequence[Kept]) -> None:
+    def __init__(self, touches: Sequence[KeptTouch]) -> None:
         longest = max(touch.levels.shape[1] for touch in touches)
         self._set_up(len(touches[0].levels), longest, [], np.empty(0, np.intp))
         self.follow(touches, set())
@@ -83,7 +83,9 @@ class Conformal:
         return {"steps": self._steps.astype(np.uint8), "own": own, "other": other}
 
     @classmethod
-    def from_arrays(cls, touches: Sequence[Kept], arrays: Mapping[str, npt.NDArray[Any]], longest: int) -> Conformal:
+    def from_arrays(
+        cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
+    ) -> Conformal:
         """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
         conformal = cls.__new__(cls)
         lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
@@ -105,7 +107,7 @@ class Conformal:
         """What is kept, by material and key, in its order."""
         return self._touches
 
-    def follow(self, added: Sequence[Kept], removed: AbstractSet[tuple[str, bytes]]) -> None:
+    def follow(self, added: Sequence[KeptTouch], removed: AbstractSet[tuple[str, bytes]]) -> None:
         """Take in touches no longer than the longest that were kept, and let others go, by material and key."""
         if removed:
             staying = [i for i, touch in enumerate(self._touches) if touch not in removed]
@@ -142,15 +144,19 @@ class Conformal:
 
     def p_values(self, levels: LevelArray) -> dict[str, Typicality]:
         """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
-        places, strange, beside, own = self.scores(levels)
+        places, own_alpha, other_alpha, own = self.scores(levels)
 
         def by_material(those: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
             return np.bincount(those, minlength=len(own))
 
-        stranger, count = by_material(places[strange >= own[places]]) + 1, by_material(places) + 1
-        others = len(beside) - np.searchsorted(np.sort(beside), own) - by_material(places[beside >= own[places]])
+        at_least, count = by_material(places[own_alpha >= own[places]]) + 1, by_material(places) + 1
+        others = (
+            len(other_alpha)
+            - np.searchsorted(np.sort(other_alpha), own)
+            - by_material(places[other_alpha >= own[places]])
+        )
         every = len(places) + 1
-        columns = (stranger / count, 1 / count, (others + stranger) / every, np.full(len(own), 1 / every))
+        columns = (at_least / count, 1 / count, (others + at_least) / every, np.full(len(own), 1 / every))
         values = (Typicality(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
         return dict(zip(self._materials, values, strict=True))
 
@@ -168,8 +174,11 @@ class Conformal:
         nearest = _least(far, self._places, len(self._materials))
         as_long = self._lengths >= self._edges[reach]
         own, other, far = own[as_long], other[as_long], far[as_long]
-        strange, beside = _strangeness(np.minimum(own, far), other), _strangeness(own, np.minimum(other, far))
-        return self._places[as_long], strange, beside, _strangeness(nearest, _least_of_others(nearest))
+        own_alpha, other_alpha = (
+            _nonconformity(np.minimum(own, far), other),
+            _nonconformity(own, np.minimum(other, far)),
+        )
+        return self._places[as_long], own_alpha, other_alpha, _nonconformity(nearest, _least_of_others(nearest))
 
     def _steps_of(self, levels: Sequence[LevelArray]) -> npt.NDArray[np.uint8]:
         """The blocks of touches, in steps, (touches, blocks · C), block by block; UNREAD where nothing was read."""
@@ -251,7 +260,7 @@ def _least_of_others(nearest: FloatArray) -> FloatArray:
     return others
 
 
-def _strangeness(own: FloatArray, other: FloatArray) -> FloatArray:
+def _nonconformity(own: FloatArray, other: FloatArray) -> FloatArray:
     """α of distances from a material and from all others."""
     apart = np.where(np.isfinite(other), other, 0.0)
-    return np.asarray((1 + APART) * np.log1p(own) - APART * np.log1p(apart))
+    return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(apart))

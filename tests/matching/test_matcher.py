@@ -6,10 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.readouts.deviation import recall_of
-from scroll_tactile.readouts.likelihood import CLEAN, LEVELS, MISSING, UNIT
-from scroll_tactile.readouts.recall import Recall
-from scroll_tactile.readouts.recollection import Kept
+from scroll_tactile.matching.deviation import matcher_of
+from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
+from scroll_tactile.matching.match import KeptTouch
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.sensors import Sensor
 
 CHANNELS, READINGS, MATERIALS = 8, 120, 5
@@ -29,7 +30,7 @@ def touch(material, seed, readings=READINGS):
 
 def kept(each=8, **kwargs):
     return [
-        Kept(f"m{material}", bytes([material, seed]) * 16, touch(material, seed, **kwargs))
+        KeptTouch(f"m{material}", bytes([material, seed]) * 16, touch(material, seed, **kwargs))
         for material in range(MATERIALS)
         for seed in range(each)
     ]
@@ -42,36 +43,37 @@ def noisy(levels, amplitude, seed, normal=False):
 
 
 @pytest.fixture(scope="module")
-def recall():
-    return recall_of(kept())
+def matcher():
+    return matcher_of(kept())
 
 
 def same(one, other):
-    """Whether two recollections are the same bytes."""
+    """Whether two matches are the same bytes."""
     arrays = ("scores", "stuck", "expected")
-    numbers = ("certainty", "noise", "trust", "evidence", "surprise")
+    numbers = ("information", "noise", "noise_share", "log_likelihood_gain", "excess_loss")
     return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in arrays) and all(
         getattr(one, name) == getattr(other, name) for name in numbers
     )
 
 
 def near(one, other):
-    """Whether two recollections say the same to 1e-9, but for what is expected, which is of single precision."""
+    """Whether two matches say the same to 1e-9, but for what is expected, which is of single precision."""
     return (
         one.noise == other.noise
         and np.allclose(one.scores, other.scores, rtol=1e-9)
         and np.allclose(one.expected, other.expected, atol=1e-3, equal_nan=True)
-        and np.allclose([one.trust, one.evidence, one.surprise], [other.trust, other.evidence, other.surprise], 1e-9)
+        and np.allclose(
+            [one.noise_share, one.log_likelihood_gain, one.excess_loss],
+            [other.noise_share, other.log_likelihood_gain, other.excess_loss],
+            1e-9,
+        )
     )
 
 
-def right(recall, change):
+def right(matcher, change):
     asked = [(material, touch(material, 100 + seed)) for material in range(MATERIALS) for seed in range(6)]
     return np.mean(
-        [
-            np.argmax(recall.recollect(change(levels, i)).scores) == material
-            for i, (material, levels) in enumerate(asked)
-        ]
+        [np.argmax(matcher.match(change(levels, i)).scores) == material for i, (material, levels) in enumerate(asked)]
     )
 
 
@@ -88,59 +90,59 @@ def right(recall, change):
     ],
     ids=["clean", "half", "quarter", "normal", "dead", "stuck", "short"],
 )
-def test_materials_are_recalled_whatever_came_over_the_touch(recall, change):
-    assert right(recall, change) >= 0.9
+def test_materials_are_found_whatever_came_over_the_touch(matcher, change):
+    assert right(matcher, change) >= 0.9
 
 
 @pytest.mark.parametrize("amplitude", [0.1, 0.25, 0.5, 0.8])
 @pytest.mark.parametrize("normal", [False, True])
-def test_the_noise_is_found(recall, amplitude, normal):
-    found = recall.recollect(noisy(touch(1, 100), amplitude, 0, normal)).noise
+def test_the_noise_is_found(matcher, amplitude, normal):
+    found = matcher.match(noisy(touch(1, 100), amplitude, 0, normal)).noise
     assert found.normal == normal
     assert found.amplitude == pytest.approx(amplitude, rel=0.15 if normal else 0.03)
 
 
-def test_noise_is_trusted_to_recall_and_clean_touches_are_not(recall):
-    assert all(recall.recollect(noisy(touch(m, 100), 0.3, m)).trust > 0.95 for m in range(MATERIALS))
-    assert np.mean([recall.recollect(touch(m, 100 + i)).trust for m in range(MATERIALS) for i in range(4)]) < 0.3
+def test_noise_is_trusted_to_kept_touches_and_clean_touches_are_not(matcher):
+    assert all(matcher.match(noisy(touch(m, 100), 0.3, m)).noise_share > 0.95 for m in range(MATERIALS))
+    assert np.mean([matcher.match(touch(m, 100 + i)).noise_share for m in range(MATERIALS) for i in range(4)]) < 0.3
 
 
-def test_an_offset_is_not_independent_noise(recall):
+def test_an_offset_is_not_independent_noise(matcher):
     drifted = [np.clip(touch(m, 100).astype(int) + 12, 0, 254).astype(np.uint8) for m in range(MATERIALS)]
-    assert all(recall.recollect(levels).trust < 0.2 for levels in drifted)
+    assert all(matcher.match(levels).noise_share < 0.2 for levels in drifted)
 
 
-def test_noise_alone_is_explained_by_nothing_that_is_kept(recall):
+def test_noise_alone_is_explained_by_nothing_that_is_kept(matcher):
     rng = np.random.default_rng(0)
     alone = [rng.integers(0, LEVELS, (CHANNELS, READINGS)).astype(np.uint8) for _ in range(8)]
     known = [noisy(touch(m, 100), 0.3, m) for m in range(MATERIALS)]
-    assert max(recall.recollect(levels).evidence for levels in alone) < 0
-    assert min(recall.recollect(levels).evidence for levels in known) > 0
+    assert max(matcher.match(levels).log_likelihood_gain for levels in alone) < 0
+    assert min(matcher.match(levels).log_likelihood_gain for levels in known) > 0
 
 
-def test_recall_is_a_function_of_the_set():
+def test_matching_is_a_function_of_the_set():
     touches = kept(each=4)
     asked = noisy(touch(2, 100), 0.4, 0)
-    first = recall_of(touches).recollect(asked)
+    first = matcher_of(touches).match(asked)
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(len(touches))
-        assert same(recall_of([touches[i] for i in order]).recollect(asked), first)
+        assert same(matcher_of([touches[i] for i in order]).match(asked), first)
 
 
-def test_touches_that_come_and_go_leave_what_a_new_recall_would_have():
-    touches, more = kept(each=4), [Kept("new", bytes([9, i]) * 16, touch(7, i)) for i in range(30)]
-    recall, gone = recall_of(touches), [touches[3], touches[9]]
-    start = [recall.recollect(touch(1, 100)), recall.recollect(noisy(touch(2, 100), 0.4, 0))]
-    assert recall.follow(more, [(went.material, went.key) for went in gone])
-    anew = Recall([stays for stays in touches if stays not in gone] + more, recall.measured)
-    assert recall.held == anew.held
-    assert recall.materials == [*(f"m{material}" for material in range(MATERIALS)), "new"]
+def test_touches_that_come_and_go_leave_what_a_new_matcher_would_have():
+    touches, more = kept(each=4), [KeptTouch("new", bytes([9, i]) * 16, touch(7, i)) for i in range(30)]
+    matcher, gone = matcher_of(touches), [touches[3], touches[9]]
+    start = [matcher.match(touch(1, 100)), matcher.match(noisy(touch(2, 100), 0.4, 0))]
+    assert matcher.kept.follow(more, [(went.material, went.key) for went in gone])
+    anew = TouchMatcher(KeptArrays.of([stays for stays in touches if stays not in gone] + more), matcher.deviation)
+    assert matcher.kept.held == anew.kept.held
+    assert matcher.kept.materials == [*(f"m{material}" for material in range(MATERIALS)), "new"]
     for asked in (touch(7, 100), noisy(touch(2, 100), 0.4, 0), touch(1, 50)[:, :40]):
         for whole in (False, True):
-            assert near(recall.recollect(asked, whole=whole), anew.recollect(asked, whole=whole))
-    assert recall.follow(gone, [(came.material, came.key) for came in more])
-    assert recall.held == {(stays.material, stays.key) for stays in touches}
-    again = [recall.recollect(touch(1, 100)), recall.recollect(noisy(touch(2, 100), 0.4, 0))]
+            assert near(matcher.match(asked, whole=whole), anew.match(asked, whole=whole))
+    assert matcher.kept.follow(gone, [(came.material, came.key) for came in more])
+    assert matcher.kept.held == {(stays.material, stays.key) for stays in touches}
+    again = [matcher.match(touch(1, 100)), matcher.match(noisy(touch(2, 100), 0.4, 0))]
     assert all(map(near, start, again))
 
 
@@ -149,59 +151,65 @@ def test_touches_that_come_and_go_leave_what_a_new_recall_would_have():
 def test_whatever_comes_and_goes_it_holds_what_a_set_would(toggled, rng):
     touches = kept(each=4)
     held = set(range(3))
-    recall = recall_of(touches[:3])
+    matcher = matcher_of(touches[:3])
     for i in toggled:
         if i in held and len(held) > 1:
-            assert recall.follow([], [(touches[i].material, touches[i].key)])
+            assert matcher.kept.follow([], [(touches[i].material, touches[i].key)])
             held.discard(i)
         elif i not in held:
-            assert recall.follow([touches[i]])
+            assert matcher.kept.follow([touches[i]])
             held.add(i)
     stays = [touches[i] for i in held]
     rng.shuffle(stays)
-    anew, asked = Recall(stays, recall.measured), noisy(touch(rng.randrange(MATERIALS), 100), 0.3, 1)
-    assert recall.held == anew.held
-    assert recall.materials == anew.materials
-    assert near(recall.recollect(asked), anew.recollect(asked))
-    for row in range(len(recall)):
-        mine = next(stay for stay in stays if recall.rows()[stay.key] == row)
-        assert (recall.material(row), recall.levels(row).tobytes()) == (mine.material, mine.levels.tobytes())
+    anew, asked = (
+        TouchMatcher(KeptArrays.of(stays), matcher.deviation),
+        noisy(touch(rng.randrange(MATERIALS), 100), 0.3, 1),
+    )
+    assert matcher.kept.held == anew.kept.held
+    assert matcher.kept.materials == anew.kept.materials
+    assert near(matcher.match(asked), anew.match(asked))
+    for row in range(len(matcher.kept)):
+        mine = next(stay for stay in stays if matcher.kept.rows()[stay.key] == row)
+        assert (matcher.kept.material(row), matcher.kept.levels(row).tobytes()) == (
+            mine.material,
+            mine.levels.tobytes(),
+        )
 
 
 def test_what_cannot_be_followed_says_so():
     short = kept(each=3, readings=60)
-    assert not recall_of(short).follow(kept(each=1))  # longer than all that were kept
-    assert not recall_of(short).follow([], [(went.material, went.key) for went in short])
+    assert not matcher_of(short).kept.follow(kept(each=1))  # longer than all that were kept
+    assert not matcher_of(short).kept.follow([], [(went.material, went.key) for went in short])
 
 
 def test_a_touch_left_out_is_as_if_it_were_not_kept():
     touches = kept(each=4)
-    recall = recall_of(touches)
-    row = recall.rows()[touches[6].key]
-    without = Recall([stays for stays in touches if stays is not touches[6]], recall.measured)
-    asked = recall.levels(row)
-    left_out = recall.recollect(asked, left_out=row)
-    assert near(left_out, without.recollect(asked))
-    assert left_out.scores.max() < recall.recollect(asked).scores.max()
+    matcher = matcher_of(touches)
+    row = matcher.kept.rows()[touches[6].key]
+    without = TouchMatcher(KeptArrays.of([stays for stays in touches if stays is not touches[6]]), matcher.deviation)
+    asked = matcher.kept.levels(row)
+    left_out = matcher.match(asked, held_out=row)
+    assert near(left_out, without.match(asked))
+    assert left_out.scores.max() < matcher.match(asked).scores.max()
 
 
 @pytest.mark.parametrize("factor", [0.5, 2, 3])
 @pytest.mark.parametrize("reach", [0, 0.3])
-def test_touches_at_another_speed_are_recalled_as_a_whole(recall, factor, reach):
+def test_touches_at_another_speed_are_found_as_a_whole(matcher, factor, reach):
     right = 0
     for material in range(MATERIALS):
         places = np.linspace(0, READINGS - 1, round(READINGS / factor))
         slower = np.rint([np.interp(places, np.arange(READINGS), channel) for channel in touch(material, 100)])
-        found = recall.recollect(noisy(slower.astype(np.uint8), reach, material), whole=True)
+        found = matcher.match(noisy(slower.astype(np.uint8), reach, material), whole=True)
         right += int(np.argmax(found.scores) == material)
     assert right == MATERIALS
 
 
-def test_stuck_channels_and_missing_values_are_left_out_exactly(recall):
+def test_stuck_channels_and_missing_values_are_left_out_exactly(matcher):
     levels, stuck, missing = touch(3, 100), touch(3, 100), touch(3, 100)
     stuck[2], missing[2] = 254, MISSING
-    found = recall.recollect(stuck)
-    assert found.scores.tobytes() == recall.recollect(missing).scores.tobytes()
+    found = matcher.match(stuck)
+    assert found.scores.tobytes() == matcher.match(missing).scores.tobytes()
     assert found.stuck.tolist() == [False, False, True] + [False] * 5
     assert np.abs(found.expected[2] - levels[2]).mean() < 8
 
@@ -212,15 +220,15 @@ def test_a_channel_that_is_often_quiet_is_not_stuck(quiet, stuck):
     touches = kept()
     for each in touches[:quiet]:
         each.levels[3] = 0
-    recall = recall_of(touches)
+    matcher = matcher_of(touches)
     asked = touch(0, 100)
     asked[3] = 0
-    assert recall.recollect(asked).stuck.tolist() == [False] * 3 + [stuck] + [False] * 4
+    assert matcher.match(asked).stuck.tolist() == [False] * 3 + [stuck] + [False] * 4
     for each in touches[2:quiet]:
-        recall.follow([], {(each.material, each.key)})
+        matcher.kept.follow([], {(each.material, each.key)})
     if quiet == 8:  # two are left, of 34, and without one of those there is one of 33
-        row = recall.rows()[touches[0].key]
-        assert recall.recollect(asked, left_out=row).stuck[3]
+        row = matcher.kept.rows()[touches[0].key]
+        assert matcher.match(asked, held_out=row).stuck[3]
 
 
 def test_channels_that_are_often_quiet_may_be_dead():
@@ -228,54 +236,54 @@ def test_channels_that_are_often_quiet_may_be_dead():
     touches = kept()
     for each in touches[::2]:
         each.levels[:3] = 0
-    recall = recall_of(touches)
+    matcher = matcher_of(touches)
     for material in range(MATERIALS):
         quiet = next(each for each in touches[::2] if each.material == f"m{material}")
         asked = touch(material, 100)
         asked[:3] = 0
-        assert not recall.recollect(asked).stuck.any()  # kept touches of its material are so
+        assert not matcher.match(asked).stuck.any()  # kept touches of its material are so
         dead = touch(material, 100)
         dead[5:] = 0
-        found = recall.recollect(dead)
+        found = matcher.match(dead)
         assert found.stuck.tolist() == [False] * 5 + [True] * 3
-        assert recall.materials[int(found.scores.argmax())] == quiet.material
-    never = recall_of([each for each in touches if each.levels[:3].any()] + touches[:2])
+        assert matcher.kept.materials[int(found.scores.argmax())] == quiet.material
+    never = matcher_of([each for each in touches if each.levels[:3].any()] + touches[:2])
     died = touch(3, 100)
     died[:3] = 0  # of its material none is quiet: two touches of another are
-    found = never.recollect(died)
+    found = never.match(died)
     assert found.stuck[:3].all()
-    assert never.materials[int(found.scores.argmax())] == "m3"
+    assert never.kept.materials[int(found.scores.argmax())] == "m3"
 
 
 def test_scores_are_sums_over_all_values():
     alone = kept(each=1)
-    recall = recall_of(alone)
+    matcher = matcher_of(alone)
     asked = noisy(touch(3, 100), 0.3, 1)
     asked[1, 5:9] = MISSING
-    found = recall.recollect(asked)
-    table = recall.measured.likelihood.table(found.noise)
-    for place, material in enumerate(recall.materials):
+    found = matcher.match(asked)
+    table = matcher.deviation.likelihood.table(found.noise)
+    for place, material in enumerate(matcher.kept.materials):
         levels = next(alike.levels for alike in alone if alike.material == material)
         total = sum(int(table.logs[256 * int(y) + int(x)]) for y, x in zip(asked.ravel(), levels.ravel(), strict=True))
         assert found.scores[place] == pytest.approx(total / UNIT, rel=1e-12)
-    assert found.certainty == pytest.approx(table.certainty * (1 - 4 / asked.size), rel=1e-12)
+    assert found.information == pytest.approx(table.information * (1 - 4 / asked.size), rel=1e-12)
 
 
-def test_noise_hides_whether_neighbours_deviate_together(recall):
-    reaches = [recall.recollect(noisy(touch(1, 100), reach, 0)).certainty for reach in (0, 0.1, 0.3, 0.6)]
+def test_noise_hides_whether_neighbours_deviate_together(matcher):
+    reaches = [matcher.match(noisy(touch(1, 100), reach, 0)).information for reach in (0, 0.1, 0.3, 0.6)]
     assert reaches == sorted(reaches, reverse=True)
     assert reaches[0] > 0.5
     assert reaches[-1] < 0.05
 
 
-def test_readings_are_filled_in_where_they_lack(recall):
+def test_readings_are_filled_in_where_they_lack(matcher):
     sensor = Sensor(name="s", channels=CHANNELS, rate=50, low=0, high=254, unit="", duration=1)
     levels = touch(2, 100)
     readings = levels.T.astype(np.float32)
     readings[:, 4], readings[10:20, 1] = 0, np.nan
     asked = levels.copy()
     asked[4], asked[1, 10:20] = 0, MISSING
-    filled = recall.recollect(asked).filled(readings, sensor)
+    filled = matcher.match(asked).filled(readings, sensor)
     untouched = np.ones(readings.shape, bool)
     untouched[:, 4], untouched[10:20, 1] = False, False
     assert np.array_equal(filled[untouched], readings[untouched])
@@ -294,27 +302,29 @@ def test_readings_are_filled_in_where_they_lack(recall):
     ],
     ids=["dead", "missing", "one reading", "two readings", "long", "one channel"],
 )
-def test_whatever_is_left_of_a_touch_has_an_answer(recall, asked):
-    found = recall.recollect(asked)
-    assert np.isfinite([*found.scores, found.trust, found.evidence, found.surprise]).all()
+def test_whatever_is_left_of_a_touch_has_an_answer(matcher, asked):
+    found = matcher.match(asked)
+    assert np.isfinite([*found.scores, found.noise_share, found.log_likelihood_gain, found.excess_loss]).all()
     assert found.expected.shape == asked.shape
     if found.stuck.all():
         assert np.ptp(found.scores) < np.log(2) or found.noise == CLEAN
 
 
 def test_touches_of_other_lengths_and_one_touch_alone():
-    ragged = recall_of([*kept(each=3), *(Kept("short", bytes([8, i]) * 16, touch(6, i)[:, :50]) for i in range(3))])
-    assert ragged.materials[np.argmax(ragged.recollect(touch(6, 100)[:, :50]).scores)] == "short"
-    assert ragged.materials[np.argmax(ragged.recollect(noisy(touch(6, 100), 0.2, 0)).scores)] == "short"
-    assert ragged.materials[np.argmax(ragged.recollect(noisy(touch(1, 100), 0.2, 0)).scores)] == "m1"
-    single = recall_of(kept(each=1)[:1])
-    assert single.recollect(touch(0, 100)).scores.shape == (1,)
+    ragged = matcher_of(
+        [*kept(each=3), *(KeptTouch("short", bytes([8, i]) * 16, touch(6, i)[:, :50]) for i in range(3))]
+    )
+    assert ragged.kept.materials[np.argmax(ragged.match(touch(6, 100)[:, :50]).scores)] == "short"
+    assert ragged.kept.materials[np.argmax(ragged.match(noisy(touch(6, 100), 0.2, 0)).scores)] == "short"
+    assert ragged.kept.materials[np.argmax(ragged.match(noisy(touch(1, 100), 0.2, 0)).scores)] == "m1"
+    single = matcher_of(kept(each=1)[:1])
+    assert single.match(touch(0, 100)).scores.shape == (1,)
 
 
-def test_errors_say_what_was_expected(recall):
+def test_errors_say_what_was_expected(matcher):
     with pytest.raises(InputError, match=r"shape \(8, T\)"):
-        recall.recollect(np.zeros((3, 10), np.uint8))
+        matcher.match(np.zeros((3, 10), np.uint8))
     with pytest.raises(InputError, match="one or more"):
-        recall_of([])
+        matcher_of([])
     with pytest.raises(InputError, match="same number of channels"):
-        recall_of([*kept(each=1), Kept("other", b"o" * 32, np.zeros((3, 10), np.uint8))])
+        matcher_of([*kept(each=1), KeptTouch("other", b"o" * 32, np.zeros((3, 10), np.uint8))])

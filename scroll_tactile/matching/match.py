@@ -1,4 +1,4 @@
-"""What kept touches say of a touch, and how far that is to be believed."""
+"""What matching a touch with kept touches gives: a match; and what the kept touches deviate by."""
 
 from __future__ import annotations
 
@@ -7,16 +7,25 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.likelihood import LEVELS, LevelArray, Likelihood, Noise
+from scroll_tactile.matching.likelihood import LEVELS, LevelArray, Likelihood, Noise
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["Kept", "Measured", "Recollection", "by_chance", "independent", "shape_of", "trust_in", "without_zero"]
+__all__ = [
+    "KeptTouch",
+    "Match",
+    "NaturalDeviation",
+    "independent",
+    "negative_entropy",
+    "noise_share",
+    "shape_of",
+    "without_zero",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Kept:
+class KeptTouch:
     """A kept touch: its material, its content hash, and its levels, uint8 of shape (C, T)."""
 
     material: str
@@ -25,8 +34,8 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What a set of kept touches says of itself.
+class NaturalDeviation:
+    """How touches of one material deviate from each other in a set of kept touches.
 
     likelihood: its tables. coherence: how much larger the deviation of a channel's mean from a kept touch's
     is, squared and times T, than that of a value; 1 for independent noise. energy: of independent
@@ -41,42 +50,43 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Recollection:
-    """What kept touches say of a touch.
+class Match:
+    """A touch beside kept touches.
 
-    scores: log-likelihood of each material, in the order of `Recall.materials`, shape (M,).
-    certainty: how far noise leaves it to be seen that values near each other deviate together, 1 of a clean touch.
+    scores: log-likelihood of each material, in the order of `KeptArrays.materials`, shape (M,).
+    information: Fisher's information on the values that were read, through the noise, in units of the natural spread;
+    1 of a clean touch without gaps.
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
-    trust: in [0, 1], which part of how it differs from kept touches is independent noise beyond what is natural.
-    moved: whether it is further from them than touches are, and at least half of that is its channels' zeros, which
+    noise_share: in [0, 1], how much of the touch's deviation from kept touches is independent noise beyond the natural.
+    moved: whether the touch deviates more than touches do, and at least half of that is its channels' zeros, which
     may drift.
-    likelihood: its logarithm per value. evidence: that beyond the one of values drawn at random from the touch's own;
-    not above 0 where nothing that is kept explains the touch. surprise: what is lacking to the one that a touch of the
-    set would have.
+    likelihood: the log-likelihood per value. log_likelihood_gain: the same less the negative entropy of the touch's own
+    values; not above 0 where nothing that is kept explains the touch. excess_loss: the negative log-likelihood per
+    value less the expected one of a touch of the set.
     """
 
     scores: FloatArray
-    certainty: float
+    information: float
     noise: Noise
     stuck: npt.NDArray[np.bool_]
     expected: FloatArray
-    trust: float
+    noise_share: float
     moved: bool
     likelihood: float
-    evidence: float
-    surprise: float
+    log_likelihood_gain: float
+    excess_loss: float
 
     def filled(self, readings: npt.NDArray[np.floating], sensor: Sensor) -> npt.NDArray[np.float32]:
         """The readings, shape (T, C) in the sensor's unit, with what is missing or stuck as kept touches have it."""
         low, high = sensor.limits
-        recalled = low + (high - low) * (self.expected.T.astype(np.float32) / np.float32(LEVELS - 1))
-        lacking = (np.isnan(readings) | self.stuck) & np.isfinite(recalled)
-        return np.where(lacking, recalled, readings).astype(np.float32)
+        expected = low + (high - low) * (self.expected.T.astype(np.float32) / np.float32(LEVELS - 1))
+        lacking = (np.isnan(readings) | self.stuck) & np.isfinite(expected)
+        return np.where(lacking, expected, readings).astype(np.float32)
 
 
 def shape_of(deviation: FloatArray, seen: npt.NDArray[np.bool_]) -> tuple[float, float]:
-    """Energy and coherence (see Measured) of a touch's deviation, (C, T) in levels, 0 where a value is not seen."""
+    """Energy and coherence (see NaturalDeviation) of a deviation, (C, T) in levels, 0 where a value is not seen."""
     counts = seen.sum(axis=1)
     energy = float(np.square(deviation).sum()) / max(int(counts.sum()), 1)
     if not energy:
@@ -105,13 +115,13 @@ def independent(energy: float, coherence: float, natural: float) -> float:
     return energy * min(max((natural - coherence) / (natural - 1), 0.0), 1.0)
 
 
-def trust_in(energy: float, coherence: float, measured: Measured) -> float:
+def noise_share(energy: float, coherence: float, natural: NaturalDeviation) -> float:
     """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² where odds are even."""
-    noise = independent(energy, coherence, measured.coherence)
-    return noise**2 / (noise**2 + measured.energy**2) if noise else 0.0
+    noise = independent(energy, coherence, natural.coherence)
+    return noise**2 / (noise**2 + natural.energy**2) if noise else 0.0
 
 
-def by_chance(levels: LevelArray) -> float:
+def negative_entropy(levels: LevelArray) -> float:
     """The mean log-likelihood of values drawn from their own frequencies: minus their entropy; 0 of none."""
     shares = np.bincount(levels, minlength=LEVELS) / max(len(levels), 1)
     shares = shares[shares > 0]

@@ -84,7 +84,7 @@ class Table:
 
     logs: L in UNIT, int16, at 256 · y + x; 0 where either is MISSING. offset, slope: of the straight line that comes
     nearest to the mean of y over x. mean: of y for each x, shape (255,). expected: of L for each x, shape (255,).
-    certainty: Fisher's information on x in units of the natural spread; near 1 without noise, and 0 where noise hides
+    information: Fisher's on x in units of the natural spread; near 1 without noise, and 0 where noise hides
     how touches differ.
     """
 
@@ -93,7 +93,7 @@ class Table:
     slope: float
     mean: FloatArray
     expected: FloatArray
-    certainty: float
+    information: float
 
 
 class Likelihood:
@@ -147,7 +147,7 @@ class Likelihood:
             slope=slope,
             mean=mean,
             expected=(chances * logs).sum(axis=1),
-            certainty=float(self.weights @ information),
+            information=float(self.weights @ information),
         )
 
     def _chances(self, noise: Noise) -> FloatArray:

@@ -1,0 +1,282 @@
+"""Kept touches in rows, with the arrays that a matcher compares a touch with: made, written, read and followed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError
+from scroll_tactile.matching.blends import at_places, block_means, unchanging
+from scroll_tactile.matching.likelihood import MISSING, LevelArray
+from scroll_tactile.matching.match import KeptTouch
+
+__all__ = ["KeptArrays"]
+
+Rows = npt.NDArray[np.intp]
+
+BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
+# Kept touches whose means are multiplied at once: the bits of a product do not depend on how many are kept.
+AT_ONCE = 128
+COARSER = 8  # blocks in one where touches of another speed are compared: finer ones are not side by side
+
+
+@dataclass
+class _Parts:
+    """What is made of kept touches, row by row, with room for more.
+
+    blocks: means, rounded to levels, as floats, (touches, C · B). wide_blocks: means over wider blocks of each touch's
+    own length, (touches, C · B'). squares: sums of the squares of blocks by channel, (touches, C). columns: the length
+    of each. gapless: whether it has a value everywhere. unchanging: the channels that never change, (touches, C).
+    """
+
+    blocks: npt.NDArray[np.float32]
+    wide_blocks: npt.NDArray[np.float32]
+    squares: npt.NDArray[np.float32]
+    columns: Rows
+    gapless: npt.NDArray[np.bool_]
+    unchanging: npt.NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls, count: int, channels: int, edges: Rows) -> _Parts:
+        """Room for so many touches."""
+        return cls(
+            np.empty((count, channels * (len(edges) - 1)), np.float32),
+            np.empty((count, channels * (len(edges[::COARSER]) - 1)), np.float32),
+            np.empty((count, channels), np.float32),
+            np.empty(count, np.intp),
+            np.empty(count, np.bool_),
+            np.empty((count, channels), np.bool_),
+        )
+
+    def take(self, other: _Parts, count: int) -> None:
+        for name in PARTS:
+            getattr(self, name)[:count] = getattr(other, name)[:count]
+
+    def move(self, row: int, to: int) -> None:
+        for name in PARTS:
+            getattr(self, name)[to] = getattr(self, name)[row]
+
+
+PARTS = tuple(field.name for field in fields(_Parts))
+LEVEL_PARTS = ("blocks", "wide_blocks")  # whole numbers, 0 to 254
+
+
+class KeptArrays:
+    """Kept touches of one number of channels, in rows; lengths may differ.
+
+    touches: material and key of each row. longest: columns of the longest that there may be. labels: the place of each
+    row's material among `materials`, which are in alphabetical order. blocks, wide_blocks, squares, columns: as in
+    `_Parts`. gapless: whether all touches have values everywhere. quiet: how many have a channel unchanging, (C,).
+
+    Any number of threads may read it at once. It follows where nobody reads: otherwise a copy does.
+    """
+
+    def __init__(
+        self,
+        channels: int,
+        longest: int,
+        touches: Sequence[tuple[str, bytes]],
+        levels: Sequence[LevelArray],
+        parts: _Parts | None = None,
+    ) -> None:
+        """parts: of the touches, which are taken over; without them there are no touches."""
+        self.channels, self.longest = channels, longest
+        self.touches = list(touches)
+        self._edges = _edges(longest, channels)
+        self._levels = list(levels)  # the memory's own: of 800 touches of a BioTac a copy is 6 MB
+        self._parts = _Parts.empty(0, channels, self._edges) if parts is None else parts
+        self._index()
+
+    @classmethod
+    def of(cls, touches: Iterable[KeptTouch]) -> KeptArrays:
+        """The arrays of some touches, in the order of their keys.
+
+        Raises InputError for touches of different channels, and for none.
+        """
+        kept = sorted(touches, key=lambda touch: (touch.key, touch.material))
+        if len({len(touch.levels) for touch in kept}) != 1:
+            raise InputError("expected kept touches, one or more, all of the same number of channels")
+        arrays = cls(len(kept[0].levels), max(touch.levels.shape[1] for touch in kept), (), ())
+        arrays._make_room(len(kept))
+        arrays.follow(kept)
+        return arrays
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """`_Parts` of the touches, row by row in the order of `touches`; levels in a byte each."""
+        made = {name: getattr(self._parts, name)[: len(self)] for name in PARTS}
+        return made | {name: made[name].astype(np.uint8) for name in LEVEL_PARTS}
+
+    @classmethod
+    def from_arrays(
+        cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
+    ) -> KeptArrays:
+        """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
+        floats = {name: arrays[name].astype(np.float32) for name in LEVEL_PARTS}
+        parts = _Parts(**{name: arrays[name] for name in PARTS} | floats)
+        own = [(touch.material, touch.key) for touch in touches]
+        return cls(len(touches[0].levels), longest, own, [touch.levels for touch in touches], parts)
+
+    @staticmethod
+    def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Name → dtype and shape of what `to_arrays` gives of so many touches."""
+        parts = _Parts.empty(count, channels, _edges(longest, channels))
+        types = {name: "uint8" if name in LEVEL_PARTS else getattr(parts, name).dtype.name for name in PARTS}
+        return {name: (types[name], getattr(parts, name).shape) for name in PARTS}
+
+    def copy(self) -> KeptArrays:
+        """Another of the same touches: what comes to it does not come to this one."""
+        parts = _Parts.empty(len(self._parts.blocks), self.channels, self._edges)
+        parts.take(self._parts, len(self))
+        return KeptArrays(self.channels, self.longest, self.touches, self._levels, parts)
+
+    def __len__(self) -> int:
+        return len(self.touches)
+
+    @property
+    def held(self) -> set[tuple[str, bytes]]:
+        """What is kept, by material and key."""
+        return set(self.touches)
+
+    def material(self, row: int) -> str:
+        """The material of a kept touch."""
+        return self.touches[row][0]
+
+    def levels(self, row: int) -> LevelArray:
+        """The levels of a kept touch, (C, T), as many columns as were kept."""
+        return self._levels[row]
+
+    def rows(self) -> dict[bytes, int]:
+        """Key → row of what is kept."""
+        return {key: row for row, (_, key) in enumerate(self.touches)}
+
+    def unchanging(self, row: int) -> npt.NDArray[np.bool_]:
+        """The channels of a kept touch that never change, (C,)."""
+        return np.asarray(self._parts.unchanging[row])
+
+    def follow(self, added: Iterable[KeptTouch], removed: Iterable[tuple[str, bytes]] = ()) -> bool:
+        """Take in touches that came, and let others go. False where all has to be made again:
+
+        a touch is longer than all that were kept, or none is left.
+        """
+        rows = {touch: row for row, touch in enumerate(self.touches)}
+        for row in sorted((rows[touch] for touch in removed), reverse=True):
+            last = len(self.touches) - 1
+            self._parts.move(last, row)
+            self.touches[row], self._levels[row] = self.touches[last], self._levels[last]
+            self.touches.pop()
+            self._levels.pop()
+        for touch in added:
+            if touch.levels.shape[1] > self.longest:
+                return False
+            self._add(touch)
+        self._index()
+        return bool(self.touches)
+
+    def _make_room(self, count: int) -> None:
+        parts = _Parts.empty(count, self.channels, self._edges)
+        parts.take(self._parts, len(self))
+        self._parts = parts
+
+    def _add(self, touch: KeptTouch) -> None:
+        row = len(self)
+        if row == len(self._parts.blocks):
+            self._make_room(row + max(8, row // 8))
+        parts, columns = self._parts, touch.levels.shape[1]
+        whole = np.full((self.channels, self.longest), MISSING, dtype=np.uint8)
+        whole[:, :columns] = touch.levels
+        means = np.rint(block_means(whole, self._edges)[0])
+        parts.blocks[row], parts.squares[row] = means.ravel(), (means**2).sum(axis=1)
+        parts.wide_blocks[row] = np.rint(block_means(touch.levels, self.wide_edges(columns))[0]).ravel()
+        parts.columns[row], parts.gapless[row] = columns, not bool((whole == MISSING).any())
+        parts.unchanging[row] = unchanging(touch.levels)
+        self.touches.append((touch.material, touch.key))
+        self._levels.append(touch.levels)
+
+    def _index(self) -> None:
+        count, parts = len(self), self._parts
+        self.materials = sorted({material for material, _ in self.touches})
+        place = {name: i for i, name in enumerate(self.materials)}
+        self.labels = np.array([place[material] for material, _ in self.touches], dtype=np.intp)
+        self.blocks, self.wide_blocks = parts.blocks[:count], parts.wide_blocks[:count]
+        self.squares, self.columns = parts.squares[:count], parts.columns[:count]
+        self.gapless = bool(parts.gapless[:count].all())
+        self.quiet = parts.unchanging[:count].sum(axis=0)
+
+    def beginnings(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
+        """The levels of some touches one below the other, (rows, C · T); T: columns, or those of the longest."""
+        kept = [self._levels[row] for row in rows]
+        found = np.full((len(kept), self.channels, columns or self.longest), MISSING, dtype=np.uint8)
+        for levels, into in zip(kept, found, strict=True):
+            part = levels[:, : into.shape[1]]
+            into[:, : part.shape[1]] = part
+        return found.reshape(len(kept), -1)
+
+    def brought_to(self, rows: Rows, columns: int) -> LevelArray:
+        """The whole of some touches, each brought to so many columns, one below the other, (rows, C · T)."""
+        brought = np.empty((len(rows), self.channels, columns), np.uint8)
+        lengths = self.columns[rows]
+        for length in np.flatnonzero(np.bincount(lengths)).tolist():  # touches of one length are brought alike
+            same = np.flatnonzero(lengths == length)
+            places = np.arange(columns) * ((length - 1) / max(columns - 1, 1))
+            kept = self.beginnings(rows[same], length).reshape(len(same), self.channels, length)
+            brought[same] = at_places(kept, places, np.float32)
+        return brought.reshape(len(rows), -1)
+
+    def edges(self, columns: int, whole: bool) -> Rows:
+        """The edges of the blocks of a touch of so many columns that is compared as a beginning, or as a whole one."""
+        return self.wide_edges(columns) if whole else self._edges
+
+    def wide_edges(self, columns: int) -> Rows:
+        """The edges of the blocks of a touch of so many columns that is compared as a whole one."""
+        edges: Rows = self._edges[::COARSER] * columns // self.longest
+        return edges
+
+    def distances(
+        self, guesses: npt.NDArray[np.float32], known: npt.NDArray[np.bool_], whole: bool
+    ) -> npt.NDArray[np.float32]:
+        """Squared distances of all touches from guesses (guesses, blocks), but for the guesses' own squares.
+
+        Where some blocks lack, of either, they are means over the others, with the guesses' squares.
+        """
+        blocks = self.wide_blocks if whole else self.blocks
+        if self.gapless and not whole and bool((known.all(axis=1) == known.any(axis=1)).all()):
+            square = self.squares[:, known[:, 0]].sum(axis=1)[:, None]  # no BLAS: some report a NaN of few columns
+            return np.asarray(square - 2 * _product(blocks, guesses.T))
+        columns = np.flatnonzero(known)
+        blocks, guesses = blocks[:, columns], guesses[:, columns]
+        square = np.einsum("nd,nd->n", blocks, blocks, dtype=np.float32)[:, None]
+        if self.gapless or whole:
+            return np.asarray(square - 2 * _product(blocks, guesses.T))
+        both = self._read()[:, columns].astype(np.float32)
+        far = square - 2 * _product(blocks, guesses.T) + both @ np.square(guesses).T
+        return np.asarray(far / np.maximum(both.sum(axis=1, keepdims=True), 1))
+
+    def nearest_alike(self, row: int) -> tuple[LevelArray, LevelArray] | None:
+        """The levels of a touch and of the nearest other one of its material; None where there is no other."""
+        others = np.flatnonzero((self.labels == self.labels[row]) & (np.arange(len(self)) != row))
+        if not len(others):
+            return None
+        far = self.squares[others].sum(axis=1) - 2 * _product(self.blocks[others], self.blocks[row])
+        own, other = self.beginnings([row, int(others[np.argmin(far)])])
+        return own, other
+
+    def _read(self) -> npt.NDArray[np.bool_]:
+        """Whether a touch has any value in a block, (touches, C · B)."""
+        values = (self.beginnings(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
+        return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self), -1)
+
+
+def _edges(longest: int, channels: int) -> Rows:
+    """The edges of the blocks of touches of so many columns at most."""
+    blocks = max(1, min(longest, BLOCK_VALUES // channels))
+    return np.linspace(0, longest, blocks + 1).astype(np.intp)
+
+
+def _product(blocks: npt.NDArray[np.float32], guess: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """blocks @ guess."""
+    parts = [blocks[row : row + AT_ONCE] @ guess for row in range(0, len(blocks), AT_ONCE)]
+    return np.concatenate(parts)

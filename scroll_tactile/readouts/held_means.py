@@ -1,0 +1,84 @@
+"""The means of the materials that a readout holds, and what is solved for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.statistics.moments import Sums
+
+__all__ = ["HeldMeans", "class_means"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+Places = npt.NDArray[np.intp]
+
+
+class HeldMeans:
+    """Materials by their place in a readout, with all that scores need of each.
+
+    rows: place → row. means: m about the readout's origin, solved: K⁻¹ m, both (H, d). sizes: mᵀ K⁻¹ m, (H,).
+    """
+
+    def __init__(self, places: Sequence[int], pairs: FloatArray, sizes: FloatArray) -> None:
+        """pairs: m and K⁻¹ m of the materials at some places, (H, 2, d), taken over."""
+        self.rows = {int(place): row for row, place in enumerate(places)}
+        self._room, self.sizes = pairs, sizes
+        self._cut(len(self.rows))
+
+    @classmethod
+    def none(cls, dimension: int) -> HeldMeans:
+        """No materials yet."""
+        return cls((), np.empty((0, 2, dimension)), np.empty(0))
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def places(self) -> list[int]:
+        """The places of the materials, in the order of the rows."""
+        return sorted(self.rows, key=self.rows.__getitem__)
+
+    @property
+    def pairs(self) -> FloatArray:
+        """m and K⁻¹ m, (H, 2, d)."""
+        return self._room[: len(self)]
+
+    def _cut(self, count: int) -> None:
+        self.means, self.solved = self._room[:count, 0], self._room[:count, 1]
+
+    def add(self, places: Sequence[int] | Places, means: FloatArray, solved: FloatArray) -> None:
+        """Hold more materials, with their means and K⁻¹ times these, (k, d) each."""
+        first = len(self.rows)
+        last = first + len(means)
+        if last > len(self._room):
+            # Room for half as many more, if there are any: materials that are asked for come one by one. All of it
+            # before any is kept: there may be no memory for it.
+            room = np.empty((last if not first else last + last // 2, 2, means.shape[1]))
+            room[:first] = self._room[:first]
+            self._room = room
+        self._room[first:last, 0], self._room[first:last, 1] = means, solved
+        self.sizes = np.append(self.sizes[:first], np.einsum("hd,hd->h", means, solved))
+        self._cut(last)
+        self.rows |= {int(place): first + i for i, place in enumerate(places)}
+
+    def keep(self, first: Places) -> None:
+        """Let all go but the first, which are at these places."""
+        self.rows = {int(place): i for i, place in enumerate(first)}
+        self._cut(len(first))
+        self.sizes = self.sizes[: len(first)]
+
+    def copy(self) -> HeldMeans:
+        """Another of the same: what is added there is not added here."""
+        return HeldMeans(self.places, np.stack([self.means, self.solved], axis=1), self.sizes.copy())
+
+
+def class_means(counts: IntArray | FloatArray, sums: Sums, origin: FloatArray) -> FloatArray:
+    """The means of materials about an origin, shape (C, d), in codes."""
+    # About the integers next to the origin, exactly: a class mean keeps the digits that its distance from it needs.
+    near = np.rint(origin)
+    means: FloatArray = (sums - np.outer(counts.astype(np.int64), near.astype(np.int64))) / counts[:, None]
+    means -= origin - near
+    return means

@@ -1,0 +1,91 @@
+"""What a readout is solved from, taken of the statistics at one moment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.held_means import HeldMeans, class_means
+from scroll_tactile.readouts.readout import Numbers, Readout, held_at_first
+from scroll_tactile.readouts.shrinkage import shrinkage
+from scroll_tactile.readouts.system import System
+from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
+from scroll_tactile.statistics.statistics import Snapshot, Statistics
+
+__all__ = ["Task"]
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+FIRST_KNOWN = 256  # materials
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a readout is solved from: the statistics at one moment, so that solving waits for nobody.
+
+    packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
+    shape (C, d). reference: the places of the materials that novelty and calibration rest on. touches: n.
+    times: how many times as far as the formula says the scatter is shrunk.
+    """
+
+    scale: Scale
+    packed: IntArray
+    names: list[str]
+    counts: IntArray
+    sums: Sums
+    reference: npt.NDArray[np.intp]
+    touches: int
+    times: float = 1.0
+
+    @classmethod
+    def of(cls, statistics: Statistics, scale: Scale, reference: Sequence[str], times: float = 1.0) -> Task:
+        """The task of a scale that has rows. reference: materials, of which those with rows at the scale count."""
+        names = statistics.names(scale)
+        places = {name: place for place, name in enumerate(names)}
+        # It may be that no sampled touch has rows here: then the first materials that have.
+        known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
+        own = np.array(known, dtype=np.intp)
+        packed, (counts, sums) = statistics.second(scale).packed(), statistics.totals(scale)
+        return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
+
+    @property
+    def scatter(self) -> FloatArray:
+        """S_w, shape (d, d): the lower triangle, formed anew each time."""
+        return within_scatter(self.packed, self.counts, self.sums)
+
+    @property
+    def origin(self) -> FloatArray:
+        """The mean of all rows, shape (d,)."""
+        return np.asarray(
+            (self.sums.sum(axis=0, dtype=np.int64).astype(np.longdouble) / self.counts.sum()).astype(np.float64)
+        )
+
+    def solve(self, statistics: Statistics | Snapshot, like: Readout | None = None) -> Readout:
+        """The readout. like: an earlier one of the same reference, to which scores stay comparable.
+
+        Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
+        """
+        origin, matrix = self.origin, self.scatter
+        trace, dimension = float(np.trace(matrix)), len(matrix)
+        share = 0.0
+        if trace > 0:
+            share = shrinkage(matrix, self.touches, self.times) if like is None else like.share
+        places = held_at_first(self.reference, len(self.names))
+        means = class_means(self.counts[places], self.sums[places], origin)
+        # Single touches have no scatter: then the nearest mean answers.
+        spread = trace / dimension * share / (1 - share)
+        penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
+        matrix[np.diag_indices(dimension)] += penalty
+        counts = self.counts.astype(np.float64)
+        precision: FloatArray = counts.sum() / np.diagonal(matrix) if like is None else like.precision
+        held = HeldMeans.none(dimension)
+        with one_thread():
+            system = System(matrix)
+            held.add(places, means, system.solve(means))
+        numbers = Numbers(self.reference, origin, counts, share, penalty, precision)
+        return Readout(self.scale, self.names, statistics, system, held, numbers)

@@ -336,7 +336,8 @@ class Model:
         distances = np.array(
             [readout.diagonal_distance(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
         )
-        return calibration.weights_at(distances), float(calibration.relative(distances).min())
+        measuring = [readout.scale.measures_novelty for readout in readouts]
+        return calibration.weights_at(distances), float(calibration.relative(distances)[measuring].min())
 
     def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """How scores are read at a stage: of the moment's, or of materials that were never felt for so long.

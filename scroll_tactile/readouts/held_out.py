@@ -58,6 +58,7 @@ def held_out_probabilities(
     materials = [[left.names.index(name) for name in names] for left in said]
     rows = [[left.rows[place, stage] for place in places] for left in said]
     away = np.stack([left.diagonal_distances[at] for left, at in zip(said, rows, strict=True)], axis=1)
+    measuring = [scale.measures_novelty for scale in scales]
     weights = calibration.weights_at(away)
     logits = np.zeros((len(places), len(names)))
     distances = []
@@ -73,6 +74,6 @@ def held_out_probabilities(
         [touches[place][1] for place in places],
         np.array([own[touches[place][0]] for place in places], dtype=np.intp),
         logits,
-        calibration.relative(away).min(axis=1) if places else np.zeros(0),
+        calibration.relative(away)[:, measuring].min(axis=1) if places else np.zeros(0),
         np.asarray(calibration.novelty(np.stack(distances, axis=1))) if places else np.zeros(0),
     )

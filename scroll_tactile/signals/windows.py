@@ -75,10 +75,10 @@ class Scale:
 
     @property
     def measures_novelty(self) -> bool:
-        """Whether distances at it say how new a touch is.
+        """Whether distances at it say how new a touch is, or how far off.
 
         With those of competing kernels, counts that are mostly 0, the learner called 1.6 % more of the touches of eight
-        series unknown.
+        series unknown, and 10 % more of RoboSkin's with a fifth of the channels dead.
         """
         return self.kind != "competing"
 

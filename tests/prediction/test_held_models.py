@@ -284,7 +284,8 @@ def test_a_held_model_stays_as_it_is_and_what_nobody_holds_is_followed_in_place(
 def _arrays(model):
     found = {}
     for scale, readout in model.readouts.items():
-        found |= {f"{scale} {name}": getattr(readout, name) for name in ("counts", "_means", "_solved", "_sizes")}
+        found |= {f"{scale} {name}": getattr(readout.held_means, name) for name in ("means", "solved", "sizes")}
+        found[f"{scale} counts"] = readout.counts
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
     matcher, conformal = model.matcher, model.conformal

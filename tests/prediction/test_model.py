@@ -14,6 +14,7 @@ from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.signals.windows import COMPETING
 
 NAMES = [f"material {i:02d}" for i in range(12)]
 WINDOWED = Windowed(dimension=64)
@@ -147,3 +148,18 @@ def test_one_material_and_one_touch():
     learner.observe("a", stream(3, 5))
     learner.observe("b", stream(5, 5))
     assert {name for name, _ in learner.predict(stream(3, 6)).ranking} == {"a", "b"}
+
+
+def test_competing_kernels_weigh_in_probabilities_and_not_in_novelty_or_distance():
+    model, touch = model_of("lda"), stream(3, 99)
+    moment, last = model.fusion.complete, len(model.calibrations) - 1
+    scales = model.scales("complete", last)
+    assert COMPETING in scales
+    assert moment.calibration.weights[scales.index(COMPETING)] > 0
+    assert len(moment.calibration.scale_novelty) == len(scales) - 1
+    image = tactile_image(validate(touch, PAD))
+    means = FeatureExtractor(PAD, SMALL, model.plan, None).means(image, scales)
+    moved = means | {COMPETING: means[COMPETING][::-1]}
+    before, after = (model.judge(NAMES, one, image.shape[1], "complete") for one in (means, moved))
+    assert (before.novelty, before.distance) == (after.novelty, after.distance)
+    assert before.probability.tolist() != after.probability.tolist()

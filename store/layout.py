@@ -132,6 +132,11 @@ class Current:
                     f"{path} is written in format {known['format']}; this release reads format {FORMAT_VERSION}: "
                     "upgrade it, or open the store with the release that wrote it; nothing was changed"
                 )
+            if "base" in known:
+                raise VersionError(
+                    f"{path} was written by a release from 0.8 to 0.10, which this one does not read: learn it again, "
+                    "or open it with that release; nothing was changed"
+                )
             number, identity = known["log"]
             newest, compaction = (
                 None if known[name] is None else NamedCheckpoint.from_json(known[name])

@@ -244,6 +244,15 @@ def test_a_memory_of_a_release_before_the_log_is_told_from_another_folder(tmp_pa
     assert contents(tmp_path) == before
 
 
+def test_a_memory_of_the_first_releases_with_a_log_is_refused_by_name_and_not_touched(plain):
+    put_current(plain, base=None)
+    before = (plain / "CURRENT").read_bytes()
+    for attempt in (Store.open, repair_store):
+        with pytest.raises(VersionError, match=r"release from 0\.8 to 0\.10.*learn it again"):
+            attempt(plain)
+    assert (plain / "CURRENT").read_bytes() == before
+
+
 def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
     Store.open(tmp_path, identity={"a": 1}).close()
     (tmp_path / "CURRENT").unlink()

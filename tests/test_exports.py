@@ -80,3 +80,44 @@ def test_the_newest_change_that_is_told_is_of_this_version():
 
 def test_the_page_of_public_names_says_what_their_docstrings_say():
     assert api.PAGE.read_text(encoding="utf-8") == api.page(), "python tests/api.py writes it"
+
+
+BANNED = [
+    "apart",
+    "asked",
+    "believed",
+    "certainty",
+    "familiar",
+    "generation",
+    "gone",
+    "heard",
+    "odd",
+    "pooled",
+    "recall",
+    "recalled",
+    "recollect",
+    "recollection",
+    "said",
+    "standing",
+    "strange",
+    "strangeness",
+    "strangers",
+    "strays",
+    "surprise",
+    "told",
+    "trust",
+    "trusted",
+    "unseen",
+    "upto",
+    "usual",
+]
+
+
+def test_public_names_are_the_fields_words():
+    headings = re.findall(r"^### (\w+)$", api.page(), re.MULTILINE)
+    signatures = re.findall(r"^(?:- `|    )([\w.]+)(\(.*?\))?(?: ->|`|$)", api.page(), re.MULTILINE)
+    names = {*headings, *(name for name, _ in signatures)}
+    names |= {one for _, parameters in signatures for one in re.findall(r"(\w+):", parameters)}
+    assert len(names) > 200
+    words = {name: re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name) for name in names}
+    assert {name: own for name, own in words.items() if {word.lower() for word in own} & {*BANNED}} == {}

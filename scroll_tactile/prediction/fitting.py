@@ -1,9 +1,9 @@
 """Fitting: a model of a memory as it is, solved once, and read by touches that are held out of it.
 
-A sampled touch that is kept is taken out of the readouts and out of the kept touches. What both then say of it, of its
-beginnings and of it at other paces, all made of its kept levels, is what they will say of a touch to come. How scores
-are read, and the weight of each expert at each moment, is fitted to that, here and nowhere else: nothing is
-measured when a prediction is made, and all is a function of the set of touches.
+A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its beginnings, and it at other
+paces, are made of its kept levels. Readouts and kept touches, both without it, judge all of these, as they will judge a
+touch to come. The calibrations, and the weights of readouts and kept touches at each moment, are fitted to that, here
+and nowhere else: a prediction measures nothing, and all is a function of the set of touches.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resa
 
 @dataclass(frozen=True)
 class Renewal:
-    """The readouts of a model, to be solved again from a memory as it was when this was made; how they are read stays.
+    """Solves the readouts of a model again, from the memory as it was when this was made; calibration and fusion stay.
 
     It takes a tenth of what a fit takes, so that a model can follow touches that come faster than that.
     """
@@ -104,7 +104,7 @@ class Draft:
             raise InputError(
                 f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"'
             )
-        # All materials where they are few: then novelty rests on all, and the ridge is the paper's.
+        # The ridge's reference is all materials, as in the paper; LDA's those with a sampled touch: all, while few.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
         judging = [scale for scale in statistics.scales if statistics.second(scale).rows]
         tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}
@@ -156,14 +156,14 @@ class _Fit:
     extractor: FeatureExtractor | None
 
     def held_out_scores(self, scale: Scale, queries: Queries | None = None) -> HeldOutScores:
-        """What a scale says of the sampled touches, each held out; where `queries` is given, of that in their place."""
+        """A scale's scores of the sampled touches, each held out. queries: features scored in place of their rows."""
         draft = self.draft
         stages = [[*stage, *draft.views] for stage in draft.stages]
         own = None if queries is None else queries[scale]
         return held_out_scores(self.readouts[scale], draft.sample, stages, draft.kind, own)
 
     def calibrated(self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]) -> Calibration:
-        """How scores are read at a stage, or at any other number by which `held_out` has what is said."""
+        """The calibration of a stage. number: the stage, or that of the query under which `held_out` has the scores."""
         materials = [material for material, *_ in self.draft.sample]
         own = [(self.readouts[scale], held_out[scale]) for scale in scales]
         return calibrate_stage(number, materials, own, self.draft.kind, viewed=bool(self.draft.views))
@@ -182,7 +182,7 @@ class _Fit:
         return HeldOutMoment(*moment, calibration, answers, matches)
 
     def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
-        """Complete touches held out of the readouts, and the weights of these and of the kept touches.
+        """What readouts say of complete touches held out, and the table of weights of readouts and kept touches.
 
         last: the last stage that any touch reached. held_out: what each scale says of the sampled touches.
         """
@@ -212,10 +212,10 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _KeptTouches:
-    """Kept touches, held out of readouts and kept touches alike, to be matched as if they came now.
+    """Kept touches, each judged by readouts and kept touches that lack it, as if it were new.
 
     chosen: the keys of those that are seen at all moments. levels, rows: by key, the levels (C, T) and the row among
-    the kept. places: of all sampled touches, in the sample. matches: what the other kept touches say of each.
+    the kept. places: by key, in the sample. matches: what the other kept touches say of each.
     """
 
     fit: _Fit
@@ -243,7 +243,7 @@ class _KeptTouches:
             matches = {}
             for key in self.chosen:
                 if (levels := self.levels[key]).shape[1] >= columns:
-                    # What came over a touch is looked for once, in all of it: that is most of what asking costs.
+                    # The noise is estimated once, on the whole touch: that is most of the cost of a match.
                     noise = self.matches[key].noise
                     matches[key] = self.matcher.match(levels[:, :columns], held_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]

@@ -6,9 +6,10 @@ readouts in 54, after 0.5 s in 83 and 94. So at each moment m, the last of them 
     p_y = (1 − ε_m) q_y + ε_m / C,    q_y ∝ exp(g_m log d_y + β_m S_y),
 
 d the readouts' probabilities, S the log-likelihoods of the kept touches. (g_m, β_m) ≥ 0 have least log loss on touches
-held out of both; they are drawn to those of this moment and its neighbours together, and these to what each of the two
-is worth by itself: half. ε_m is the share of touches that are unlike all others of their material, no less than n of
-them can rule out. All is fitted to one set of held-out touches, seen at all moments.
+held out of both. They are drawn to the weights fitted to this moment and its neighbours together. Those are drawn to
+g = 1, and to half of the β at which the kept touches alone put their best material AHEAD logits ahead of the next. ε_m
+is the share of touches that are unlike all others of their material; n held-out touches keep it above 0.5 / (n + 1).
+One set of held-out touches serves all moments and paces; for complete touches the least sure ones join it.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
 MOST_HELD_OUT = 96  # touches, each compared with all kept ones at every moment
-PRIOR_TOUCHES = 0.5  # that half of what each is worth by itself counts as
-ALONE_TOUCHES = 2.0  # that what the kept touches are worth by themselves counts as
+PRIOR_TOUCHES = 0.5  # that the prior, g = 1 and half of the lone β, counts as
+ALONE_TOUCHES = 2.0  # that the prior of the kept touches by themselves counts as
 SHARED_TOUCHES = 10.0  # that the weights of a moment and its neighbours count as
 LEAST_PRIOR = 1e-3
 PRIOR_OUTLIERS = 0.5  # touches more than those held out that are outliers
@@ -86,7 +87,7 @@ class HeldOutMoment:
 class _FusionInputs:
     """The inputs of a fit at one moment, of the touches `reached`, that reached it; see `Trajectories`.
 
-    logs: g's part, scores: β's for an information of `information`, both (n, C).
+    logs: the term that g multiplies. scores: the term that β multiplies, for the common `information`; both (n, C).
     """
 
     reached: IntArray
@@ -141,10 +142,10 @@ def _rows(
 
 
 def chosen_of(complete: HeldOutProbabilities, matcher: TouchMatcher | None) -> tuple[list[bytes], dict[bytes, float]]:
-    """The held-out touches that are seen at all moments: of those that are kept, evenly over their keys.
+    """The held-out touches that are seen at all moments, and how many touches each complete one stands for.
 
-    And those that are compared as complete ones, with how many each stands for: beside them the least sure, where it
-    matters which has the weight; each of the others stands for many.
+    First: at most MOST_HELD_OUT kept touches, evenly spaced by key. Second, by key: 1 for each of the least sure, where
+    the weights matter most; the others share the count of all remaining touches.
     """
     kept = set() if matcher is None else matcher.kept.rows().keys()
     ranked = [key for _, key in sorted(zip(complete.margins.tolist(), complete.keys, strict=True)) if key in kept]
@@ -200,7 +201,7 @@ def _fitted(
     model_rate = _outlier_rate(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
     distance_limit = float(np.quantile(held.distance, WITHIN)) if complete and len(held.keys) else np.inf
     if matcher is None or len(inputs.targets) < FEWEST or inputs.logs.shape[1] < 2:
-        # Where nothing can be held out, the kept touches decide only where the readouts do not.
+        # With too few held-out touches or materials the kept touches decide only where the readouts do not.
         power = float(calibration.weights.sum()) / prior_weight
         weight = 0.5
         if matcher is not None:
@@ -266,7 +267,7 @@ def _outlier_rate(own: FloatArray, materials: int, counts: FloatArray) -> float:
 
 
 def full_match_weight(weight: float, information: float) -> float:
-    """r, of which β is the weight that was fitted, where the information is that of the touches it was fitted to."""
+    """The r for which `match_weight(r, information)` is the fitted β; information: of the touches it was fitted to."""
     return 1 / (1 + max(1 / max(weight, LEAST_WEIGHT) - 1, 0.0) / max(information, LEAST_INFORMATION))
 
 

@@ -1,4 +1,4 @@
-"""Answers of a model to the sampled touches, each held out."""
+"""Answers of a model to the sampled touches, each held out, as complete touches in their own time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class HeldOutTouch:
     """The answer to a touch by all others.
 
     material, key: its own. names: the materials it was weighed among, in alphabetical order. probability: of each,
-    shape (C,). novelty: see `Prediction`. threshold: of the novelty, from which on it is called unknown.
+    shape (C,). novelty: see `Prediction`. threshold: a novelty above it is called unknown.
     """
 
     material: str
@@ -52,8 +52,9 @@ class HeldOutTouch:
 def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     """Answers of a model, just fitted, to the sampled touches, each held out of readouts and kept touches.
 
-    They are weighed among the materials that have a sampled touch. Those of a material's only touch are not there.
-    Calibration is that of all. false_alarms: as in `Settings`.
+    They are weighed among the materials that have a sampled touch. A touch that is its material's only one is omitted.
+    The calibration was fitted to all of them, each one included; no other pace is tried, no dead channel filled in.
+    false_alarms: as in `Settings`.
     """
     return list(_held_out_touches(model, false_alarms))
 

@@ -5,9 +5,10 @@ of, or that has another length than those learned, is compared with kept touches
 their beginnings, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by its
 own row of the table (see `prediction.moments`), and they weigh exp(COUNTED e), e the log-likelihood gain per value.
 Channels that never change are filled in with what the kept touches have there, and the touch is judged again. The
-readouts have less weight the more of the touch's deviation from kept ones is noise, t (`Match.noise_share`):
+readouts weigh less the further the touch lies from what was learned (w, `Moment.distance_weight`), and the larger the
+share t of its deviation from kept touches that is noise (`Match.noise_share`):
 
-    p_y ∝ exp(g (1 − t) log d_y + β S_y).
+    q_y ∝ exp(w g (1 − t) log d_y + β S_y),    p_y = (1 − ε) q_y + ε / C.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ __all__ = ["fused", "judged", "levels_seen"]
 
 FloatArray = npt.NDArray[np.float64]
 
-COUNTED = 30.0  # values, as which the log-likelihood gain of a hypothesis counts: neighbours say the same
+COUNTED = 30.0  # independent values that the gain per value counts as: neighbouring values are correlated
 TINY = 1e-300
 
 
@@ -49,7 +50,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     matches: list[tuple[Match, Hypothesis, bool]] = [(matcher.match(levels), usual, True)]
     if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
         whole = matcher.match(levels, whole=True)
-        if whole.log_likelihood_gain > 0:  # at no other pace is it any more like what is kept
+        if whole.log_likelihood_gain > 0:  # kept touches at its length explain it better than chance
             matches.append((whole, "paced", False))
     filled = _filled(
         model, extractor, encoded, max((match for match, *_ in matches), key=lambda match: match.log_likelihood_gain)
@@ -74,7 +75,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
 
 
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
-    """The judgement by the readouts. Where the touch may be of nothing known, kept touches say what differs."""
+    """The judgement by the readouts. The kept touches name what differs in a novel touch."""
     unusual = _of_length(model, encoded)
     if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - WITHIN):
         unusual = _unusual(model, encoded, model.matcher.match(levels_seen(encoded.stream)), hypothesis)
@@ -124,7 +125,7 @@ def _of_length(model: Model, encoded: Encoded) -> tuple[Unusual, ...]:
 
 
 def levels_seen(stream: Stream) -> LevelArray:
-    """The levels of a touch, (C, T), MISSING where a reading was."""
+    """The levels of a touch, (C, T); MISSING marks each value that was not read (`Stream.mask`)."""
     readings = stream.readings if stream.mask is None else np.where(stream.mask, np.nan, stream.readings)
     return levels_of(readings, stream.sensor)
 

@@ -34,8 +34,8 @@ FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["beginning", "complete", "paced"]
 """What a touch may be: the beginning of a usual one, a complete one, or a complete one at another pace."""
 
-# Of a logit, and the logarithm of their number more: materials so far behind have less than 2e-8 of the probability
-# together, and are not read from the memory.
+# Logits, to which the logarithm of the number of materials is added: materials further behind have less than 2e-8 of
+# the probability together, and are not read from the memory.
 NEGLIGIBLE = 18.0
 
 
@@ -64,8 +64,8 @@ class Judgement:
     """What is said of a touch by the readouts alone, or with the kept touches.
 
     probability: of each candidate, shape (C,). novelty: see Prediction. moment: whose threshold the novelty has.
-    distance: the least squared distance from a material at any scale that was asked, beside that of a usual touch; 0
-    where none is measured. unusual: see Prediction.
+    distance: the smallest ratio, over the scales that measure novelty, of the diagonal distance to the best-scoring
+    material and its median over held-out touches; 0 where none was measured. unusual: see Prediction.
     """
 
     probability: FloatArray
@@ -86,8 +86,8 @@ class Model:
     sample: these. dependence: how far touches of one thing say the same. least: the columns of all but the shortest
     touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
 
-    Any number of threads may ask at once; where it `reads_memory` only one, which holds the memory's lock. It follows
-    where nobody asks: otherwise a copy does.
+    Any number of threads may use it at once; if it `reads_memory`, only the one that holds the memory's lock. `follow`
+    changes it in place: a copy follows while any thread uses it.
     """
 
     kind: ReadoutName
@@ -135,7 +135,7 @@ class Model:
         return other
 
     def read(self, statistics: Statistics | Snapshot) -> None:
-        """Read there the materials that are asked for: in statistics that agree with it, or will where it follows."""
+        """Set the statistics that materials are read from: of this model's state, or of the one it is to follow to."""
         for readout in self.readouts.values():
             readout.statistics = statistics
 
@@ -191,9 +191,10 @@ class Model:
         return min(len(self.plan.stages(columns)), len(self.calibrations)) == len(self.stages)
 
     def scales(self, hypothesis: Hypothesis, stage: int) -> list[Scale]:
-        """The scales that judge a touch at a stage: of the beginning of one windows, of one at another pace the views.
+        """The scales that judge a touch at a stage.
 
-        Of others both, but before the last stage windows alone.
+        Windows judge a beginning, views a touch at another pace, both a complete one. Before the last stage windows
+        alone judge.
         """
         if hypothesis == "beginning" or not self.views or stage < len(self.calibrations) - 1:
             return list(self.stages[stage])
@@ -226,8 +227,8 @@ class Model:
         means: for each of the scales of `scales_for`, mean features in the codes' unit, (d,). columns: observed so far.
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
-        A material that was observed at fewer scales is weighed at the last stage that it reached, against all others;
-        the probability that is left goes to the others, which later stages weigh again.
+        A material is weighed at the last stage at which it has rows, against all candidates there, and keeps that
+        probability. Later stages divide the rest among the candidates that reached them.
         """
         moment = self.moment(hypothesis, columns)
         if hypothesis == "paced":  # every touch has views, of all of it
@@ -250,7 +251,7 @@ class Model:
         return Judgement(probability, novelty, moment, distance)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
-        """(stage, places of the candidates weighed there), for each stage that weighs any against each other."""
+        """(stage, places of the candidates weighed there), for each stage that is the last one of any candidate."""
         groups = [
             self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]
         ]
@@ -340,9 +341,10 @@ class Model:
         return calibration.weights_at(distances), float(calibration.relative(distances)[measuring].min())
 
     def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
-        """How scores are read at a stage: of the moment's, or of materials that were never felt for so long.
+        """The calibration by which scores are read at a stage: the moment's, if it is of this stage.
 
-        Or of a beginning where touches are so short that no moment comes before they are complete.
+        Otherwise the stage's own: for materials whose touches ended at an earlier stage, and for a beginning where
+        "complete" is the only row.
         """
         assert self.fusion is not None
         begun = hypothesis == "beginning" and moment is self.fusion.complete

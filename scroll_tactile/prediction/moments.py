@@ -36,7 +36,7 @@ WITHIN = 0.95  # of held-out touches are within the limits
 SURE = 0.99  # of the readouts' probability: a touch with less is compared with kept ones
 APART = 1.25  # times a moment: the next is no nearer
 LEAST_SPREAD = 1e-9
-LEAST_DISTANCE_WEIGHT = 0.5  # times the weight at the limit: of a touch beyond it that is compared at another pace
+LEAST_DISTANCE_WEIGHT = 0.5  # the least weight at another pace, as a share of that at the distance limit
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Moment:
     calibration: how their scores are read. model_weight: g. match_weight: β at an information of 1, called r, see
     `match_weight_at`. lone_match_weight: the same where noise or distance leaves the readouts no weight.
     outlier_rate: ε. model_outlier_rate: ε of the readouts' own probabilities. distance_limit: the relative distance
-    that 19 of 20 stay below. mean_excess_loss, loss_spread: mean and standard deviation of the excess loss of known
-    touches beside the kept ones.
+    that 19 of 20 complete touches stay below; infinite in other rows. mean_excess_loss, loss_spread: mean and standard
+    deviation of the excess loss of known touches beside the kept ones.
     """
 
     columns: int
@@ -64,7 +64,10 @@ class Moment:
     loss_spread: float
 
     def match_weight_at(self, match: Match, distance_weight: float) -> float:
-        """β = 1 / (1 + (1/r − 1) c) of a touch for which the readouts have this weight, c its information."""
+        """β, between `match_weight` (readouts at full weight) and `lone_match_weight` (at none), for a touch.
+
+        Each r counts as 1 / (1 + (1/r − 1) c), c the touch's information. distance_weight: of the readouts.
+        """
         beside, alone = (match_weight(r, match.information) for r in (self.match_weight, self.lone_match_weight))
         share = (1 - match.noise_share) * distance_weight
         return share * beside + (1 - share) * alone
@@ -72,7 +75,7 @@ class Moment:
     def distance_weight(self, distance: float, own_time: bool) -> float:
         """The weight of the readouts for a touch at a relative distance, in (0, 1]: less, the further it is off.
 
-        own_time: whether it is compared with beginnings: then no less than at the limit.
+        own_time: whether it is compared in its own time: then no less than 1 / limit, at another pace half of that.
         """
         if not (np.isfinite(self.distance_limit) and np.isfinite(distance)):
             return 1.0
@@ -82,7 +85,7 @@ class Moment:
     def suffices(self, probability: float, distance: float) -> bool:
         """Whether the readouts' word is enough: their highest probability, and how far off the touch is.
 
-        With one touch of each, any other looks as if noise came over it: then no probability is too low.
+        Where no touch could be held out any probability suffices: a new touch then always looks noisy.
         """
         return probability >= (SURE if self.model_outlier_rate else 0.0) and distance <= self.distance_limit
 
@@ -135,7 +138,7 @@ class Fusion:
         return self.paced[0].columns <= APART * columns and columns <= APART * self.paced[-1].columns
 
     def at_pace(self, columns: int) -> Moment:
-        """How a complete touch is judged of which the pace, not the end, makes it so many columns long."""
+        """The row for a complete touch made at another pace: the one nearest in length, by ratio."""
         return min(self.paced, key=lambda row: abs(math.log(row.columns / columns)))
 
     def latest(self, stage: int) -> Moment:

@@ -1,6 +1,7 @@
 """What no change may move: a memory is refused to an embedding whose features or fingerprint changed by a bit.
 
-These are literals of the first version, so that without any data, too, a change of the default embedding is noticed.
+These are literals of 0.11.0, when kernels began to compete, so that without any data, too, a change of the default
+embedding is noticed.
 """
 
 import hashlib
@@ -18,17 +19,18 @@ from scroll_tactile.statistics.grid import to_codes
 SCENE = Scene(sensor=sensors.BIOTAC)
 
 FINGERPRINTS = [
-    (Kernels(), "7ca64c644374904e4e1687d99224aeb4f1debc8085be2283f3aa8983defe0d3c"),
-    (Kernels(dimension=64), "57f08f53388ea400c235b2c91e24d47edb76fc83175b793c42183337022f65d3"),
+    (Kernels(), "c38f4e9de80d967cb0b725d2619c58a67bb23e412e312c0f193dc008731b11be"),
+    (Kernels(dimension=64), "d30c650cd0c542225b5ac9cebd617b4ca07150bb50c4639183f3d38b92d0ac64"),
     (Frames(), "4acbe6a3662862972b53271ce2e817fb6ca8eb8ea17ccd9fc51bdcef2be7de8f"),
     (Frames(rest=None), "c0681443478dd89f9aadb7c5fdb199e1138ca2339eecb2ec232290fc04e0b952"),
     (
         Joined(Kernels(dimension=64), Kernels(seed=2, dimension=128)),
-        "03526032c69ee247a5292ba2e52ddd94aa3c4f6c1f49c863f302e80ed51f2215",
+        "05c617ee9b5e082048ad097c6df38be60b7ff18b3434fa947505823108d072c8",
     ),
     (Maps(layout=(19,), parts=3), "7370942d5c2d7ff09600c15f971087e8312dd2d02976fa12df2f3171e987ede6"),
 ]
 CODES = "888cebaadb4cfb976bf95cf4dedfd4f4ae15a78a0161860a85e2c6e936ba80d6"
+COMPETING = "3cfbf64416f716b8756b0820808e48e02d8f0201b1a47978a4bbfc0ab11a21cd"
 # Of the first kernel of the shortest dilation, for three channels.
 THRESHOLDS = [
     *(363.5, 420.5, -63.5, 843.5, -46.5, -726.5, 1458.5, -1574.5, 1133.5, 1.5, -6267.5, 129.5),
@@ -56,6 +58,12 @@ def test_the_default_features_of_a_simulated_touch():
     for _, rows in sorted(embed_windows(embedding, image, windows).items()):
         digest.update(to_codes(rows, embedding.bound).astype("<i8").tobytes())
     assert digest.hexdigest() == CODES
+
+
+def test_the_default_competing_features_of_a_simulated_touch():
+    embedding = Kernels()
+    _, competing = embedding.embed_competing(tactile_image(SCENE.touch("denim", 0)), {}, 400)
+    assert hashlib.sha256(to_codes(competing, embedding.bound).astype("<i8").tobytes()).hexdigest() == COMPETING
 
 
 def test_the_default_accuracy_on_simulated_touches():

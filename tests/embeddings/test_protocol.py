@@ -8,7 +8,7 @@ import pytest
 from scroll_tactile import Capabilities, Frames, Joined, Kernels, TactileLearner, sensors
 from scroll_tactile.embeddings.protocol import capabilities_of, embed_windows, parts_of, require_rest, window_plan
 from scroll_tactile.errors import EmbeddingError, InputError
-from scroll_tactile.signals.windows import SHAPE, WHOLE, whole_columns
+from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, whole_columns
 from scroll_tactile.testing import check_embedding
 
 
@@ -66,8 +66,10 @@ def test_the_plan_of_windows_follows_what_is_declared():
     plan = window_plan(sensors.BIOTAC, Declaring(Capabilities(False, "widest", shrinkage=3.0)))
     assert (plan.partial, plan.judged, plan.shrinkage) == (False, "widest", 3.0)
     plain, views = window_plan(sensors.BIOTAC, Plain()), window_plan(sensors.BIOTAC, Kernels())
-    assert plain == dataclasses.replace(views, whole=0)
-    assert (plain.views, views.views) == ((), (WHOLE, SHAPE))
+    assert plain == dataclasses.replace(views, whole=0, competes=False)
+    assert (plain.views, views.views) == ((), (WHOLE, SHAPE, COMPETING))
+    two = dataclasses.replace(Kernels.capabilities, competes=False)
+    assert window_plan(sensors.BIOTAC, Declaring(two)).views == (WHOLE, SHAPE)
     joined = Joined(Kernels(dimension=64), Kernels(seed=2, dimension=64))
     assert window_plan(sensors.BIOTAC, joined) == views
     assert window_plan(sensors.BIOTAC, Joined(Kernels(dimension=64), Plain())).views == ()

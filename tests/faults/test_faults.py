@@ -32,7 +32,7 @@ def quick(name, folder, *more):
     """Run a command; its exit code and its record."""
     record = folder / "record.json"
     command = [sys.executable, FAULTS / f"{name}.py", "--quick", "--json", record, *more]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
     assert record.exists(), done.stdout + done.stderr
     return done.returncode, json.loads(record.read_text())
 

@@ -152,17 +152,18 @@ class Kernels:
         _require_image(image)
         levels, wide = to_levels(image), max(width, SHORTEST)
         if _suffices(image.shape[1], width):
-            features, competing = self._embedded(levels, windows, wide)
+            features, parts = self._embedded(levels, windows, wide)
         else:
-            features, (_, competing) = self.embed_windows(image, windows), self._read(_mirrored(levels, wide), {}, wide)
-        return features, competing
+            features, (_, parts) = self.embed_windows(image, windows), self._read(_mirrored(levels, wide), {}, wide)
+        return features, np.concatenate([*parts, np.zeros(self.dimension % (2 * GROUP), np.float32)])
 
     def _embedded(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], competing: int | None = None
-    ) -> tuple[dict[int, npt.NDArray[np.float32]], npt.NDArray[np.float32]]:
+    ) -> tuple[dict[int, npt.NDArray[np.float32]], list[npt.NDArray[np.float32]]]:
+        """Features of windows, and those of competing kernels; see `_read`."""
         columns = levels.shape[1]
         whole = {w: tuple(starts) for w, starts in windows.items() if _suffices(min(w, columns), w)}
-        features, proportions = self._read(levels, whole, competing)
+        features, proportions = self._read(levels, whole, competing) if whole or competing else ({}, [])
         for width, starts in windows.items():
             if width not in whole:
                 wide = max(width, SHORTEST)
@@ -176,11 +177,11 @@ class Kernels:
 
     def _read(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]], competing: int | None = None
-    ) -> tuple[dict[int, npt.NDArray[np.float32]], npt.NDArray[np.float32]]:
-        """Features of windows, and those of competing kernels for an image of a width; zeros where none is given."""
+    ) -> tuple[dict[int, npt.NDArray[np.float32]], list[npt.NDArray[np.float32]]]:
+        """Features of windows; and of competing kernels, dilation by dilation, where a width is given for these."""
         channels, readings = levels.shape
         contests = _contests(self.dimension, competing)
-        proportions = [np.zeros(self.dimension % (2 * GROUP) if competing else self.dimension, np.float32)]
+        proportions: list[npt.NDArray[np.float32]] = []
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
         plans = {width: _plan(channels, self._proportions(width), width) for width in windows}
         uses = {
@@ -212,8 +213,7 @@ class Kernels:
                 cut = np.stack([levels[:, start : start + width] for start in starts])
                 triangle = triangle_features(self.seed, channels, self.dimension - self._proportions(width))
                 pooled[width].append(triangle(window_statistics(cut)))
-        joined = {width: np.concatenate(parts, axis=1) for width, parts in pooled.items()}
-        return joined, np.concatenate([*proportions[1:], proportions[0]])
+        return {width: np.concatenate(parts, axis=1) for width, parts in pooled.items()}, proportions
 
     def _proportions(self, width: int) -> int:
         """How many of the features are proportions in a window of this width; the rest are of levels."""

@@ -6,8 +6,8 @@ Simulated, so that it runs anywhere: python examples/camera.py
 import numpy as np
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.errors import NoContactError
+from scroll_tactile.simulation.gel import SMALL, Gel
 
 gel = Gel(SMALL)  # presses reliefs into a gel before a small camera
 learner = TactileLearner(sensor=SMALL)  # a camera's usual embedding: Frames(), the first frame is the gel at rest

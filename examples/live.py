@@ -4,7 +4,7 @@ Simulated, so that it runs anywhere: python examples/live.py
 """
 
 from scroll_tactile import Scene, TactileLearner, sensors
-from scroll_tactile.datasets.shift import simulated_shift
+from scroll_tactile.simulation.shift import simulated_shift
 
 scene = Scene(sensor=sensors.BIOTAC)
 known, new = scene.materials[:4], scene.materials[4]

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.table1 import Table1, rows
 from scroll_tactile import Scene, Stream, sensors
-from scroll_tactile.datasets import Recordings
 
 
 class Strengths:

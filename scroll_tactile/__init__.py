@@ -10,11 +10,9 @@ import typing
 
 if typing.TYPE_CHECKING:
     from scroll_tactile import errors, recordings, sensors
-    from scroll_tactile.datasets.simulator import Scene
     from scroll_tactile.embeddings.frames import Frames
     from scroll_tactile.embeddings.joined import Joined
     from scroll_tactile.embeddings.kernels import Kernels
-    from scroll_tactile.embeddings.maps import Maps
     from scroll_tactile.embeddings.modules import ModuleEmbedding
     from scroll_tactile.embeddings.protocol import Capabilities, Embedding
     from scroll_tactile.embeddings.vision import Vision
@@ -37,6 +35,7 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.settings import Settings
     from scroll_tactile.signals.copies import Augmented
     from scroll_tactile.signals.stream import Stream
+    from scroll_tactile.simulation.scene import Scene
     from scroll_tactile.testing.embedding_checks import check_embedding
     from scroll_tactile.testing.learner_checks import check_learner
 
@@ -56,7 +55,6 @@ __all__ = [
     "LiveSession",
     "LiveState",
     "LiveTouch",
-    "Maps",
     "Merged",
     "ModuleEmbedding",
     "Observation",
@@ -97,13 +95,12 @@ _MODULES = {
     "LiveSession": "live.session",
     "LiveState": "live.answers",
     "LiveTouch": "live.answers",
-    "Maps": "embeddings.maps",
     "Merged": "results",
     "ModuleEmbedding": "embeddings.modules",
     "Observation": "results",
     "Prediction": "results",
     "Receipt": "results",
-    "Scene": "datasets.simulator",
+    "Scene": "simulation.scene",
     "Sensor": "sensors",
     "Settings": "settings",
     "SourceOptions": "pipelines.sources",

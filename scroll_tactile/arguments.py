@@ -63,6 +63,6 @@ def _advice(name: str, value: Any) -> str:
         return f". Use sensors.{value.upper().replace('-', '_')}"
     if name in ("sensor", "embedding", "augmentation") and isinstance(value, type):
         return f". Call it: {value.__name__}(...)"
-    if name == "embedding" and isinstance(value, str) and value.lower() in ("kernels", "frames", "maps", "vision"):
+    if name == "embedding" and isinstance(value, str) and value.lower() in ("kernels", "frames", "vision"):
         return f". Use {value.capitalize()}(...)"
     return ""

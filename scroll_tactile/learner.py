@@ -21,22 +21,21 @@ import numpy.typing as npt
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, window_plan
 from scroll_tactile.errors import DescriptionError, EmbeddingMismatchError, InputError, RangeWarning
-from scroll_tactile.memory.buffer import exemplar_candidates, ranked_exemplars
-from scroll_tactile.memory.contents import Contents
 from scroll_tactile.memory.descriptions import Description, checked, require_constituents
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.gate import open_store
 from scroll_tactile.memory.identity import Identity, default_kept_touches, usual_embedding, usual_exemplars
 from scroll_tactile.memory.kept import Keeping
-from scroll_tactile.memory.ledger import Ledger
-from scroll_tactile.memory.merge import Choice, MergeRules
-from scroll_tactile.memory.observations import observations
-from scroll_tactile.memory.packing import pack_memory
-from scroll_tactile.memory.reembed import finish_interrupted
-from scroll_tactile.memory.replaying import load
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
+from scroll_tactile.persistence.buffer import exemplar_candidates, ranked_exemplars
+from scroll_tactile.persistence.contents import Contents
+from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.merge import Choice, MergeRules
+from scroll_tactile.persistence.observations import observations
+from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.persistence.reembed import finish_interrupted
+from scroll_tactile.persistence.replaying import load
 from scroll_tactile.prediction.answer import Touch, answer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
@@ -51,6 +50,7 @@ from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.validation.gate import open_store
 from store.files import is_there
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class TactileLearner:
     """A memory of how materials feel: exact, durable where it has a path, and honest about what it never observed.
 
     >>> from scroll_tactile import TactileLearner, sensors
-    >>> from scroll_tactile.datasets.simulator import Scene
+    >>> from scroll_tactile.simulation.scene import Scene
     >>> scene = Scene(sensor=sensors.BIOTAC)
     >>> learner = TactileLearner(sensor=sensors.BIOTAC)
     >>> receipts = [learner.observe(name, scene.touch(name, i)) for i in range(4) for name in scene.materials[:3]]

@@ -6,8 +6,8 @@ import numpy as np
 from touches import PAD, SMALL
 
 from scroll_tactile import Joined, Kernels, TactileLearner
-from scroll_tactile.datasets.gel import SMALL as SMALL_GEL
-from scroll_tactile.datasets.gel import Gel
+from scroll_tactile.simulation.gel import SMALL as SMALL_GEL
+from scroll_tactile.simulation.gel import Gel
 
 NOISE = 0.004
 GEL = Gel()

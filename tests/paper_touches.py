@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.simulator import Scene
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.simulation.scene import Scene
 
 PAD = Sensor(name="pad", channels=10, rate=50.0, low=-2.0, high=6.0, unit="N", duration=2.0)
 PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.recordings import PRESETS
+from scroll_tactile.simulation.scene import Scene
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

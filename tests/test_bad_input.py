@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from scroll_tactile import Sensor, TactileLearner
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import NotFiniteError, StreamError, StreamTooShortError
+from scroll_tactile.simulation.scene import Scene
 
 LOW, HIGH = (0.0, -10.0, 0.0, 100.0, 0.0), (255.0, 10.0, 1.0, 900.0, 4095.0)
 PLAIN = Sensor(name="pad", channels=5, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.5)

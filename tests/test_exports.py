@@ -17,7 +17,7 @@ import store
 PACKAGES = [
     scroll_tactile,
     store,
-    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("datasets", "recordings", "testing")),
+    *(importlib.import_module(f"scroll_tactile.{name}") for name in ("recordings", "testing")),
 ]
 
 

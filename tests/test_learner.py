@@ -11,7 +11,6 @@ import torch
 
 import scroll_tactile
 from scroll_tactile import Kernels, Prediction, Sensor, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import (
     CapacityError,
     ChannelCountError,
@@ -28,6 +27,7 @@ from scroll_tactile.errors import (
     UnknownMaterialError,
 )
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
 from store import NotAStoreError, Store, StoreError
 
@@ -473,7 +473,7 @@ def test_a_memory_can_be_opened_without_naming_its_sensor_and_with_either_readou
 
 
 def test_a_checkpoint_is_written_while_observing(tmp_path, monkeypatch):
-    monkeypatch.setattr("scroll_tactile.memory.open_memory.SNAPSHOT_EVERY", 3)
+    monkeypatch.setattr("scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)
     learner._ledger.store.flush()

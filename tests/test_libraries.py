@@ -134,7 +134,6 @@ def test_every_extra_that_is_named_is_there():
         "scroll_tactile.Vision",
         "scroll_tactile.ModuleEmbedding",
         "scroll_tactile.Frames()",
-        "scroll_tactile.Maps(layout=(8, 10), cosines=90).embed(np.zeros((80, 20), np.float32))",
         "importlib.import_module('scroll_tactile.pipelines.onnx_export')",
         "importlib.import_module('scroll_tactile.finetune.fine_tune')",
     ],
@@ -160,7 +159,7 @@ def test_a_memory_is_made_and_asked_without_torch(tmp_path):
 import sys
 sys.modules["torch"] = None
 from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.simulation.scene import Scene
 scene = Scene(sensors.ROBOSKIN)
 with TactileLearner.open({str(tmp_path / "memory")!r}, sensor=sensors.ROBOSKIN) as learner:
     for name in ("felt", "oak"):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Augmented, Kernels, Sensor, TactileLearner
-from scroll_tactile.datasets.gel import SMALL as CAMERA
 from scroll_tactile.errors import LearnerError
+from scroll_tactile.simulation.gel import SMALL as CAMERA
 from scroll_tactile.testing import check_learner
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=(0.0, -1.0, 0.0), high=(1.0, 1.0, 9.0), unit="N", duration=1.0)

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.readers import biotac_slide
 from scroll_tactile import __version__
-from scroll_tactile.datasets import biotac_slide
 
 __all__ = ["MOMENTS", "THRESHOLD"]
 

@@ -18,13 +18,12 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.benchmarks.timing import circumstances
+from examples.paper.readers.labelled import Recordings, hold_out
 from scroll_tactile import Embedding
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
-from scroll_tactile.pipelines.classification import hold_out
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale

@@ -16,11 +16,11 @@ import numpy as np
 
 from examples.benchmarks.timing import circumstances
 from scroll_tactile import Kernels, Sensor, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.sources import SourceOptions
+from scroll_tactile.simulation.scene import Scene
 from store import StoreError
 
 __all__ = ["DyingExecutor", "run_fleet"]

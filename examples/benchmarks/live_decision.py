@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 from rich.table import Table
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.replay import novelty_area, rotations
 from scroll_tactile.cli.terminal import console, percent
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import decision_rule

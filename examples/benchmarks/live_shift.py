@@ -12,14 +12,14 @@ import numpy.typing as npt
 from rich.table import Table
 
 from examples.benchmarks.timing import circumstances
+from examples.paper.readers.biotac_slide import load
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.blas import one_thread
 from scroll_tactile.cli.terminal import console
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.datasets.shift import Shift, quiet_noise, resting_level, shift_of, simulated_shift
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.live.answers import LiveTouch
+from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import Shift, quiet_noise, resting_level, shift_of, simulated_shift
 
 __all__ = ["run_shifts", "show_shifts"]
 

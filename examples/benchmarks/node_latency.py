@@ -19,11 +19,11 @@ from rich.table import Table
 from examples.benchmarks.timing import circumstances
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.cli.terminal import console
-from scroll_tactile.datasets.shift import simulated_shift
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.ros2 import TactileNode
 from scroll_tactile.ros2.interfaces import interface, require_rclpy
+from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import simulated_shift
 
 __all__ = ["run_node", "show_node"]
 

@@ -21,15 +21,15 @@ import torch
 from examples.benchmarks.checkouts import Worker, checkouts, disk_bytes, in_turns, write_touches
 from examples.benchmarks.timing import Timing, circumstances, timed
 from examples.benchmarks.vision_speed import BareResNet
+from examples.paper.readers.biotac_slide import load
+from examples.paper.readers.labelled import hold_out
 from scroll_tactile import sensors
-from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import one_torch_thread
-from scroll_tactile.pipelines.classification import hold_out
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image, three_planes
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["Sizes", "run_speed"]
 

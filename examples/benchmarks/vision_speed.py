@@ -23,9 +23,8 @@ from torch import nn
 from torch.nn import functional
 
 from examples.benchmarks.timing import circumstances, take_turns
+from examples.paper.readers.biotac_slide import load
 from scroll_tactile import sensors
-from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, Run, RuntimeName, make_runtime, one_torch_thread
 from scroll_tactile.embeddings.vision import Vision, to_planes
@@ -33,6 +32,7 @@ from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["BareResNet", "run_vision"]
 

@@ -36,7 +36,7 @@ def reembed(
     Interrupted, start it again to go on.
     """
     from scroll_tactile.memory.identity import Identity, usual_embedding
-    from scroll_tactile.memory.reembed import finish_interrupted
+    from scroll_tactile.persistence.reembed import finish_interrupted
     from scroll_tactile.prediction.reembedding import reembed_memory
 
     finish_interrupted(folder)
@@ -169,9 +169,9 @@ def list_observations(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each.")] = False,
 ) -> None:
     """List the observations: number, material, time, what became of it (kept, compacted, retracted), and source."""
-    from scroll_tactile.memory.gate import MemoryStore
-    from scroll_tactile.memory.observations import observations
+    from scroll_tactile.persistence.observations import observations
     from scroll_tactile.pipelines.plain_export import date_of
+    from scroll_tactile.validation.gate import MemoryStore
 
     with MemoryStore.open(folder, mode="read") as store:
         found = observations(store)

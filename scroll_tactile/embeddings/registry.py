@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlia
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES
 from scroll_tactile.embeddings.protocol import Embedding
@@ -40,14 +40,12 @@ __all__ = [
 MOST_DEPTH: Final = 16  # mappings and lists within each other
 MOST_PARTS: Final = 8  # of a Joined
 MOST_COSINES = 2**14
-MOST_WEIGHTS = 2**27  # of all cosines together: 1 GiB
 MOST_PIXELS = 2**24  # of a resting picture, times colours: 64 MiB
 
 _KINDS = {  # each a module's name, too
     "frames": "Frames",
     "joined": "Joined",
     "kernels": "Kernels",
-    "maps": "Maps",
     "vision": "Vision",
 }
 
@@ -114,29 +112,6 @@ class VisionConfiguration(Configuration):
     precision: Literal["float32", "bfloat16"]
 
 
-class MapsConfiguration(Configuration):
-    """Of `Maps`."""
-
-    kind: Literal["maps"]
-    layout: Annotated[list[Annotated[int, Field(ge=1, le=2**12)]], Field(min_length=1, max_length=2)]
-    views: Annotated[list[Literal["as-felt", "centre", "corner"]], Field(min_length=1, max_length=3)]
-    parts: Annotated[int, Field(ge=1, le=2**10)]
-    cosines: Annotated[int, Field(ge=0, le=MOST_COSINES)]
-    reach: Annotated[int | FiniteFloat, Field(gt=0)]  # 3 and 3.0 have other fingerprints
-    seed: _Seed
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        values = math.prod(self.layout) * (self.parts + 3)
-        if len(self.views) * values > MOST_COSINES and not self.cosines:
-            raise ValueError(
-                f"maps of {values} values in {len(self.views)} views are more than {MOST_COSINES} features"
-            )
-        if self.cosines * values > MOST_WEIGHTS:
-            raise ValueError(f"{self.cosines} cosines of {values} values need more than {MOST_WEIGHTS} weights")
-        return self
-
-
 class JoinedConfiguration(Configuration):
     """Of `Joined`, part by part."""
 
@@ -144,7 +119,7 @@ class JoinedConfiguration(Configuration):
     parts: Annotated[list[AnyConfiguration], Field(min_length=2, max_length=MOST_PARTS)]
 
 
-_Single: TypeAlias = KernelsConfiguration | FramesConfiguration | VisionConfiguration | MapsConfiguration
+_Single: TypeAlias = KernelsConfiguration | FramesConfiguration | VisionConfiguration
 AnyConfiguration: TypeAlias = Annotated[_Single | JoinedConfiguration, Field(discriminator="kind")]
 JoinedConfiguration.model_rebuild()
 ADAPTER: TypeAdapter[AnyConfiguration] = TypeAdapter(AnyConfiguration)

@@ -1,1 +1,1 @@
-"""The memory: its state, how it is kept in a store, and what it may be opened with."""
+"""What was learned: state, rows, identity, exemplars, kept touches, descriptions and the tuned model."""

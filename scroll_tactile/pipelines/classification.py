@@ -6,17 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Answers", "Labelled", "evaluate", "hold_out", "missing", "observe_all"]
+__all__ = ["Answers", "Labelled", "evaluate", "missing", "observe_all"]
 
 Labelled = tuple[str, Stream]
 """A material and a touch of it."""
@@ -52,13 +48,6 @@ class Answers:
             if predicted and predicted != truth
         )
         return [(*pair, count) for pair, count in sorted(pairs.items(), key=lambda entry: (-entry[1], entry[0]))]
-
-
-def hold_out(recordings: Recordings, tested: npt.NDArray[np.bool_]) -> tuple[list[Labelled], list[Labelled]]:
-    """The touches that are learned, and those that are held out for the test: of N, bool of shape (N,)."""
-    touches = list(zip(recordings.materials, recordings.streams, tested.tolist(), strict=True))
-    learned = [(name, stream) for name, stream, out in touches if not out]
-    return learned, [(name, stream) for name, stream, out in touches if out]
 
 
 def evaluate(learner: TactileLearner, touches: Sequence[Labelled], *, seconds: float | None = None) -> Answers:

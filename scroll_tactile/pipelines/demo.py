@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile import Kernels
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["Demo", "Half", "Outcome"]
 

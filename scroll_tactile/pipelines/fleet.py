@@ -32,8 +32,8 @@ from scroll_tactile.errors import (
     ScrollTactileError,
 )
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.merge import Choice, MergeRules
 from scroll_tactile.memory.rows import SOURCE
+from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.pipelines.addresses import expand, fetched
 from scroll_tactile.pipelines.engines import Engine, engine, require_workers
 from scroll_tactile.pipelines.jobs import Made, Making, hush, learn_job

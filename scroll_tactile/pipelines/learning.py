@@ -10,7 +10,7 @@ from time import monotonic
 
 from scroll_tactile.errors import InputError, printable
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.contents import refusal
+from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.pipelines.classification import Answers
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches

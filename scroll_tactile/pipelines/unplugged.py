@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scroll_tactile import Kernels
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["Unplugged", "pull_the_plug"]
 

@@ -24,16 +24,16 @@ from weakref import ReferenceType, ref
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.memory.gate import WRONG
-from scroll_tactile.memory.ledger import Ledger
 from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
 from scroll_tactile.settings import Settings
+from scroll_tactile.validation.gate import WRONG
 from store import StoreError
 
 logger = logging.getLogger(__name__)

@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity, default_kept_touches
 from scroll_tactile.memory.kept import Keeping, usual_kept
-from scroll_tactile.memory.reembed import Reembedding, finish_interrupted
 from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.reembed import Reembedding, finish_interrupted
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.validation.gate import MemoryStore
 from store import Store
 
 __all__ = ["reembed_memory", "reembedding"]

@@ -26,7 +26,6 @@ from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
-from scroll_tactile.memory.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.moments import Fusion, Moment, Trajectories
@@ -36,6 +35,7 @@ from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.readout_arrays import readout_from_arrays, readout_to_arrays
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
+from scroll_tactile.validation.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from store import Checkpoint
 
 __all__ = ["NAME", "banks_to_arrays", "model_from", "model_to_arrays", "with_banks"]

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.datasets.gel import Gel
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import EmptyStreamError, LearnerError, NotFiniteError, StreamError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.simulation.gel import Gel
+from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["check_learner"]
 

@@ -8,10 +8,10 @@ from commands import run
 from examples.benchmarks import live_shift
 from examples.benchmarks.live_shift import _scored
 from scroll_tactile import sensors
-from scroll_tactile.datasets.shift import Shift, Truth
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.results import Prediction
+from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import Shift, Truth
 
 
 def test_shifts_are_measured(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ import pytest
 from commands import refused, run
 
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
 NAMES = ("silk", "wool")

@@ -13,7 +13,7 @@ import pytest
 from commands import refused, run
 
 from scroll_tactile import Kernels, TactileLearner, __version__, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
 SMALL = ["--materials", "5", "--touches", "3", "--held-out", "2", "--features", "64"]

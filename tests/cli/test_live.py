@@ -13,8 +13,8 @@ from touches import PAD, SMALL
 
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.cli import replay
-from scroll_tactile.datasets.shift import simulated_shift
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import simulated_shift
 
 SCENE = Scene(sensors.ROBOSKIN)
 SHIFT = simulated_shift(SCENE, ["silk", "wool"], seconds=22)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scroll_tactile import sensors
 from scroll_tactile.cli.application import app
 from scroll_tactile.cli.wording import in_options, typed
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.BIOTAC)
 

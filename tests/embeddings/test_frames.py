@@ -5,7 +5,6 @@ import pytest
 from commands import refused, run
 
 from scroll_tactile import Frames, Joined, Kernels, Sensor, TactileLearner, sensors
-from scroll_tactile.datasets.gel import MATERIALS, SMALL, Gel
 from scroll_tactile.embeddings.frames import LIGHT, STRENGTHS, SURFACE, light, surface
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import (
@@ -20,6 +19,7 @@ from scroll_tactile.errors import (
 from scroll_tactile.signals.contact import image_of
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.simulation.gel import MATERIALS, SMALL, Gel
 from scroll_tactile.statistics.grid import mean_code
 from scroll_tactile.statistics.moments import SecondMoment
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Frames, Joined, Kernels, Maps, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.banks import bank
 from scroll_tactile.embeddings.protocol import embed_windows, window_plan
 from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.grid import to_codes
 
 SCENE = Scene(sensor=sensors.BIOTAC)

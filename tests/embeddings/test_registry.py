@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision
+from scroll_tactile import Frames, Joined, Kernels, ModuleEmbedding, Vision
 from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import PUBLISHED
@@ -19,7 +19,6 @@ from scroll_tactile.errors import EmbeddingError, WeightsError
 
 PICTURE = np.random.default_rng(0).uniform(0, 255, (24, 32, 3)).astype(np.float32)
 KERNELS = {"kind": "kernels", "dimension": 64, "seed": 0}
-MAPS = Maps(layout=(2, 3)).configuration()
 FRAMES = Frames().configuration()
 VISION = {
     "kind": "vision",
@@ -37,9 +36,8 @@ SHIPPED = {
     "frames": lambda: Frames(rest=None),
     "frames with a picture": lambda: Frames(rest=PICTURE),
     "frames by cosines": lambda: Frames(cosines=64, seed=2),
-    "maps": lambda: Maps(layout=(4, 5), parts=2, views=["corner"], cosines=64, reach=3, seed=2),
     "random vision": lambda: Vision(None, seed=1, stages=(0, 2)),
-    "joined": lambda: Joined(Kernels(dimension=64), Joined(Kernels(dimension=64, seed=2), Maps(layout=(5,)))),
+    "joined": lambda: Joined(Kernels(dimension=64), Joined(Kernels(dimension=64, seed=2), Frames(rest=None))),
 }
 
 
@@ -94,14 +92,10 @@ def test_what_could_not_be_made_again_has_no_configuration(embedding):
         ({}, "Unable to extract tag"),
         ([], "came \\[\\]"),
         (None, "came None"),
-        ({"kind": "thermal"}, "of kind frames, joined, kernels, maps, vision; it: .*'thermal'"),
+        ({"kind": "thermal"}, "of kind frames, joined, kernels, vision; it: .*'thermal'"),
         ({"kind": "joined", "parts": [KERNELS] * 9}, "at most 8 items"),
         ({"kind": "joined", "parts": [KERNELS]}, "at least 2 items"),
         ({"kind": "joined", "parts": [KERNELS, KERNELS | {"seed": -1}]}, "joined.parts.1.kernels.seed"),
-        (MAPS | {"layout": [10**9]}, "maps.layout.0"),
-        (MAPS | {"layout": [4096, 4096]}, "more than 16384 features"),
-        (MAPS | {"layout": [4096, 4096], "cosines": 1000}, "weights"),
-        (MAPS | {"reach": float("nan")}, "finite number"),
         (FRAMES | {"cosines": MOST_COSINES + 1}, "frames.cosines"),
         (FRAMES | {"rest": {"shape": [2**14, 2**14, 3], "float32": ""}}, "of at most 16777216 values"),
         (FRAMES | {"rest": {"shape": [1, 1, 3], "float32": "%%"}}, "picture in a Frames' configuration is damaged"),
@@ -134,7 +128,7 @@ JSON = st.recursive(
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.sampled_from([KERNELS, MAPS, FRAMES, VISION | {"weights": {"name": None, "sha256": "0" * 64}}]), st.data())
+@given(st.sampled_from([KERNELS, FRAMES, VISION | {"weights": {"name": None, "sha256": "0" * 64}}]), st.data())
 def test_any_one_field_of_any_value_gives_an_embedding_or_a_typed_error(configuration, data):
     changed = configuration | {data.draw(st.sampled_from(sorted(configuration))): data.draw(JSON)}
     try:
@@ -195,11 +189,11 @@ class TestWeights:
 
 IMPORTS = """
 import sys, tempfile
-import scroll_tactile.datasets.gel, scroll_tactile.testing
-from scroll_tactile import Frames, Joined, Kernels, Maps, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+import scroll_tactile.simulation.gel, scroll_tactile.testing
+from scroll_tactile import Frames, Joined, Kernels, TactileLearner, sensors
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.embeddings.registry import configuration_of, from_configuration
-for embedding in (Kernels(), Frames(), Maps(layout=(3,)), Joined(Kernels(), Kernels(seed=2))):
+for embedding in (Kernels(), Frames(), Joined(Kernels(), Kernels(seed=2))):
     from_configuration(configuration_of(embedding))
 scene = Scene(sensor=sensors.BIOTAC)
 with tempfile.TemporaryDirectory() as folder:

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from images import image
 
+from examples.paper.readers.biotac_slide import load
 from scroll_tactile import Vision
-from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.vision import pool_windows, to_planes
 from scroll_tactile.errors import InputError

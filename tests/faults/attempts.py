@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import scroll_tactile.memory.open_memory
+import scroll_tactile.persistence.open_memory
 from faults.model import Operation, Other, State, opened, perform, seen, settle
 from store import StoreError
 
@@ -34,7 +34,7 @@ class Attempt:
     ) -> None:
         self.operation, self.path, self.home, self.every = operation, path, home, every
         self.learner: Any = None
-        scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = NEVER
+        scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = NEVER
         if start is None:
             return
         copied(start, path)
@@ -54,7 +54,7 @@ class Attempt:
 
     def do(self) -> Any:
         """Do it, and wait for what goes on behind it."""
-        scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = self.every
+        scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = self.every
         try:
             if self.operation[0] == "open":
                 self.learner = opened(self.path)
@@ -65,7 +65,7 @@ class Attempt:
             self.learner._ledger.store._checkpoints.wait()
             return result
         finally:
-            scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = NEVER
+            scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = NEVER
 
 
 class Trials:

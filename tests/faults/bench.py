@@ -40,9 +40,9 @@ from faults.received import (
     read,
 )
 from scroll_tactile import TactileLearner
-from scroll_tactile.memory.gate import MemoryStore
-from scroll_tactile.memory.replaying import replay
 from scroll_tactile.memory.rows import pack_codes
+from scroll_tactile.persistence.replaying import replay
+from scroll_tactile.validation.gate import MemoryStore
 from store import Record, VersionError
 from store.encoding import decode_payload, encode_payload
 from store.records import from_json

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from forging import log_of, named_in
 
-import scroll_tactile.memory.open_memory
+import scroll_tactile.persistence.open_memory
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.model import Operation, Other, State, after, expected, opened, perform, seen, warm
 from faults.plans import prepare
@@ -74,7 +74,7 @@ class Memory:
 
 def prepared(home: Path, others: dict[str, Other]) -> list[Memory]:
     """The same history twice: closed at its end, and left as a crash would leave it."""
-    scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = NEVER
+    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = NEVER
     path, states = home / "memory", [State()]
     learner = opened(path)
     for operation in HISTORY:

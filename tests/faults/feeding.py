@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import Kernels, Sensor, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.results import Receipt
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.grid import to_codes
 
 BIOTAC: dict[str, Any] = {"sensor": sensors.BIOTAC, "embedding": Kernels()}

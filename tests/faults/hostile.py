@@ -42,7 +42,7 @@ from faults.named import NAMED
 from faults.recorded import RecordingBench
 from faults.recording_attacks import ATTACKS
 from faults.zygote import Child, Zygote
-from scroll_tactile.memory.gate import Gate
+from scroll_tactile.validation.gate import Gate
 
 NAMES = 2**40  # the number of the first case that has a name
 BATCH = 250  # cases a process

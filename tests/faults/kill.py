@@ -19,7 +19,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.memory.open_memory
+import scroll_tactile.persistence.open_memory
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.model import Operation, Other, State, after, opened, perform, seen, settle, unsound_copies, warm
 from faults.plans import KINDS, history, prepare
@@ -34,7 +34,7 @@ PATIENCE = 120  # seconds without a word from a child
 
 def work(channel: Connection, path: Path, home: Path, operations: list[Operation]) -> None:
     """The child: open the memory, do the operations; "close": close it; "idle": wait to be killed."""
-    scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
     with warnings_told(lambda text: channel.send(("warned", text))):
         channel.send(("begin", "open"))
         learner = opened(path)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.planting import Patches, nothing
-from scroll_tactile.memory import ledger
+from scroll_tactile.persistence import ledger
 from store import backup, checkpoint_files, checkpoints, layout, log_writer
 from store.exceptions import reported
 from store.files import sync_file, sync_folder, sync_tree

@@ -23,7 +23,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.memory.open_memory
+import scroll_tactile.persistence.open_memory
 from faults import shim as watch
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.disks import STYLES, Disk, Event, events
@@ -196,7 +196,7 @@ class Cutting:
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many disks as asked."""
     disks = 30 if options.quick else options.disks
-    scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
     one_scale()
     warm()
     with folder(options, in_memory=True) as home:

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from touches import stream
 
-import scroll_tactile.memory.open_memory
+import scroll_tactile.persistence.open_memory
 from faults.common import folder, parser, progress, run, warnings_told
 from faults.model import Operation, State, after, expected, opened, perform, seen, warm
 from faults.plans import draw
@@ -120,7 +120,7 @@ def _taken_over(path: Path, children: list[Any], told: Counter[str], failures: l
 
 def write(channel: Connection, path: Path, seed: int, seconds: float) -> None:
     """The writer: random operations; tells each, the instants of its beginning and its end, and what it returned."""
-    scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
     rng, state = random.Random(seed), State()
     with opened(path) as learner:
         channel.send("ready")

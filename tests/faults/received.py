@@ -27,8 +27,8 @@ from faults.model import Operation, _kept, _pool, opened, perform
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.cli.application import app
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.pipelines.plain_export import export_plain
+from scroll_tactile.validation.gate import check_memory
 from store import Store, StoreError, check_store, repair_store
 
 OURS = (ScrollTactileError, StoreError)

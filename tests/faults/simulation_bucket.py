@@ -11,7 +11,7 @@ from faults.simulation_disk import flip
 from faults.simulation_events import OneMemory
 from faults.simulation_model import Rows
 from faults.simulation_world import Machine
-from scroll_tactile.memory.merge import MergeRules
+from scroll_tactile.persistence.merge import MergeRules
 from store import StoreError
 
 MOST = 24  # touches of a memory that is merged

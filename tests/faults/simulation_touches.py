@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from touches import SmallSample
 
-import scroll_tactile.memory.open_memory
 import scroll_tactile.memory.state
+import scroll_tactile.persistence.open_memory
 from faults import simulation_model as model
 from faults.simulation_model import Expected
 from scroll_tactile import Sensor, TactileLearner
@@ -59,7 +59,7 @@ def fed(pairs: tuple[model.Pair, ...], embedding: str) -> TactileLearner:
 def prepare() -> None:
     """Have what a touch comes to be worked out once."""
     scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]
-    scroll_tactile.memory.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
     worked, known = FeatureExtractor.codes, dict[Any, Any]()
 
     def codes(self: FeatureExtractor, image: Any, key: bytes) -> Any:

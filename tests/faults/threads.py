@@ -43,8 +43,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 import scroll_tactile.learner
-import scroll_tactile.memory.open_memory
 import scroll_tactile.memory.state
+import scroll_tactile.persistence.open_memory
 import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.model
@@ -561,7 +561,7 @@ def read_when_asked() -> Iterator[None]:
         for place in (own.model, own.fitting, scroll_tactile.readouts.readout):
             patched.enter_context(patch.object(place, "EAGER", FEW))
         patched.enter_context(patch.object(scroll_tactile.readouts.readout, "MOST_HELD", 2 * FEW))
-        patched.enter_context(patch.object(scroll_tactile.memory.open_memory, "MOST_ADDED", FEW))
+        patched.enter_context(patch.object(scroll_tactile.persistence.open_memory, "MOST_ADDED", FEW))
         patched.enter_context(patch.object(scroll_tactile.memory.state, "TouchSample", FewSampled))
         yield
 

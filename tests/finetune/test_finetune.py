@@ -9,7 +9,6 @@ import torch
 from touches import Windowed
 
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
 from scroll_tactile.finetune import training
@@ -17,6 +16,7 @@ from scroll_tactile.finetune.network import TouchFeatures, TrainingSample, Tuned
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.simulation.scene import Scene
 from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
 from scroll_tactile.prediction.moments import Trajectories
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction
+from scroll_tactile.simulation.scene import Scene
 
 SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6)
 SCENE = Scene(sensor=SKIN, seed=1)

@@ -6,10 +6,10 @@ from live_touches import learner, shift, slide
 from touches import PAD
 
 from scroll_tactile import Sensor, TactileLearner, sensors
-from scroll_tactile.datasets.shift import quiet_noise, resting_level, shift_of, simulated_shift
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.detector import ContactDetector
+from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import quiet_noise, resting_level, shift_of, simulated_shift
 
 
 def found(sensor, rows, false_contacts=1.0, size=10_000):

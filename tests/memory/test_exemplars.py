@@ -303,9 +303,9 @@ def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
 
 def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
     from examples.benchmarks.buffers import run_buffers
-    from scroll_tactile.datasets import Recordings
-    from scroll_tactile.datasets.simulator import Scene
+    from examples.paper.readers.labelled import Recordings
     from scroll_tactile.sensors import Sensor
+    from scroll_tactile.simulation.scene import Scene
 
     pad = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
     scene = Scene(sensor=pad)

@@ -17,9 +17,9 @@ import pytest
 import store.layout
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.validation.gate import check_memory
 from store import Store, VersionError, check_store
 from store.layout import read_current, write_current
 

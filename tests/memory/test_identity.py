@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import Joined, Kernels, Maps, Sensor, TactileLearner, Vision
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision
 from scroll_tactile.embeddings.protocol import capabilities_of, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
@@ -22,7 +23,6 @@ EMBEDDINGS = {
     "kernels": lambda: Kernels(dimension=64),
     "seeded kernels": lambda: Kernels(dimension=64, seed=3),
     "joined": lambda: Joined(Kernels(dimension=64), Kernels(dimension=128, seed=1)),
-    "maps": lambda: Maps(layout=(3,)),
 }
 
 

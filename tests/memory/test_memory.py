@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
-from scroll_tactile.datasets import biotac_slide
+from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import CapacityError, MismatchError
 from scroll_tactile.memory.rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.memory.state import Memory

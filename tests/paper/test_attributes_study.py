@@ -7,9 +7,9 @@ import pytest
 from commands import refused, run
 
 from examples.paper.fabric.attributes_study import Attributes, summary
+from examples.paper.readers.grades import read_grades
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile import Sensor
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.grades import read_grades
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.signals.stream import validate
 

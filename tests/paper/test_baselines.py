@@ -5,15 +5,15 @@ import pytest
 from paper_touches import PATCH
 
 from examples.paper.studies.baselines import BASELINES, COPIES, Sometimes, baseline
+from examples.paper.studies.perturbations import noise
 from examples.paper.systems.catalogue import Catalogue
 from examples.paper.systems.descent import Course
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import silent
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.metrics import accuracy
-from scroll_tactile.pipelines.robustness import noise
 from scroll_tactile.signals.augmentation import Augmentation
+from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(PATCH, seed=0)
 NAMES = SCENE.materials[:3]

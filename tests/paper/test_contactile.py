@@ -12,12 +12,12 @@ from commands import refused, run
 from examples.paper.fabric.contactile_rows import EPOCHAL, OURS, PAPER, ROWS
 from examples.paper.fabric.contactile_study import HAND, Contactile, rows, simulated
 from examples.paper.fabric.simulated import FabricScene
+from examples.paper.readers.labelled import Recordings
 from examples.paper.systems.constituent_nets import presence_loss
 from examples.paper.systems.constituent_squares import Heads, Shares
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import BIOTAC
+from scroll_tactile.simulation.scene import Scene
 
 SMALL: dict[str, Any] = {"epochs": 1, "biotac_epochs": 1, "every": 24}
 

@@ -10,12 +10,12 @@ from commands import refused, run
 from paper_touches import recorded, untimed
 
 from examples.paper.commands.continual_command import parse_sizes
+from examples.paper.readers.labelled import Recordings
+from examples.paper.studies.continual import accuracy_of, curve, forgetting, forgetting_of, summary, tally
 from examples.paper.studies.continual_study import Continual
 from examples.paper.studies.schedules import part_ends
 from scroll_tactile import Kernels, sensors
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.continual import accuracy_of, curve, forgetting, forgetting_of, summary, tally
 
 SMALL: dict[str, Any] = {"sizes": (0, 8, "all"), "epochs": 1}
 

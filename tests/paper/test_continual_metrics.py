@@ -12,11 +12,11 @@ from commands import refused, run
 from paper_touches import PATCH, recorded, untimed
 from torch import nn
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.continual_metrics import anytime_area, backward_transfer, metrics
 from examples.paper.studies.fleet_study import deal, federated
 from examples.paper.studies.metrics_study import METHODS, STREAMS, ContinualMetrics, summary
 from examples.paper.studies.random_convolution import random_convolution
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 
 SMALL: dict[str, Any] = {"every": 6, "capacity": 8, "features": 64, "robots": (3,), "alphas": (0.1,)}

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from commands import run
 
+from examples.paper.fabric.fabric_protocol import score, score_compositions
 from examples.paper.fabric.fabric_study import Letters, SlideTransfer, directions, summary
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.fabric_slide import CPM_FINGER, Slides
-from scroll_tactile.datasets.letter_spike import DOTS, GRID, NUSKIN, dots_of
+from examples.paper.readers.fabric_slide import CPM_FINGER, Slides
+from examples.paper.readers.labelled import Recordings
+from examples.paper.readers.letter_spike import DOTS, GRID, NUSKIN, dots_of
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.fabric import score, score_compositions
 from scroll_tactile.results import Composition, Constituent, Prediction
 from scroll_tactile.signals.stream import validate
 
@@ -148,8 +148,8 @@ def test_slides_are_classified_at_another_force_and_speed(slides, tmp_path):
 
 
 def test_the_commands_report_write_and_resume(letters, slides, tmp_path, monkeypatch):
-    monkeypatch.setattr("scroll_tactile.datasets.letter_spike.load", lambda data, seed: letters)
-    monkeypatch.setattr("scroll_tactile.datasets.fabric_slide.load", lambda data, seed: slides)
+    monkeypatch.setattr("examples.paper.readers.letter_spike.load", lambda data, seed: letters)
+    monkeypatch.setattr("examples.paper.readers.fabric_slide.load", lambda data, seed: slides)
     common = ["--data", tmp_path, "--run", tmp_path / "run", "--json", tmp_path / "out.json"]
     reported = run("fabric", "letters", *common, "--folds", "1", "--groups", "2", "--cosines", "128")
     assert reported.exit_code == 0, reported.output

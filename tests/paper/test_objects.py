@@ -8,12 +8,12 @@ from commands import refused, run
 
 from examples.paper.fabric.objects import Objects, most_often, object_groups, summary
 from examples.paper.fabric.unseen import fit_heads
-from scroll_tactile.datasets import Recordings, physiclear
-from scroll_tactile.datasets.gel import SMALL, Gel
+from examples.paper.readers.labelled import Recordings, physiclear
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.readouts.attributes import solve
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.simulation.gel import SMALL, Gel
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.statistics import Statistics
 

@@ -15,10 +15,10 @@ from examples.paper.studies.peers import (
 )
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from scroll_tactile import Kernels, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.simulation.scene import Scene
 
 NAMES = ("felt", "oak", "silk", "wool")
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from paper_touches import PAD
 
+from examples.paper.studies.perturbations import dead, drift, gaussian, length, noise, speed
 from scroll_tactile import sensors
 from scroll_tactile.errors import InputError, StreamTooShortError
-from scroll_tactile.pipelines.robustness import dead, drift, gaussian, length, noise, speed
 from scroll_tactile.signals.stream import validate
 
 DRAWN = (noise, gaussian, dead, drift)

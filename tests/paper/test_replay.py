@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from paper_touches import recorded, untimed
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.replay import Replay, subset, summary
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import DatasetError, InputError
 
 

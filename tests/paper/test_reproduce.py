@@ -12,10 +12,10 @@ from commands import refused, run
 from paper_touches import PATCH, recorded, untimed
 
 from examples.paper.commands.options import SETS
+from examples.paper.readers.labelled import Recordings, physiclear
 from examples.paper.runs.cells import Cell, pooled, split, thinned, time_left
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import PAPER, Table1, blocked, rows
-from scroll_tactile.datasets import Recordings, physiclear
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import DatasetError, InputError
 

@@ -8,6 +8,7 @@ import pytest
 from commands import refused, run
 from paper_touches import PATCH, recorded, untimed
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.default_learner import Checkout, answers
 from examples.paper.studies.robustness_study import (
     NOVELTY,
@@ -18,9 +19,8 @@ from examples.paper.studies.robustness_study import (
     Simulated,
     summary,
 )
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.errors import InputError
+from scroll_tactile.simulation.gel import Gel
 
 HERE = Path(__file__).resolve().parents[2]
 ROWS = [*PERTURBED, NOVELTY]

@@ -4,8 +4,8 @@ import pytest
 
 from examples.paper.studies.schedules import SCHEDULES, ScheduleName, arrange, si_blurry, try_schedules
 from scroll_tactile import sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.sample import TouchSample
 
 NAMES = [f"m{number}" for number in range(8) for _ in range(3)]

@@ -9,11 +9,11 @@ from paper_touches import PAD, untimed
 
 from examples.paper import drawing as plots
 from examples.paper.plots import draw_robustness, robustness_curves
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.strengths_study import Strengths, ours, summary
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.gel import Gel
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.simulation.gel import Gel
 
 MATERIALS = ("dull", "loud", "lost")
 

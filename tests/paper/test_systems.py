@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 
+from examples.paper.readers.physiclear import HALF_SIZE
 from examples.paper.systems.catalogue import SYSTEMS, Catalogue
 from examples.paper.systems.descent import Batches, Course, Precision, TrainingError, descend, logits_of, seeded
 from examples.paper.systems.inputs import average_columns, one_width, picture
@@ -20,7 +21,6 @@ from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System, silent, unwatched
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile import Vision
-from scroll_tactile.datasets.physiclear import HALF_SIZE
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from commands import refused, run
 
+from examples.paper.readers.labelled import Recordings
+from examples.paper.readers.physiclear import HALF_SIZE
 from examples.paper.systems.system_protocol import silent
 from examples.paper.transfer.across_sensors import ALONE, WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
@@ -21,8 +23,6 @@ from examples.paper.transfer.few_touches import (
 from examples.paper.transfer.shared_features import SharedFeatures
 from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows, some_frames
 from scroll_tactile import Kernels, Vision
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.physiclear import HALF_SIZE
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor

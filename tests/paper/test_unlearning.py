@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from paper_touches import PATCH, recorded, untimed
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.recursive_ridge import RecursiveRidge
 from examples.paper.studies.unlearning_study import (
     Unlearning,
@@ -20,7 +21,6 @@ from examples.paper.studies.unlearning_study import (
     ridge_from_scratch,
     summary,
 )
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 
 

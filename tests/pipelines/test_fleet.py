@@ -15,7 +15,7 @@ from touches import PAD, SETTINGS, fed, require_same, stream
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
-from scroll_tactile.memory.ledger import Ledger
+from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.pipelines import engines, fleet, jobs, steps
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.learning import learn_sources

@@ -8,7 +8,7 @@ import pytest
 from touches import PAD, SMALL, SmallSample, stream
 
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets.simulator import Scene
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import SecondMoment
 
 SCENE = Scene(sensor=sensors.ROBOSKIN, seed=2)

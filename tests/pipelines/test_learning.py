@@ -11,8 +11,8 @@ from live_touches import GEL, frames, gel_learner, shift
 from live_touches import learner as live_learner
 from touches import PAD, SETTINGS, fed, filled, require_same, stream
 
+from examples.paper.readers import biotac_slide
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import FieldError, InputError, MaterialError
 from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.learning import evaluate_sources, learn_sources

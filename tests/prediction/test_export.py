@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision, sensors
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.onnx_export import export_onnx
 from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.simulation.scene import Scene
 
 pytest.importorskip("onnx", reason="onnx is not installed")
 runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace
@@ -14,6 +13,7 @@ from scroll_tactile.prediction.held_out_touches import held_out_touches
 from scroll_tactile.prediction.judging import judged
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.report.growing import _without
+from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import one_thread
 
 SKIN = Sensor(name="skin", channels=6, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.2, non_finite="missing")

@@ -216,7 +216,7 @@ def relabelling(learner, names, tmp_path):
 def test_of_many_materials_too_a_live_touch_is_answered_as_it_was_when_it_began(
     many, monkeypatch, tmp_path, change, most_added
 ):
-    monkeypatch.setattr("scroll_tactile.memory.open_memory.MOST_ADDED", most_added)
+    monkeypatch.setattr("scroll_tactile.persistence.open_memory.MOST_ADDED", most_added)
     before = copy.deepcopy(many)
     with many.live(contact="manual", risk=1e-12) as live:
         live.begin()

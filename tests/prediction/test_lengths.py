@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from touches import Windowed
 
+from examples.paper.readers import biotac_slide
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.datasets import biotac_slide
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensor=sensors.BIOTAC, seed=3)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.readouts.calibration import FEWEST
+from scroll_tactile.simulation.scene import Scene
 
 SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6, non_finite="missing")
 SCENE = Scene(sensor=SKIN, seed=1)

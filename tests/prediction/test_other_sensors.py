@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.datasets.simulator import EVENT_SKIN, LIGHT_PAD, MATERIALS, Scene
 from scroll_tactile.pipelines.metrics import accuracy, calibration_error
+from scroll_tactile.simulation.scene import EVENT_SKIN, LIGHT_PAD, MATERIALS, Scene
 
 SENSORS = {"events": EVENT_SKIN, "light": LIGHT_PAD}
 TOUCHES, TESTS = 12, 6

@@ -6,7 +6,6 @@ from touches import PAD, SMALL, fed
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.pipelines.metrics import calibration_error
@@ -15,6 +14,7 @@ from scroll_tactile.prediction.held_out_touches import HeldOutTouch, held_out_to
 from scroll_tactile.report.channels import channels_of, drift
 from scroll_tactile.report.growing import chosen, growing, soon
 from scroll_tactile.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
+from scroll_tactile.simulation.scene import Scene
 
 SENSOR = known.BIOTAC
 SCENE = Scene(sensor=SENSOR)

@@ -9,9 +9,9 @@ from browser import Browser
 from commands import refused, run
 
 from scroll_tactile import Frames, Kernels, Sensor, TactileLearner
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
 from scroll_tactile.report import memory_page, recording_page, save
+from scroll_tactile.simulation.scene import Scene
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 SMALL = Kernels(seed=0, dimension=64)

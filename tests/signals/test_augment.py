@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.augmentation import Augmentation, Change, augment, changed, crop, fit, flip, jitter, resize
 from scroll_tactile.signals.stream import fewest_readings, validate
+from scroll_tactile.simulation.scene import Scene
 
 PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Frames, Kernels, TactileLearner, sensors
-from scroll_tactile.datasets.gel import SMALL, Gel
 from scroll_tactile.embeddings.protocol import require_rest
 from scroll_tactile.errors import InputError, MismatchError, NoContactError, StreamError
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.signals.contact import MOST_FRAMES, image_of, in_contact, pressed
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.simulation.gel import SMALL, Gel
 from store import Store
 
 SHAPE = SMALL.shape

@@ -12,8 +12,8 @@ import numpy as np
 
 from examples.benchmarks.numerics.memories import JUDGED, Memory
 from examples.benchmarks.numerics.regressions import Case
+from examples.paper.readers.biotac_slide import load
 from scroll_tactile import Kernels
-from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError
 from scroll_tactile.signals.image import tactile_image
 

@@ -15,8 +15,8 @@ from examples.paper.fabric import fabrics_set as published
 from examples.paper.fabric.contactile_rows import EPOCHAL, NEED_BIOTAC, NEED_WEIGHTS, PAPER_EPOCHS, ROWS
 from examples.paper.fabric.contactile_study import HAND, PARTS, Contactile, rows, simulated
 from examples.paper.fabric.fabrics_set import Fabrics
+from examples.paper.readers import biotac_slide
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
-from scroll_tactile.datasets import biotac_slide
 from scroll_tactile.errors import InputError
 
 __all__ = ["contactile"]

@@ -34,15 +34,15 @@ from examples.paper.commands.sets import (
     write_result,
 )
 from examples.paper.plots import draw_continual
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import thinned
+from examples.paper.studies.continual import summary
 from examples.paper.studies.continual_study import Continual, Size
 from examples.paper.studies.replay import PUBLISHED, subset
 from examples.paper.systems.own import is_own, own_embedding
 from scroll_tactile import Embedding, Joined, Kernels, Vision
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.continual import summary
 
 __all__ = ["continual"]
 

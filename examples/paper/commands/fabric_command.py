@@ -26,11 +26,11 @@ from examples.paper.fabric import objects
 from examples.paper.fabric.attributes_study import Attributes
 from examples.paper.fabric.attributes_study import summary as summary_of_attributes
 from examples.paper.fabric.fabric_study import FIGURES, Letters, SlideTransfer, summary
+from examples.paper.readers import fabric_slide, letter_spike, physiclear
+from examples.paper.readers.grades import read_grades
+from examples.paper.readers.letter_spike import DOTS
 from examples.paper.runs.cells import thinned
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar
-from scroll_tactile.datasets import fabric_slide, letter_spike, physiclear
-from scroll_tactile.datasets.grades import read_grades
-from scroll_tactile.datasets.letter_spike import DOTS
 
 __all__ = ["fabric"]
 

@@ -12,14 +12,15 @@ import torch
 import typer
 
 from examples.paper.commands.sets import command_line, leave_out, named, origin, parse_folds, write_result
+from examples.paper.readers import physiclear
+from examples.paper.readers.biotac_slide import load
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures, thinned
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import blocked
 from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS, library_of, name_of
 from examples.paper.systems.own import is_own, require_own
 from scroll_tactile.cli.terminal import say
-from scroll_tactile.datasets import Recordings, physiclear
-from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError
 
 __all__ = [

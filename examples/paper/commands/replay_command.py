@@ -23,9 +23,9 @@ from examples.paper.commands.sets import (
     with_spread,
     write_result,
 )
+from examples.paper.readers.labelled import Recordings
 from examples.paper.studies.replay import FIGURES, PUBLISHED, Replay, subset, summary
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.pipelines.metrics import confusion_counts
 
 __all__ = ["replay"]

@@ -10,13 +10,13 @@ import typer
 from rich.table import Table
 
 from examples.paper.commands.options import Seed
+from examples.paper.readers.biotac_slide import load
 from examples.paper.studies.schedules import Trial, try_schedules
 from scroll_tactile.cli.terminal import console, progress_bar, say
-from scroll_tactile.datasets.biotac_slide import load
-from scroll_tactile.datasets.simulator import Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.sensors import Sensor, read_sensor
+from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["schedules"]
 

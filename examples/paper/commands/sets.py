@@ -18,10 +18,10 @@ from typing import Any, Literal
 from rich.markup import escape
 
 from examples.paper import drawing
+from examples.paper.readers.biotac_slide import load
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile import __version__
 from scroll_tactile.cli.terminal import percent, say
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import missing
 

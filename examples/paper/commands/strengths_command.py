@@ -48,6 +48,7 @@ from examples.paper.commands.sets import (
     write_result,
 )
 from examples.paper.plots import draw_robustness
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import thinned
 from examples.paper.runs.study import columns_averaged, weights_digest
 from examples.paper.studies.baselines import BASELINES, baseline
@@ -57,7 +58,6 @@ from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, Catalogue
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import require_device
 from scroll_tactile.cli.terminal import console, percent, progress_bar, say
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 
 __all__ = ["IN_THE_PAPER", "strengths"]

@@ -34,14 +34,15 @@ from examples.paper.commands.sets import (
     write_result,
 )
 from examples.paper.plots import draw_transfer
+from examples.paper.readers import fabric_slide, letter_spike, physiclear
+from examples.paper.readers.biotac_slide import load
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures
 from examples.paper.transfer.across_sensors import WAYS, SensorTransfer
 from examples.paper.transfer.across_sensors import rows as sensor_rows
 from examples.paper.transfer.few_touches import COUNTS
 from examples.paper.transfer.tasks import TRAINING, TaskTransfer, rows, some_frames
 from scroll_tactile.cli.terminal import Commands, console, percent, progress_bar, say
-from scroll_tactile.datasets import Recordings, fabric_slide, letter_spike, physiclear
-from scroll_tactile.datasets.biotac_slide import load
 from scroll_tactile.errors import DatasetError, InputError
 
 __all__ = ["transfer"]

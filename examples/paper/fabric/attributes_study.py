@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import require_data
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Kernels
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional

@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 
 from examples.paper.fabric.contactile_rows import NEED_BIOTAC, NEED_WEIGHTS, PAPER, PAPER_EPOCHS, ROWS, RowMaker
+from examples.paper.fabric.fabric_protocol import score
 from examples.paper.fabric.fabrics_set import Fabrics, load
 from examples.paper.fabric.pretraining import Pretraining
 from examples.paper.fabric.simulated import LIMITS, FabricScene
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
 from examples.paper.runs.study import weights_digest
 from examples.paper.systems.constituent_memory import ConstituentMemory, estimates_of
@@ -27,10 +29,8 @@ from examples.paper.systems.constituent_nets import ConstituentNet
 from examples.paper.systems.constituent_squares import ConstituentSquares, Shares
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import require_device
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.fabric import score
 from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["HAND", "HELD_OUT", "PARTS", "Contactile", "rows", "simulated"]

@@ -16,16 +16,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.fabric.fabric_protocol import score, score_compositions
+from examples.paper.readers.fabric_slide import CPM_RATIOS, Slides, ratios
+from examples.paper.readers.labelled import Recordings
+from examples.paper.readers.letter_spike import DOTS, GRID, dots_of, letter_folds
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import over_folds, require_folds
 from examples.paper.studies.replay import Progress
-from scroll_tactile import Embedding, Maps
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.fabric_slide import CPM_RATIOS, Slides, ratios
-from scroll_tactile.datasets.letter_spike import DOTS, GRID, dots_of, letter_folds
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.fabric import score, score_compositions
 from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.pipelines.runfile import RunFile
 

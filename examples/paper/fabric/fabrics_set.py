@@ -38,7 +38,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.fabric.compositions_table import read_compositions
-from scroll_tactile.datasets.labelled import Recordings
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import CONTACTILE, Sensor
 from scroll_tactile.signals.stream import Stream, validate

@@ -19,12 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.fabric.unseen import fit_heads
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import data_digest, over_folds, require_folds
 from examples.paper.runs.study import weights_digest
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Frames
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import nn
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import split
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import average_columns
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError

@@ -9,13 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
 from examples.paper.systems.catalogue import CONTROLS, NEED_WEIGHTS, SYSTEMS, Catalogue
 from examples.paper.systems.descent import Course, Precision
 from examples.paper.systems.own import code_digest, is_own, require_own
 from examples.paper.systems.system_protocol import System
 from examples.paper.systems.trained import require_device
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress

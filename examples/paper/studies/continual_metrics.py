@@ -1,4 +1,4 @@
-"""The field's metrics of continual learning, of what was counted on the way: see `scroll_tactile.pipelines.continual`.
+"""The field's metrics of continual learning, of what was counted on the way: see `examples.paper.studies.continual`.
 
 >>> backward_transfer([{"felt": 1.0}, {"felt": 0.75, "silk": 0.5}, {"felt": 0.5, "silk": 1.0, "wool": 1.0}])
 0.0
@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
+from examples.paper.studies.continual import Points, accuracy_of, forgetting_of
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.continual import Points, accuracy_of, forgetting_of
 
 __all__ = ["METRICS", "anytime_area", "backward_transfer", "metrics"]
 

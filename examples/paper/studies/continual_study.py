@@ -15,18 +15,18 @@ from typing import Any, Literal
 
 import numpy as np
 
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import require_folds
+from examples.paper.studies.continual import Points, accuracy_of, curve, forgetting_of, tally
 from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import Progress
 from examples.paper.studies.schedules import ScheduleName, arrange, part_ends
 from scroll_tactile import Embedding
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled, hold_out
-from scroll_tactile.pipelines.continual import Points, accuracy_of, curve, forgetting_of, tally
+from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName
 

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, require_data, require_folds, run_cells
+from examples.paper.studies.continual import Points, accuracy_of, tally
 from examples.paper.studies.continual_metrics import METRICS, metrics
 from examples.paper.studies.fleet_study import Fleet
 from examples.paper.studies.peers import (
@@ -34,11 +36,9 @@ from examples.paper.studies.random_convolution import random_convolution
 from examples.paper.studies.replay import Progress
 from examples.paper.studies.schedules import arrange, part_ends, si_blurry
 from scroll_tactile import Embedding, Kernels
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled, hold_out
-from scroll_tactile.pipelines.continual import Points, accuracy_of, tally
+from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 

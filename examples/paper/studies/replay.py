@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cells import over_folds, require_folds
 from examples.paper.studies.schedules import ScheduleName, arrange
 from scroll_tactile import Kernels
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, hold_out, observe_all
+from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.readouts.readout import ReadoutName

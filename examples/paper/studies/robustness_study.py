@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cells import over_folds, require_data, require_folds
 from examples.paper.studies.default_learner import Answering, Answers, answers
+from examples.paper.studies.perturbations import dead, drift, gaussian, noise, speed
 from examples.paper.studies.replay import novelty_area, rotations
-from scroll_tactile.datasets import Recordings
-from scroll_tactile.datasets.simulator import EVENT_SKIN, LIGHT_PAD, Response, Scene
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled, hold_out
+from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.metrics import accuracy, calibration_error
-from scroll_tactile.pipelines.robustness import dead, drift, gaussian, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
+from scroll_tactile.simulation.scene import EVENT_SKIN, LIGHT_PAD, Response, Scene
 
 __all__ = ["FIGURES", "NOVELTY", "NOW", "PERTURBED", "SESSION", "Robustness", "Series", "Simulated", "summary"]
 

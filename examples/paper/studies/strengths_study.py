@@ -19,13 +19,13 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cells import over_folds, require_data, require_folds
-from scroll_tactile.datasets import Recordings
+from examples.paper.studies.perturbations import dead, drift, length, noise, speed
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled, hold_out, observe_all
+from scroll_tactile.pipelines.classification import Labelled, observe_all
 from scroll_tactile.pipelines.metrics import accuracy
-from scroll_tactile.pipelines.robustness import dead, drift, length, noise, speed
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream

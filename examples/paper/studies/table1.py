@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures, mean_curve, pooled
 from examples.paper.runs.study import SystemStudy
 from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import TrainedNetwork
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import accuracy
 

@@ -19,16 +19,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, require_data, require_folds, run_cells
 from examples.paper.studies.peers import touch_features
 from examples.paper.studies.recursive_ridge import RecursiveRidge
 from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Kernels
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled, hold_out
+from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Receipt
 from scroll_tactile.statistics.statistics import Statistics

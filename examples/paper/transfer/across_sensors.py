@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, over_folds, require_data, run_cells
 from examples.paper.studies.peers import touch_features
@@ -22,7 +23,6 @@ from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, Shar
 from examples.paper.transfer.few_touches import FewTouchLearner, candidate_maker, draw_touches, few_touches
 from examples.paper.transfer.shared_features import Features, SharedFeatures
 from scroll_tactile import Kernels
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.runfile import RunFile

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.datasets import Recordings
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress

@@ -38,7 +38,7 @@ class SharedFeatures:
 
     sensors: with channels, no cameras. Raises InputError for a camera.
 
-    >>> from scroll_tactile.datasets.simulator import Scene
+    >>> from scroll_tactile.simulation.scene import Scene
     >>> from scroll_tactile.sensors import BIOTAC, ROBOSKIN
     >>> shared = SharedFeatures((BIOTAC, ROBOSKIN))
     >>> [shared.spectra(Scene(sensor).touch("felt", 0)).shape for sensor in (BIOTAC, ROBOSKIN)]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, over_folds, require_data, run_cells, split
 from examples.paper.runs.study import weights_digest
@@ -23,7 +24,6 @@ from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork, require_device
 from examples.paper.transfer.few_touches import COUNTS, candidate_maker, few_touches
 from scroll_tactile import Embedding, Kernels, Vision
-from scroll_tactile.datasets import Recordings
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress

@@ -1,0 +1,1 @@
+"""Persistence: how a memory survives; journal, replay, merge, packing, another embedding."""

@@ -1,0 +1,271 @@
+"""The changes of a memory: each is durable when its method returns, and whole or not there at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from scroll_tactile.errors import FineTuneError, InputError
+from scroll_tactile.memory.descriptions import Description, describe
+from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    OBSERVE,
+    RETRACT,
+    SOURCE,
+    Codes,
+    pack_codes,
+    pack_readings,
+    require_row,
+    spans,
+)
+from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.persistence.buffer import exemplar_candidates
+from scroll_tactile.persistence.merge import MergePlan, MergeRules
+from scroll_tactile.persistence.observations import compaction_point, observation_of, observations_from, observations_of
+from scroll_tactile.persistence.open_memory import OpenMemory
+from scroll_tactile.persistence.replaying import apply_description, refill, replay, until
+from scroll_tactile.results import Compacted, Merged, Receipt
+from scroll_tactile.signals.stream import Stream
+from scroll_tactile.validation.gate import MemoryStore
+from store import Head, Record, Store
+
+__all__ = ["Ledger"]
+
+
+class Ledger(OpenMemory):
+    """The memory of one learner, and all that changes it: a row of the journal first, then the sums."""
+
+    def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
+        durable = self.store is not None and not self._batching
+        return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable, repeated)
+
+    def observe(
+        self,
+        material: str,
+        stream: Stream,
+        columns: int,
+        codes: Codes,
+        source: str | None = None,
+        *,
+        again: bool = False,
+    ) -> Receipt:
+        """Append an observation to the journal, then add it to the memory; again: also one that is there already."""
+        require_row(stream)
+        with self.lock:
+            self.require_open()
+            # In a memory opened to read the journal refuses all.
+            if not again and (self.store is None or self.store.mode == "write"):
+                known = self.contents().find(material, stream.key)
+                if known is not None:
+                    return self._receipt(known, material, stream, repeated=True)
+            # Before the journal has it: every row there must fit at the next opening.
+            self.memory.statistics.require_room(codes)
+            undo = self._undo_of(material, stream.key, columns) if self.store is None else None
+            with self._mutation(_nothing, undo):
+                sequence = self._append(material, stream, columns, codes, source)
+                if self._contents is not None:
+                    self._contents.add(material, stream.key, sequence)
+                self._changed([(material, codes, 1)])
+            self._snapshot_if_due()
+            return self._receipt(sequence, material, stream)
+
+    def _undo_of(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
+        """What takes the next observation back, of a memory without a store."""
+        memory, sequence = self._memory.undo(material, key, columns), self._memory.sequence + 1
+
+        def undo() -> None:
+            memory()
+            if self._contents is not None:
+                self._contents.remove(material, key, sequence)
+
+        return undo
+
+    def _append(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None) -> int:
+        memory = self._memory
+        # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
+        kept = self._bare or memory.exemplars is not None or memory.kept is not None
+        packed = pack_readings(stream.readings) if kept else {}
+        if self.store is None:
+            sequence, stages = memory.sequence + 1, memory.plan.scored_stages(columns)
+            held = Exemplar.of(material, stream.key, packed, stages, codes) if kept else None
+            memory.add(material, stream.key, columns, codes, sequence, held, stream.readings)
+            return sequence
+        attributes: dict[str, Any] = {"columns": columns}
+        attributes |= ({"nbytes": stream.readings.nbytes} if kept else {}) | ({SOURCE: source} if source else {})
+        arrays = packed if self._bare else packed | pack_codes(codes)
+        head = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays)
+        replay(memory, Record(**vars(head), arrays=arrays), self.store, codes)
+        return head.sequence
+
+    def describe(self, material: str, constituents: Description | None) -> None:
+        """As `TactileLearner.describe`, of what was checked."""
+        with self.lock:
+            self.require_open()
+            memory = self.memory
+            if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but means another thing
+                return
+            before = dict(memory.descriptions)
+
+            def undo() -> None:
+                memory.descriptions = before
+
+            with self._mutation(_nothing, undo if self.store is None else None):
+                if self.store is not None:
+                    attributes = {"constituents": constituents}
+                    memory.sequence = self.store.append(DESCRIBE, material, b"", attributes=attributes).sequence
+                describe(memory.descriptions, material, constituents)
+                self.described += 1
+            self._snapshot_if_due()
+
+    def retract(self, receipt: Receipt | int) -> None:
+        """As `TactileLearner.retract`."""
+        with self.lock:
+            store = self.require_store("retract anything")
+            self._retract(store, [observation_of(store, self.memory, receipt)], "")
+
+    def forget(self, material: str | None, source: str | None) -> int:
+        """As `TactileLearner.forget`."""
+        with self.lock:
+            store = self.require_store("forget anything")
+            if material is not None:
+                found = observations_of(store, self.memory, material)
+            else:
+                found = observations_from(store, self.memory, source or "")
+            self._retract(store, [store.record(sequence) for sequence in found], material or "")
+        return len(found)
+
+    def _retract(self, store: Store, records: list[Record], material: str) -> None:
+        # In the memory first: it reads rows again that may be damaged, and after a retraction is in the journal every
+        # opening would have to read them.
+        store.compaction()
+        memory, sequences = self._memory, spans(record.sequence for record in records)
+        before = memory.sample, memory.kept, memory.exemplars, memory.tuned
+
+        def revert() -> None:
+            for record in records:
+                memory.put_back(record)
+            memory.sample, memory.kept, memory.exemplars, memory.tuned = before
+
+        with self._mutation(revert):
+            retracted = [memory.retract(record) for record in records]
+            refill(memory, store)
+            head = store.append(RETRACT, material, b"", attributes={"sequences": sequences})
+            memory.sequence = head.sequence
+            apply_description(memory.descriptions, head)
+            self._changed(retracted)
+        self._snapshot_if_due()
+
+    def relabel(self, receipt: Receipt | int, material: str) -> int:
+        """As `TactileLearner.relabel`."""
+        with self.lock:
+            store = self.require_store("relabel anything")
+            self._require_no_batch("a relabelling")
+            record = observation_of(store, self.memory, receipt)
+            if record.label == material:
+                raise InputError(f"observation {record.sequence} of {store.path} is called {material!r} already")
+            store.compaction()  # a damaged one has what the retraction needs
+            memory = self._memory
+            with self._mutation(), store.batch():
+                removed = memory.retract(record)
+                refill(memory, store)
+                store.append(RETRACT, "", b"", attributes={"sequences": spans([record.sequence])})
+                attributes, arrays, time = record.attributes, dict(record.arrays), record.time
+                head = store.append(OBSERVE, material, record.key, attributes=attributes, arrays=arrays, time=time)
+                self._changed([removed, *(replay(memory, Record(**vars(head), arrays=arrays), store) or ())])
+            self._snapshot_if_due()
+            return head.sequence
+
+    def _require_no_batch(self, what: str) -> None:
+        if self._batching:
+            raise InputError(f"{what} is a batch of its own: end the batch before it")
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """As `TactileLearner.batch`."""
+        with self.lock:
+            self.require_open()
+            if self.store is None or self._batching:
+                yield
+                return
+            raised: BaseException | None = None
+            self._batching = True
+            try:
+                with self.store.batch():
+                    try:
+                        yield
+                    except BaseException as error:  # the store must not see it: it would undo the batch
+                        raised = error
+            except BaseException:
+                self._whole = False
+                raise
+            finally:
+                self._batching = False
+            self._snapshot_if_due()
+            if raised is not None:
+                raise raised
+
+    def merge(
+        self, other: str | os.PathLike[str], rules: MergeRules, progress: Callable[[str, int, int], object]
+    ) -> tuple[Merged, list[tuple[Head, str]]]:
+        """As `TactileLearner.merge`; also the rows there that are refused, and why.
+
+        Raises ObservationError also where one that is refused cannot be left out.
+        """
+        with self.lock:
+            store, memory = self.require_store("merge"), self.memory
+            self._require_no_batch("a merge")
+            with MemoryStore.open(other, mode="read") as source:
+                source.read_with(memory.plan, thorough=rules.thorough)
+                plan = MergePlan.of(store, memory, source, self.contents(), rules)
+                with self._mutation(), store.batch():
+                    added = plan.append_to(store, memory, lambda done, of: progress("merging", done, of))
+            self._changed()
+            self._snapshot_if_due()
+        return Merged(added, plan.shared, len(plan.descriptions)), plan.refused
+
+    def compact(self, keep: int) -> Compacted:
+        """As `TactileLearner.compact`."""
+        with self.lock:
+            store, memory = self.require_store("compact"), self.memory
+            last_sequence = compaction_point(store, memory, keep)
+            before = sum(store.size().values())
+            self.require_writing()
+            if last_sequence > memory.compacted:
+                store.compaction()  # a damaged one has what the new one needs
+                # With the tuned model, which the compaction checkpoint may lack.
+                newest = memory.to_arrays() if last_sequence < memory.sequence else None
+                kept = until(memory, store, last_sequence) if last_sequence < memory.sequence else memory
+                arrays, attributes = kept.to_arrays(last_sequence, exemplar_candidates(kept, store))
+                with self._mutation():
+                    store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
+                    self._saved = memory.sequence
+                    memory.note_compaction(last_sequence)
+                give_back_scratch()
+            return Compacted(memory.compacted, before, sum(store.size().values()))
+
+    def keep_tuned(self, tuned: Tuned, made_from: Memory, last_sequence: int, retractions: int) -> None:
+        """Keep the tuned model, durably. Raises FineTuneError where something was retracted since its training began.
+
+        made_from, last_sequence, retractions: the memory, its last row and its count of retractions when it began.
+        """
+        with self.lock:
+            self.require_writing()
+            memory = self.memory
+            if memory is not made_from or memory.retractions != retractions:
+                raise FineTuneError("what the tuned model was being made from was retracted meanwhile: fine-tune again")
+            before = memory.tuned, memory.tuned_last_sequence
+            memory.tuned, memory.tuned_last_sequence = tuned, last_sequence
+            try:
+                self._snapshot()
+            except BaseException:
+                # Ctrl-C may come when the checkpoint is already current: closing writes the earlier tuned model again.
+                (memory.tuned, memory.tuned_last_sequence), self._saved = before, -1
+                raise
+
+
+def _nothing() -> None:
+    """Nothing to revert: the journal refused the row before the memory was changed."""

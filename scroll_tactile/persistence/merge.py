@@ -1,0 +1,280 @@
+"""How two memories become one: which rows of the other come in, which are left out, and which are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence, Set
+from dataclasses import dataclass
+from typing import Any, Literal, Self, cast
+
+from pydantic import BaseModel
+
+from scroll_tactile.errors import MismatchError, ObservationError
+from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
+from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, active_rows
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.contents import Contents, StoredContents, refusal
+from scroll_tactile.persistence.packing import sums_without
+from scroll_tactile.persistence.replaying import apply_description, replay
+from scroll_tactile.validation.gate import MemoryStore, require_counted, wrong_retractions
+from store import Checkpoint, Head, Record, Store
+from store.files import same_folder
+
+__all__ = ["Choice", "MergePlan", "MergeRules"]
+
+Choice = Literal["same", "ours", "theirs"]
+"""Whose description of a material is kept where two memories describe it; "same": they must agree."""
+
+
+@dataclass(frozen=True)
+class MergeRules:
+    """How another memory comes in.
+
+    once: leave out streams that both observed, of one material with one content hash. one_name: refuse touches that are
+    there under another name, or came under one before, and leave out those that came before under theirs: what was
+    learned from sources. clipped: contents that clipping made, of which the refusal says so. said: the source of
+    touches that say none. thorough: see `Gate`.
+    """
+
+    once: bool = True
+    one_name: bool = False
+    descriptions: Choice = "same"
+    clipped: Collection[bytes] = ()
+    said: str | None = None
+    thorough: bool = True
+
+
+@dataclass(frozen=True)
+class MergePlan:
+    """What another memory would bring: rows to be appended, in order.
+
+    rows: heads of its journal. compaction: what stands for those that it compacted. shared: streams that both observed,
+    and that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are
+    there under another name, and why that is refused. descriptions: by material, those that we have not. said: see
+    `MergeRules`. newest: what a packed memory sums up.
+    """
+
+    source: MemoryStore
+    compaction: Checkpoint | None
+    rows: list[Head]
+    shared: int
+    left_out: list[Head]
+    refused: list[tuple[Head, str]]
+    descriptions: dict[str, Description]
+    said: str | None
+    newest: Checkpoint | None
+
+    @classmethod
+    def of(
+        cls,
+        ours: Store,
+        memory: Memory,
+        theirs: MemoryStore,
+        contents: Contents | StoredContents,
+        rules: MergeRules,
+    ) -> Self:
+        """Look through both journals; contents: which touches we have.
+
+        Raises MismatchError where theirs cannot be a part of ours, or describes a material otherwise and nobody chose,
+        ObservationError where a touch cannot be left out, DamageError for what opening theirs refuses, and for a shared
+        stream that is not what its key says, here or there.
+        """
+        _require_mergeable(ours, memory, theirs)
+        compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
+        if found is not None:
+            require_counted(theirs.path, found, heads)
+        incoming = active_rows(heads)
+        both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
+        refused, again = (
+            _by_first_names(incoming, contents, compacted, rules.clipped) if rules.one_name else ([], set())
+        )
+        out = {*(both if rules.once else ()), *again, *(head.sequence for head, _ in refused)}
+        if fixed := [
+            head for head in incoming if head.sequence in out and (head.sequence <= compacted or head.kind == MEMBER)
+        ]:
+            raise _cannot_be_left_out(theirs, fixed, refused)
+        rows = [head for head in incoming if head.sequence not in out]
+        left_out = [head for head in incoming if head.sequence in out]
+        bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
+        if bare and memory.exemplars is not None:
+            raise MismatchError(
+                f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
+                "exemplars: touch it again, or merge into a memory made with exemplars=0"
+            )
+        described = _descriptions(ours, memory, theirs, found, rules.descriptions)
+        newest = _require_sound(theirs, heads, coming={head.sequence for head in rows})
+        if rules.once:
+            for head in (head for head in incoming if head.sequence in both):
+                sequence = _row(contents, head) or 0
+                if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
+                    ours.record(sequence)
+        shared = len(both) + len(again)
+        summed = newest if theirs.is_packed else None
+        return cls(theirs, found, rows, shared, left_out, refused, described, rules.said, summed)
+
+    def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
+        """Append the rows to our journal and add them to our memory; the number of observations that came in.
+
+        The caller opens a batch around it, and where a row does not pass the gate none of them is kept. each: called
+        with (rows done, rows in all).
+        """
+        compaction = self.compaction
+        # A compaction checkpoint comes in as one row, and the merges before it are a part of it.
+        part = (
+            0
+            if compaction is None
+            else sum(head.kind == MERGE and head.sequence <= compaction.last_sequence for head in self.rows) - 1
+        )
+        total = len(self.rows) - part
+        for material, description in self.descriptions.items():
+            head = ours.append(DESCRIBE, material, b"", attributes={"constituents": description})
+            replay(memory, Record(**vars(head), arrays={}), ours)
+        sums = self._sums(memory)
+        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(compaction), start=1):
+            head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
+            if kind != MEMBER and sums is None:
+                replay(memory, Record(**vars(head), arrays=arrays), ours)
+            elif memory.exemplars is not None and "nbytes" in attributes:
+                memory.exemplars.add(label, key, head.sequence)
+            memory.sequence = head.sequence
+            each(done, total)
+        if sums is not None:
+            memory.join(sums, exemplars=False)
+        return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
+
+    def _sums(self, memory: Memory) -> Memory | None:
+        """What the rows taught, of those that are not left out; None where only replaying them tells."""
+        source = self.source
+        if self.newest is None or source.compacted:
+            return None
+        if memory.kept is not None and Identity.read(source).kept_touches != memory.kept.capacity:
+            return None
+        return sums_without(source, self.newest, memory, {head.sequence for head in self.left_out})
+
+    def _rows_to_append(
+        self, compaction: Checkpoint | None
+    ) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
+        if compaction is not None:
+            left_out = ("tuned", "descriptions")  # the tuned model stays there; descriptions come as rows of their own
+            attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
+            arrays = {name: array for name, array in compaction.arrays.items() if not name.startswith("tuned")}
+            yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
+        for head in self.rows:
+            if compaction is not None and head.sequence <= compaction.last_sequence:
+                if head.kind != MERGE:  # a merge before the compaction checkpoint is a part of it
+                    kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
+                    yield MEMBER, head.label, head.key, kept, None, head.time
+            else:
+                record = self.source.record(head.sequence)
+                yield head.kind, head.label, head.key, self._said(head), record.arrays, head.time
+
+    def _said(self, head: Head) -> dict[str, Any]:
+        touch = head.kind in (OBSERVE, MEMBER) and self.said is not None
+        return {**({SOURCE: self.said} if touch else {}), **head.attributes}
+
+
+def _row(contents: Contents | StoredContents, head: Head) -> int | None:
+    """Our row of a touch that both have under one name; None where we have it not."""
+    return contents.find(head.label, head.key)
+
+
+def _by_first_names(
+    incoming: Sequence[Head], contents: Contents | StoredContents, compacted: int, clipped: Collection[bytes]
+) -> tuple[list[tuple[Head, str]], set[int]]:
+    """The touches that are there, or came just before, under another name, and why each is refused.
+
+    And the rows of those that came before under their own, where they can be left out.
+    """
+    came: dict[bytes, str] = {}
+    refused: list[tuple[Head, str]] = []
+    again: set[int] = set()
+    for head in incoming:
+        if head.kind == MERGE:
+            continue
+        known, before = contents.names(head.key), head.key in came
+        names = known or [came.setdefault(head.key, head.label)]
+        if (why := refusal(names, head.label, head.key in clipped)) is not None:
+            refused.append((head, why))
+        elif before and head.kind == OBSERVE and head.sequence > compacted:
+            again.add(head.sequence)
+    return refused, again
+
+
+def _cannot_be_left_out(
+    theirs: MemoryStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
+) -> ObservationError:
+    named = {head.sequence: why for head, why in refused}
+    if why := named.get(fixed[0].sequence):
+        more = f" (and {len(fixed) - 1} more of its touches)" if len(fixed) > 1 else ""
+        return ObservationError(f"{why}{more}; {theirs.path} was compacted, and none of them can be left out")
+    return ObservationError(
+        f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be counted "
+        f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
+        'or count them twice, with shared="twice"'
+    )
+
+
+def _descriptions(
+    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
+) -> dict[str, Description]:
+    """Those of their descriptions that come in."""
+    theirs_now = dict(cast(dict[str, Description], {} if compaction is None else compaction.attributes["descriptions"]))
+    for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
+        apply_description(theirs_now, head)
+    ours_now = memory.descriptions
+    new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}
+    differing = [name for name in new if name in ours_now]
+    if differing and choice == "same":
+        name = differing[0]
+        raise MismatchError(
+            f"{len(differing)} materials are described differently in {ours.path} and {theirs.path}, such as {name!r}: "
+            f"here it is {ours_now[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
+        )
+    return {name: new[name] for name in new if choice != "ours" or name not in ours_now}
+
+
+def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None:
+    if same_folder(ours.path, theirs.path):
+        raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
+    mine, other = Identity.read(ours), Identity.read(theirs)
+    for part in ("sensor", "embedding", "reading", "views", "grid", "augmentation"):
+        own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
+        if own != incoming:
+            raise MismatchError(
+                f"{theirs.path} cannot be merged into {ours.path}: their {part.removesuffix('s')}s differ. Here it is "
+                f"{_formatted(own)}, there {_formatted(incoming)}. Merge memories of one sensor and one embedding"
+            )
+    whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
+    if whole and memory.exemplars is not None and mine.exemplars != other.exemplars:
+        raise MismatchError(
+            f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
+            f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
+        )
+    if whole and memory.kept is not None and mine.kept_touches != other.kept_touches:
+        raise MismatchError(
+            f"{theirs.path} was compacted and keeps {other.kept_touches} touches to match with; {ours.path} keeps "
+            f"{mine.kept_touches}, and the readings for the others are gone"
+        )
+
+
+def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> Checkpoint | None:
+    """Their newest checkpoint. Raises DamageError where what does not come in would not pass the gate of theirs."""
+    for wrong in wrong_retractions(theirs.path, heads):
+        raise wrong
+    for head in heads:
+        if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
+            theirs.record(head.sequence)
+    return theirs.latest()
+
+
+def _without_configuration(part: Any) -> Any:
+    """The part of an identity, of an embedding without its configuration: its weights' file may have any name."""
+    return part.model_copy(update={"configuration": None}) if isinstance(part, EmbeddingIdentity) else part
+
+
+def _formatted(part: Any) -> str:
+    if not isinstance(part, BaseModel):
+        return repr(part)
+    fields = ((name, getattr(part, name)) for name in type(part).model_fields)
+    shown = ((name, value[:12] if name == "fingerprint" else value) for name, value in fields)
+    return ", ".join(f"{name} {value!r}" for name, value in shown if value is not None)

@@ -1,0 +1,248 @@
+"""A memory that is open, with the store that keeps it: a change is whole or not there, and checkpoints follow it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.memory.rows import Added
+from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.persistence.contents import Contents, StoredContents
+from scroll_tactile.persistence.replaying import apply_appended
+from store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
+
+__all__ = ["OpenMemory"]
+
+logger = logging.getLogger(__name__)
+
+Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
+"""Arrays and attributes."""
+
+MOST_ADDED = 1024  # touches: a model is fitted again long before
+SNAPSHOT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
+LOOKS = 5  # of a reader at a memory that is written to meanwhile, before it is read anew
+MATERIALS_A_ROW = 16  # and where there are many materials, as many rows as a part of them: a checkpoint has all
+
+
+class OpenMemory:
+    """The memory of one learner and the store that keeps it; `Ledger` has the changes.
+
+    load: reads the memory from the store, or makes an empty one without a store. bare: whether rows of observations
+    hold readings alone, to be embedded again when they are read. contents: which touches a memory without a store has;
+    None where nothing says.
+
+    lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
+    described: grows with each change of a description. added: where `follow` is set, what was observed and retracted
+    since it was last cleared; None where that is too much, or more has changed. saves: whether checkpoints are written;
+    without them the journal still has all.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[], Memory],
+        store: Store | None = None,
+        bare: bool = False,
+        contents: Contents | None = None,
+    ) -> None:
+        self.store = store
+        self._contents = contents
+        self._bare = bare
+        self.lock = threading.RLock()
+        self.version = 0
+        self.described = 0
+        self.follow = False
+        self.saves = True
+        self.added: list[Added] | None = []
+        self._load = load
+        self._memory = load()
+        self._saved = self._memory.saved
+        self._closed = False
+        self._whole = True
+        self._undo: Callable[[], None] | None = None
+        self._batching = False
+
+    @property
+    def memory(self) -> Memory:
+        """The memory; after a change that was cut short, by ctrl-C, say, it is read again, or the change is undone."""
+        if not self._whole:
+            if self._undo is not None:
+                self._undo()
+            else:
+                self._memory = self._load()
+            self._whole = True
+            self._changed()
+        return self._memory
+
+    def contents(self) -> Contents | StoredContents:
+        """Which touches the memory has, by their content; whoever calls holds the lock.
+
+        Raises StoreClosedError for a snapshot of a memory that was closed before anybody asked.
+        """
+        _ = self.memory  # where a change was cut short, it is read again
+        if self.store is not None:
+            return StoredContents(self.store, self._memory)
+        if self._contents is None:
+            raise StoreClosedError(
+                "this is a snapshot of a memory that was closed, which does not say what touches it has: make it "
+                "before the memory is closed, or observe with again=True"
+            )
+        return self._contents
+
+    def copied_contents(self) -> Contents | None:
+        """All that `contents` has, to be changed apart; None where nobody knows."""
+        known = self._contents is not None or (self.store is not None and not self._closed)
+        return self.contents().copy() if known else None
+
+    @contextmanager
+    def _mutation(
+        self, revert: Callable[[], None] | None = None, undo: Callable[[], None] | None = None
+    ) -> Iterator[None]:
+        """A change of the memory and its journal: where it is cut short, the memory is read again before its next use.
+
+        revert: undoes in the memory what the journal refused; None where only reading again can. undo: of a memory
+        without a path, which cannot be read again, takes back what was done of the change.
+        """
+        self._undo, self._whole = undo, False
+        try:
+            yield
+        except StoreError:
+            if revert is not None:
+                revert()
+                self._whole = not self._batching  # a batch that fails loses all that was added in it before
+            raise
+        self._whole = True
+
+    def _changed(self, added: list[Added] | None = None) -> None:
+        self.version += 1
+        if added is None or (self.added is not None and len(self.added) + len(added) > MOST_ADDED):
+            self.added = None
+        elif self.follow and self.added is not None:
+            self.added += added
+
+    def require_open(self) -> None:
+        """Raise StoreClosedError after `close`."""
+        if self._closed:
+            where = "in memory" if self.store is None else self.store.path
+            raise StoreClosedError(f"the memory {where} is closed: open its path again")
+
+    def require_store(self, doing: str) -> Store:
+        """The store. Raises InputError where there is none: what asks for it needs the journal."""
+        self.require_open()
+        if self.store is None:
+            raise InputError(
+                f"a memory without a path keeps no journal, and cannot {doing}: TactileLearner.open(path, ...) makes "
+                "one that does"
+            )
+        return self.store
+
+    def require_writing(self) -> None:
+        """Raise, before any work is done, what would keep a checkpoint from being written."""
+        self.require_open()
+        if self.store is None:
+            return
+        if self._batching:
+            raise InputError("no checkpoint can be written in a batch: end it first")
+        if self.store.mode == "read":
+            raise ReadOnlyError(f'{self.store.path} was opened with mode="read": open it to write')
+        self._pass_over_failures(self.store)
+
+    def _pass_over_failures(self, store: Store) -> None:
+        try:
+            store.flush()
+        except StoreError as error:  # of an earlier checkpoint: the next commit would raise it instead of committing
+            logger.warning("%s: no checkpoint could be written: %s", store.path, error)
+
+    def refresh(self) -> bool:
+        """As `TactileLearner.refresh`."""
+        with self.lock:
+            self.require_open()
+            memory, store = self.memory, self.store
+            if store is None or store.mode == "write":
+                return False
+            if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.compacted):
+                return False
+            try:
+                # A checkpoint that came between the reads may be of rows behind these, and hold a tuned model from
+                # before them.
+                for _ in range(LOOKS):
+                    if store.compacted != memory.compacted or store.last - memory.sequence > SNAPSHOT_EVERY:
+                        break
+                    records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
+                    with self._mutation():
+                        self._changed(apply_appended(memory, store, records))
+                    if store.newest == memory.checkpoint and store.compacted == memory.compacted:
+                        return True
+            except CompactedError:  # just now, and a retraction needs what is gone
+                pass
+            self._memory, self._whole = self._load(), True
+            self._changed()
+            return True
+
+    def _snapshot_if_due(self) -> None:
+        if self.saves:
+            self.save_behind(max(SNAPSHOT_EVERY, len(self._memory.statistics.materials) // MATERIALS_A_ROW))
+
+    def save_behind(self, rows: int) -> None:
+        """Write a checkpoint, in the background, where so many rows or more are behind the last; whatever `saves`."""
+        if self.store is None or self._batching or self._memory.sequence - self._saved < rows:
+            return
+        arrays, attributes = self._memory.to_arrays()
+        try:
+            self.store.commit_later(arrays, last_sequence=self._memory.sequence, attributes=attributes)
+        except StoreError as error:
+            # The journal has it all; only the next opening has more to replay.
+            logger.warning("%s: no checkpoint could be written: %s", self.store.path, error)
+        self._saved = self._memory.sequence
+        del arrays
+        give_back_scratch()
+
+    def _snapshot(self) -> None:
+        if self.store is not None:
+            arrays, attributes = self._memory.to_arrays()
+            self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
+            self.store.commit(arrays, last_sequence=self._saved, attributes=attributes)
+
+    def derived(self, name: str) -> Checkpoint | None:
+        """What was kept under a name of the checkpoint that the memory was loaded from; None where there is nothing."""
+        if self.store is None or self._closed:
+            return None
+        found = self.store.derived(name)
+        return found if found is not None and found.number == self.memory.checkpoint else None
+
+    def saved_since(self, memory: Memory) -> bool:
+        """Whether the store has another newest checkpoint than the one that the memory was loaded from."""
+        return self.store is not None and self.store.newest != memory.checkpoint
+
+    def close(self, name: str, derived: Callable[[], Derived | None]) -> None:
+        """As `TactileLearner.close`. derived: makes what is kept under a name beside the checkpoint."""
+        with self.lock:
+            if self._batching:
+                raise InputError("a memory cannot be closed in a batch: end it first")
+            store, self._closed = self.store, True
+            if store is None:
+                return
+            try:
+                # A change that was cut short is never saved: the journal holds all of it, or nothing.
+                if store.mode == "write" and self.saves and self._whole:
+                    if self._memory.sequence > self._saved:
+                        self._pass_over_failures(store)
+                        self._snapshot()
+                    self._keep(store, name, derived)
+            finally:
+                store.close()
+                give_back_scratch()
+
+    def _keep(self, store: Store, name: str, derived: Callable[[], Derived | None]) -> None:
+        """Keep what follows from the memory; where that fails it will be made again."""
+        try:
+            if (made := derived()) is not None:
+                store.keep_derived(name, made[0], last_sequence=self._memory.sequence, attributes=made[1])
+        except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
+            logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)

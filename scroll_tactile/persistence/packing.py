@@ -1,0 +1,106 @@
+"""A memory packed into one file, and what such a file brings to another memory: its sums, and its rows."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from copy import copy
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+from scroll_tactile.memory.exemplars import ExemplarSample
+from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.buffer import exemplar_candidates
+from scroll_tactile.validation.gate import MemoryStore
+from store import Checkpoint, DamageError, Head, Store
+from store.archive import write_archive
+from store.exceptions import reported
+
+__all__ = ["pack_memory", "sums_without"]
+
+
+def pack_memory(
+    store: Store, memory: Memory, path: Path, *, rows: bool = True, readings: bool = True, source: str | None = None
+) -> None:
+    """Write all that a memory learned as a packed memory; the arguments are those of `TactileLearner.pack`."""
+    found = active_rows(store.heads())
+    heads = [head for head in found if head.kind != MERGE]
+    with_rows = rows and readings and not memory.compacted and len(heads) == len(found)
+    identity: dict[str, Any] = Identity.read(store).to_json()
+    packed = copy(memory)
+    packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
+    if not readings:
+        identity |= {"exemplars": 0, "kept_touches": 0}
+        packed.kept = packed.exemplars = None
+        packed.capacity = 0
+    with reported(path, "packing a memory"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # What a failing disk does not let go of says nothing of what was packed.
+        made = TemporaryDirectory(
+            dir=path.parent, prefix=f"{path.name}.", suffix=".partial", ignore_cleanup_errors=True
+        )
+    with made as folder:
+        with Store.open(folder, identity=identity) as into:
+            with into.batch():
+                touches = [_append(into, store, head, source, arrays=with_rows, readings=readings) for head in heads]
+                for material, constituents in memory.descriptions.items():
+                    into.append(DESCRIBE, material, b"", attributes={"constituents": constituents})
+            if with_rows:
+                if packed.exemplars is not None:
+                    packed.exemplars = _among(touches, memory)
+                written, attributes = packed.to_arrays()
+                into.commit(written, last_sequence=into.last, attributes=attributes)
+            else:
+                written, attributes = packed.to_arrays(
+                    into.last, exemplar_candidates(memory, store) if readings else []
+                )
+                into.compact(written, last_sequence=into.last, attributes=attributes)
+        write_archive(Path(folder), path)
+
+
+def _append(into: Store, store: Store, head: Head, source: str | None, *, arrays: bool, readings: bool) -> Head:
+    """Append a touch to a packed memory; its row there. Raises StoreError."""
+    said = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
+    said |= {} if source is None or SOURCE in said else {SOURCE: source}
+    own = store.record(head.sequence).arrays if arrays else None
+    return into.append(head.kind, head.label, head.key, attributes=said, arrays=own, time=head.time)
+
+
+def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
+    """The exemplars among some touches, as a memory of this making has them."""
+    exemplars = memory.empty_like().exemplars
+    if exemplars is not None:
+        exemplars.update((head.label, head.key, head.sequence) for head in touches if "nbytes" in head.attributes)
+    return exemplars
+
+
+def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_out: Collection[int]) -> Memory | None:
+    """What the touches of a packed memory taught, without some of them, exactly; None where only replaying them tells.
+
+    found: its newest checkpoint. memory: any of that making. Raises DamageError, also where the sums are not those of
+    the touches that it names.
+    """
+    if found.last_sequence != source.last:
+        return None
+    heads = [head for head in source.heads() if head.kind == OBSERVE]
+    observed = found.arrays["observations"]
+    said = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
+    if len(heads) != sum(1 for head in source.heads() if head.kind != DESCRIBE):
+        return None
+    if observed.ndim != 1 or said != Counter(head.label for head in heads):
+        raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
+    sums = memory.empty_like().fill(found.arrays, found.attributes)
+    if not left_out:
+        return sums
+    gone, rest = memory.empty_like(), memory.empty_like()
+    for sequence in left_out:
+        record = source.record(sequence)
+        columns, codes = memory.codes(record)
+        gone.statistics.add(record.label, codes, columns)
+    rest.statistics = sums.statistics - gone.statistics
+    rest.exemplars = None  # the rows have them
+    rest.choose([head for head in heads if head.sequence not in left_out], source.record, sums)
+    return rest

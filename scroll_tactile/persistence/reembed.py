@@ -1,0 +1,178 @@
+"""Carrying a memory over to another embedding, or to another version of its own, from the readings in its journal.
+
+The new memory is written beside the old one, row for row, and takes its place when it is whole:
+
+1. `name.reembedding` grows in batches. A run that was cut short goes on behind the last.
+2. It is given the name `name.reembedded`: it is whole.
+3. The old memory is given the name `name.before`, and the new one its own.
+
+Where there is nothing under the memory's name, step 3 was cut short: whoever opens it ends it.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.identity import Identity
+from scroll_tactile.memory.rows import (
+    DESCRIBE,
+    OBSERVE,
+    RETRACT,
+    Codes,
+    Readings,
+    pack_codes,
+    pack_readings,
+    unpack_readings,
+)
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.replaying import load, refill, replay
+from scroll_tactile.validation.gate import MemoryStore, require_counted
+from store import Record, Store, StoreError
+from store.exceptions import reported
+from store.files import is_there, sync_folder
+from store.lock import WriterLock
+
+__all__ = ["Reembedding", "finish_interrupted"]
+
+BATCH = 64  # rows that wait for the disk together
+SNAPSHOT_EVERY = 256  # rows, after which a run that goes on does not embed them again
+
+
+class Reembedding:
+    """The memory that takes the place of another one.
+
+    source: the store of the other one. identity: of the new one. empty: a memory of its making. encode: embeds
+    readings: the columns of the touch, and its rows of codes by scale. bare: whether rows keep readings alone.
+
+    Raises MismatchError where not every observation has its readings, DamageError where a checkpoint counts touches
+    that no row has, StoreError.
+    """
+
+    def __init__(
+        self,
+        source: Store,
+        identity: Identity,
+        empty: Memory,
+        encode: Callable[[Readings], tuple[int, Codes]],
+        *,
+        bare: bool,
+    ) -> None:
+        _require_readings(source)
+        self._source, self._encode, self._bare = source, encode, bare
+        folder = _named(source.path, "reembedding")
+        if is_there(whole := _named(source.path, "reembedded")):  # as far as it goes: rows may have come since
+            with reported(folder, "going on with a memory embedded anew"):
+                whole.rename(folder)
+        self._draft = MemoryStore.open(folder, identity=identity.to_json())
+        if Identity.read(self._draft) != identity:  # begun for another embedding
+            self._draft.close()
+            shutil.rmtree(folder)
+            self._draft = MemoryStore.open(folder, identity=identity.to_json())
+        self._memory = load(empty, self._draft)
+
+    def copy(self, progress: Callable[[str, int, int], object]) -> None:
+        """Embed the rows that the new memory does not have yet; the old one can be used meanwhile.
+
+        progress: called with (what is being done, rows done, rows in all).
+        """
+        memory, draft = self._memory, self._draft
+        while draft.last < self._source.last:
+            with draft.batch():
+                for record in islice(self._source.records(after=memory.sequence), BATCH):
+                    self._carry(record)
+            refill(memory, draft)
+            if memory.sequence - memory.saved >= SNAPSHOT_EVERY:
+                self._snapshot()
+            progress("embedding", draft.last, self._source.last)
+
+    def _carry(self, record: Record) -> None:
+        attributes, arrays = dict(record.attributes), dict(record.arrays)
+        codes: Codes | None = None
+        if record.kind == OBSERVE:
+            readings = unpack_readings(record.arrays)
+            assert readings is not None
+            columns, codes = self._encode(readings)
+            attributes |= {"columns": columns, "nbytes": readings.nbytes}
+            arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
+        head = self._draft.append(
+            record.kind, record.label, record.key, attributes=attributes, arrays=arrays, time=record.time
+        )
+        assert head.sequence == record.sequence
+        replay(self._memory, Record(**vars(head), arrays=arrays), self._draft, codes)
+
+    def _snapshot(self) -> None:
+        arrays, attributes = self._memory.to_arrays()
+        self._draft.commit(arrays, last_sequence=self._memory.sequence, attributes=attributes)
+        self._memory.saved = self._memory.sequence
+
+    def put_in_place(self) -> Path:
+        """Close both memories and exchange them; the folder in which the old one then lies.
+
+        The caller has copied all rows. Raises StoreError where the old one was written since, in another process.
+        """
+        self._snapshot()
+        folder, last_sequence = (
+            self._source.path.resolve(),
+            self._draft.last,
+        )  # resolved: a link goes on leading to the memory
+        for store in (self._draft, self._source):
+            store.close()
+        whole, before, count = _named(folder, "reembedded"), _named(folder, "before"), 1
+        while before.exists():
+            before, count = _named(folder, f"before-{count + 1}"), count + 1
+        lock = WriterLock(folder)
+        try:
+            with Store.open(folder, mode="read") as old:
+                if old.last != last_sequence:
+                    raise StoreError(f"{folder} was written while it was exchanged: embed it again, to go on")
+            with reported(folder, "putting a memory embedded anew in place"):
+                self._draft.path.rename(whole)
+                sync_folder(folder.parent)
+                folder.rename(before)
+                sync_folder(folder.parent)
+        finally:
+            lock.release()
+        finish_interrupted(folder)
+        return before
+
+    def close(self) -> None:
+        """Release the files; what was copied stays, for a run that goes on."""
+        self._draft.close()
+
+
+def finish_interrupted(path: Path) -> None:
+    """Put the memory embedded anew in place, where the exchange was cut short just before that."""
+    folder, whole = path.resolve(), _named(path, "reembedded")
+    if not is_there(folder) and is_there(whole):
+        with reported(folder, "putting a memory embedded anew in place"):
+            whole.rename(folder)
+            sync_folder(folder.parent)
+
+
+def _named(path: Path, what: str) -> Path:
+    folder = path.resolve()
+    return folder.with_name(f"{folder.name}.{what}")
+
+
+def _require_readings(store: Store) -> None:
+    heads = list(store.heads())
+    brought = [head.sequence for head in heads if head.kind not in (OBSERVE, RETRACT, DESCRIBE)]
+    bare = [head.sequence for head in heads if head.kind == OBSERVE and "nbytes" not in head.attributes]
+    if store.compacted:
+        what = f"rows 1 to {store.compacted} were compacted, and their readings given up"
+    elif brought:
+        what = f"row {brought[0]} brought in a compacted memory, which had none"
+    elif bare:
+        what = f"{len(bare)} rows, such as {bare[0]}, were observed without keeping them (exemplars=0)"
+    else:
+        if (newest := store.latest()) is not None:
+            require_counted(store.path, newest, heads)
+        return
+    raise MismatchError(
+        f"{store.path} cannot be embedded again, which takes the readings of every observation: {what}. Open it with "
+        "the embedding that made it, or touch again what it knows"
+    )

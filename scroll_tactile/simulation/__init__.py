@@ -1,0 +1,1 @@
+"""Sensors without hardware: simulated touches, a pressed gel, and shifts of readings for live sessions."""

@@ -1,0 +1,266 @@
+"""What a checkpoint, or that which a merge brought, must be: sums that touches can have, and samples of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.memory.rows import Arrays
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import Stream, fewest_readings
+from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
+from scroll_tactile.statistics.tables import rows_of
+from scroll_tactile.validation.expected import (
+    MOST_COLUMNS,
+    array,
+    check_values,
+    codes,
+    counts,
+    expect,
+    keys,
+    name,
+    whole,
+)
+from scroll_tactile.validation.row_checks import check_description, check_readings
+from store.records import LateArray
+
+__all__ = ["CheckpointChecks"]
+
+MOST_STAGES = 2**10  # and scales that judge at one
+MODES = ("head", "adapters", "network")
+NO_MOMENT = "a second moment of rows with these sums", "one that no rows have"
+JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as much
+IntArray = npt.NDArray[np.int64]
+
+
+class CheckpointChecks:
+    """The checks of checkpoints of one sensor, dimension and plan of windows; each raises Unexpected.
+
+    keeps: whether touches are kept to match with.
+    """
+
+    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, keeps: bool) -> None:
+        self._sensor, self._dimension, self._plan, self._keeps = sensor, dimension, plan, keeps
+
+    def check(
+        self, arrays: Arrays, attributes: Mapping[str, Any], last_sequence: int | None, *, thorough: bool
+    ) -> None:
+        """Check all that a memory takes from a checkpoint.
+
+        last_sequence: its last row; None of what a merge brought. thorough: whether second moments are shown to be
+        some; none is read later then.
+        """
+        whole("dimension", attributes.get("dimension"), self._dimension, self._dimension)
+        own, scales = list(map(int, self._plan.scales)), attributes.get("scales")
+        # 1.0 and True are equal to 1, and are not what is written there.
+        expect(scales == own and all(type(scale) is int for scale in scales), "scales", f"{own}", scales)
+        materials = _names("materials", attributes.get("materials"))
+        expect(len(set(materials)) == len(materials), "materials", "different names", materials)
+        touches = self._check_touches(arrays, len(materials))
+        totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in self._plan.scales}
+        rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
+        expect(all(touches), "observations", "a touch or more of each material", touches)
+        for view in self._plan.views:
+            expect(bool((totals[view] >= touches).all()), f"rows-{view}", "a row or more of each touch", totals[view])
+        sampled = _names("sample", attributes.get("sample"), materials)
+        self._check_sample(arrays, sampled)
+        copies: Any = attributes.get("copies")
+        expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of sample", copies)
+        for each in copies:
+            whole("copies", each, 1, MOST_ROWS)
+        if self._keeps or "kept" in attributes:
+            self._check_kept(arrays, _names("kept", attributes.get("kept"), materials))
+        if "exemplars" in attributes:
+            self._check_exemplars(arrays, attributes["exemplars"], rows, last_sequence)
+        for field in ("retracted", "excluded"):
+            sequences = counts(field, array(arrays, field, ("int64",), (None,)), 1, last_sequence or 2**63 - 1)
+            expect(len(set(sequences.tolist())) == len(sequences), field, "different rows", sequences)
+        if last_sequence is not None or "descriptions" in attributes:  # to a merge they are rows of their own
+            _check_descriptions(attributes.get("descriptions"))
+        if last_sequence is not None or "tuned" in attributes:  # a merge leaves the tuned model where it is
+            whole("tuned_last_sequence", attributes.get("tuned_last_sequence"), 0, last_sequence or 2**63 - 1)
+        if "tuned" in attributes:
+            self._check_tuned(arrays, attributes["tuned"])
+
+    def _check_touches(self, arrays: Arrays, count: int) -> list[int]:
+        observations = array(arrays, "observations", ("int64",), (count,))
+        touches: list[int] = counts("observations", observations, 0, MOST_ROWS).tolist()
+        lengths = array(arrays, "lengths", ("int64",), (None, 2))
+        counts("lengths", lengths[:, 0], 1, MOST_COLUMNS)
+        counts("lengths", lengths[:, 1], 1, MOST_ROWS)
+        expect(len(set(lengths[:, 0].tolist())) == len(lengths), "lengths", "different lengths", lengths[:, 0])
+        total = int(lengths[:, 1].sum())
+        expect(total == sum(touches), "lengths", f"{sum(touches)} touches, those of observations", total)
+        return touches
+
+    def _check_sums(self, arrays: Arrays, scale: Scale, count: int, thorough: bool) -> IntArray:
+        """The rows of each material at a scale, whose sums and second moment could be of so many."""
+        field = f"rows-{scale}"
+        rows = counts(field, array(arrays, field, ("int64",), (count,)), 0, MOST_ROWS)
+        total = whole(field, int(rows.sum()), 0, MOST_ROWS)
+        field = f"sums-{scale}"
+        sums = array(arrays, field, ("int64",), (count, self._dimension))
+        codes(field, sums, rows[:, None])
+        if total:
+            known = rows > 0
+            self._check_second(arrays, scale, rows[known], sums[known], thorough)
+        return rows
+
+    def _check_second(self, arrays: Arrays, scale: Scale, rows: IntArray, sums: IntArray, thorough: bool) -> None:
+        """The triangle of a scale, or the rows that it is of; all materials have rows."""
+        total, between = int(rows.sum()), (sums.astype(np.float64) ** 2 / rows[:, None]).sum(axis=0)
+        field = f"second-{scale}"
+        if field in arrays:
+            packed = array(arrays, field, ("int64",), (self._dimension * (self._dimension + 1) // 2,))
+            check_values(packed, partial(self._check_moment, field, total, between))
+            if thorough:
+                self._check_scatter(field, packed, rows, sums)
+            return
+        field = f"values-{scale}"
+        values = array(arrays, field, ("int32",), (None,))
+        count = whole(field, values.shape[0], 1, total * self._dimension)
+        check_values(values, partial(_check_ascending, field))
+        field = f"places-{scale}"
+        expect(total <= self._dimension, f"rows-{scale}", f"{self._dimension} or fewer, or a second moment", total)
+        places = array(arrays, field, ("int32",), (self._dimension, total))
+        check_values(places, partial(self._check_rows, field, count, values, between, sums.sum(axis=0)))
+        if thorough:
+            moment = SecondMoment.of_codes(rows_of(values, places), total, self._dimension)
+            self._check_scatter(field, moment.packed(), rows, sums)
+
+    def _check_rows(
+        self,
+        field: str,
+        count: int,
+        values: npt.NDArray[np.int32] | LateArray,
+        between: npt.NDArray[np.float64],
+        sums: IntArray,
+        places: npt.NDArray[np.int32],
+    ) -> None:
+        """Raise Unexpected for rows that are not of these sums, or vary less than their materials do.
+
+        count: of the values. between: as in `_check_moment`. sums: of all, (d,).
+        """
+        expect(bool(((places >= 0) & (places < count)).all()), field, f"places among {count}", "others")
+        rows = rows_of(values.read() if isinstance(values, LateArray) else values, places)
+        expect(bool((rows.sum(axis=0, dtype=np.int64) == sums).all()), field, "rows of these sums", "others")
+        self._check_diagonal(field, np.einsum("nd,nd->d", rows, rows, dtype=np.float64), between)
+
+    def _check_moment(self, field: str, total: int, between: npt.NDArray[np.float64], packed: IntArray) -> None:
+        """Raise Unexpected where a variance within the materials is negative: a readout of it has no answer.
+
+        total: the rows. between: the sum over materials of the squares of their sums over their rows, (d,).
+        """
+        most = total << 2 * BITS
+        counts(field, packed, -most, most)
+        places = np.cumsum(np.arange(1, self._dimension + 1)) - 1  # of the diagonal
+        self._check_diagonal(field, packed[places].astype(np.float64), between)
+
+    def _check_diagonal(self, field: str, diagonal: npt.NDArray[np.float64], between: npt.NDArray[np.float64]) -> None:
+        sound = bool((diagonal + 1e-9 * diagonal.max(initial=0) + 1 >= between).all())
+        expect(sound, field, *NO_MOMENT)
+
+    def _check_scatter(self, field: str, packed: IntArray, rows: IntArray, sums: IntArray) -> None:
+        """Raise Unexpected where a variance within the materials, which all have rows, is negative in any direction."""
+        scatter = within_scatter(packed, rows, sums)
+        scatter[np.diag_indices(self._dimension)] += JITTER * float(np.trace(scatter)) / self._dimension + 1
+        try:
+            with one_thread():
+                np.linalg.cholesky(scatter)
+        except np.linalg.LinAlgError:
+            expect(False, field, *NO_MOMENT)
+
+    def _check_sample(self, arrays: Arrays, materials: list[str]) -> None:
+        keys(arrays, "sample-keys", materials)
+        sizes = array(arrays, "sample-sizes", ("int64",), (len(materials),))
+        counts("sample-sizes", sizes, 1, MOST_STAGES**2)
+        pairs = array(arrays, "sample-pairs", ("int64",), (int(sizes.sum()), 3))
+        counts("sample-pairs", pairs[:, :2], 0, MOST_STAGES - 1)
+        counts("sample-pairs", pairs[:, 2], 1, MOST_ROWS)
+        order = np.diff(pairs[:, 0] * MOST_STAGES + pairs[:, 1])
+        order[np.cumsum(sizes)[:-1] - 1] = 1  # from one touch to the next
+        expect(bool((order > 0).all()), "sample-pairs", "stages and scales in order", pairs)
+        rows = array(arrays, "sample-rows", ("int32",), (self._dimension if len(pairs) else None, len(pairs)))
+        check_values(rows, partial(codes, "sample-rows"))
+
+    def _check_kept(self, arrays: Arrays, materials: list[str]) -> None:
+        keys(arrays, "kept-keys", materials)
+        columns = array(arrays, "kept-columns", ("int64",), (len(materials),))
+        counts("kept-columns", columns, fewest_readings(self._sensor), MOST_COLUMNS)
+        array(arrays, "kept-levels", ("uint8",), (int(columns.sum()) * self._sensor.channels,))
+
+    def _check_exemplars(
+        self, arrays: Arrays, about: Any, rows: Mapping[Scale, Mapping[str, int]], last_sequence: int | None
+    ) -> None:
+        expect(isinstance(about, dict), "exemplars", "their materials", about)
+        known = list(next(iter(rows.values()), {}))
+        materials = _names("exemplars.materials", about.get("materials"), known)
+        keys(arrays, "exemplar-keys", materials)
+        count = len(materials)
+        if "exemplar-sources" in arrays:
+            sources = array(arrays, "exemplar-sources", ("int64",), (count,))
+            counts("exemplar-sources", sources, 0, 2**63 - 1 if last_sequence is None else last_sequence)
+        if "exemplar-readings" not in arrays:
+            return
+        lengths = array(arrays, "exemplar-lengths", ("int64",), (count,))
+        counts("exemplar-lengths", lengths, fewest_readings(self._sensor), MOST_COLUMNS)
+        scales = array(arrays, "exemplar-scales", ("int64",), (count,)).tolist()
+        for material, scale in zip(materials, scales, strict=True):
+            found = next((totals for own, totals in rows.items() if int(own) == scale and own.width), {})
+            expect(found.get(material, 0) > 0, "exemplar-scales", f"windows that {material!r} has", scale)
+        array(arrays, "exemplar-codes", ("int32",), (count, self._dimension if count else None))
+        codes("exemplar-codes", arrays["exemplar-codes"])
+        shape = (int(lengths.sum()), *self._sensor.shape) if count else (0, None)
+        readings = array(arrays, "exemplar-readings", ("float32",), shape)
+        if count:
+            check_readings("exemplar-readings", readings, self._sensor)
+            streams = (Stream(self._sensor, own) for own in np.split(readings, np.cumsum(lengths)[:-1]))
+            same = [stream.key for stream in streams] == [key.tobytes() for key in arrays["exemplar-keys"]]
+            expect(same, "exemplar-keys", "the content hashes of their readings", "others")
+
+    def _check_tuned(self, arrays: Arrays, about: Any) -> None:
+        """A tuned model: whether a network takes its tensors is known when one is made."""
+        expect(isinstance(about, dict), "tuned", "names, mode, kept and report", about)
+        names = _names("tuned.names", about.get("names"))
+        expect(bool(names) and len(set(names)) == len(names), "tuned.names", "different names", names)
+        expect(about.get("mode") in MODES, "tuned.mode", f"one of {MODES}", about.get("mode"))
+        expect(isinstance(about.get("kept"), bool), "tuned.kept", "true or false", about.get("kept"))
+        expect(isinstance(about.get("report"), dict), "tuned.report", "a report", about.get("report"))
+        heads = {field for field in arrays if field.startswith("tuned-head-")}
+        able = {f"tuned-head-{scale}" for scale in self._plan.windows}
+        expect(bool(heads) and heads <= able, "tuned", f"heads of {sorted(able)}", sorted(heads))
+        for field in heads:
+            _check_finite(field, array(arrays, field, ("float64",), (self._dimension, len(names))))
+        _check_finite("tuned-bias", array(arrays, "tuned-bias", ("float64",), (len(names),)))
+        for field in (field for field in arrays if field.startswith("tuned-net-")):
+            _check_finite(field, array(arrays, field, ("float32",), arrays[field].shape))
+
+
+def _check_ascending(field: str, values: npt.NDArray[np.int32]) -> None:
+    codes(field, values)
+    expect(bool((np.diff(values) > 0).all()), field, "ascending values", "others")
+
+
+def _check_finite(field: str, values: npt.NDArray[np.floating]) -> None:
+    expect(bool(np.isfinite(values).all()), field, "finite weights", "others")
+
+
+def _names(field: str, values: Any, among: list[str] | None = None) -> list[str]:
+    expect(isinstance(values, list), field, "names of materials", values)
+    names = [name(field, value) for value in values]
+    strange = [] if among is None else sorted(set(names) - set(among))
+    expect(not strange, field, "materials that were observed", strange)
+    return names
+
+
+def _check_descriptions(descriptions: Any) -> None:
+    expect(isinstance(descriptions, dict), "descriptions", "descriptions by material", descriptions)
+    for material, constituents in descriptions.items():
+        expect(constituents is not None, "descriptions", "a description", constituents)
+        check_description("descriptions", name("descriptions", material), constituents)

@@ -1,0 +1,282 @@
+"""The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
+
+Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
+gate takes every row and checkpoint for what it must be (see `row_checks`, `checkpoint_checks`), and raises DamageError
+with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
+under another name is, and it fits.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy.typing as npt
+
+from scroll_tactile.embeddings.protocol import Embedding, window_plan
+from scroll_tactile.embeddings.registry import require_configuration
+from scroll_tactile.errors import EmbeddingError, MismatchError
+from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
+from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.copies import Augmented, require_augmentable
+from scroll_tactile.signals.windows import WindowPlan
+from scroll_tactile.validation.checkpoint_checks import CheckpointChecks
+from scroll_tactile.validation.expected import Unexpected
+from scroll_tactile.validation.row_checks import RowChecks
+from store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
+from store.files import file_size
+from store.layout import log_numbers, log_path
+
+__all__ = ["WRONG", "Gate", "MemoryStore", "check_memory", "open_store", "require_counted", "wrong_retractions"]
+
+SMALLEST_ROW = 128  # bytes of the log: a frame and a row without texts
+# What reading values of wrong types can raise; what is no error of the values, such as ctrl-C, is none of them.
+WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
+
+
+class Gate:
+    """What rows and checkpoints in a folder must be, by the identity there, and the plan of windows it is read with.
+
+    thorough: whether second moments are shown to be some; it takes as long as fitting a readout.
+    """
+
+    def __init__(self, path: Path, identity: Identity, plan: WindowPlan, *, thorough: bool = False) -> None:
+        self._path, self.thorough = path, thorough
+        copies = identity.augmentation.copies if identity.augmentation else 0
+        made_with = identity.sensor, identity.embedding.dimension, plan
+        self._rows = RowChecks(*made_with, copies)
+        self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.kept_touches))
+
+    def head(self, head: Head) -> Head:
+        """This row, which is what its kind must be but for its arrays. Raises as `record`."""
+        with self._refusing(f"row {head.sequence}", head.sequence):
+            self._rows.check_head(head, self._most_rows)
+        return head
+
+    def record(self, record: Record) -> Record:
+        """This row with its arrays. Raises DamageError; MismatchError for what this version does not know."""
+        self.head(record)
+        with self._refusing(f"row {record.sequence}", record.sequence):
+            if record.kind == OBSERVE:
+                self._rows.check_observed(record)
+            elif record.kind == MERGE:
+                self._checkpoints.check(record.arrays, record.attributes, None, thorough=self.thorough)
+        return record
+
+    def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
+        """This checkpoint. Raises DamageError."""
+        with self._refusing(f"checkpoint {checkpoint.number}"):
+            arrays, attributes, last_sequence = checkpoint.arrays, checkpoint.attributes, checkpoint.last_sequence
+            every: dict[str, Any] = {**arrays, **checkpoint.late}
+            self._checkpoints.check(every, attributes, last_sequence, thorough=self.thorough)
+        for late in checkpoint.late.values():
+            late.check = partial(self._late, f"checkpoint {checkpoint.number}", late.check)
+        return checkpoint
+
+    def _late(self, what: str, check: Callable[[npt.NDArray[Any]], None] | None, values: npt.NDArray[Any]) -> None:
+        """Check an array of a checkpoint that was read later than the others."""
+        with self._refusing(what):
+            if check is not None:
+                check(values)
+
+    @contextmanager
+    def _refusing(self, what: str, sequence: int | None = None) -> Iterator[None]:
+        """Name the place of what a check refuses."""
+        try:
+            yield
+        except MismatchError as error:
+            advice = "Open the memory with the version that wrote it, or a newer one"
+            raise MismatchError(f"{what} of {self._path} {error}. {advice}") from None
+        except WRONG as error:
+            raise self._damage(what, error, sequence) from error
+
+    def _damage(self, what: str, error: Exception, sequence: int | None = None) -> DamageError:
+        """The error for what is Unexpected and, as a last net, for what a check itself did not expect."""
+        came = str(error) if isinstance(error, Unexpected) else f"{type(error).__name__}: {error!s:.200}"
+        return DamageError(
+            f"{what} of {self._path} is not what is written there: {came}. It is damaged, or was made by another "
+            "program: use none of this memory before you know who made it (scroll-tactile memory check)",
+            path=self._path,
+            sequence=sequence,
+        )
+
+    def _most_rows(self) -> int:
+        """How many rows the journal can hold, by its size."""
+        packed = self._path.is_file()
+        logs = [self._path] if packed else [log_path(self._path, number) for number in log_numbers(self._path)]
+        return sum(map(file_size, logs)) // SMALLEST_ROW
+
+
+class MemoryStore(Store):
+    """A store that holds a memory: what it reads passes the gate.
+
+    Raises, from each method that reads, what `Gate` does, and what `Identity.read` does.
+    """
+
+    _gate: Gate | None = None
+
+    @property
+    def gate(self) -> Gate:
+        """The gate, by the memory's identity alone where nobody called `read_with`."""
+        if self._gate is None:
+            identity = Identity.read(self)
+            self.read_with(window_plan(identity.sensor, AbsentEmbedding(identity, self.path)))
+        assert self._gate is not None
+        return self._gate
+
+    def read_with(self, plan: WindowPlan, *, thorough: bool = False) -> None:
+        """Read with this plan of windows from now on; thorough: see `Gate`."""
+        self._gate = Gate(self.path, Identity.read(self), plan, thorough=thorough)
+
+    def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
+        """As `Store.heads`."""
+        return map(self.gate.head, super().heads(after, kind=kind, label=label))
+
+    def with_key(self, key: bytes) -> Iterator[Head]:
+        """As `Store.with_key`."""
+        return map(self.gate.head, super().with_key(key))
+
+    def record(self, sequence: int) -> Record:
+        """As `Store.record`."""
+        return self.gate.record(super().record(sequence))
+
+    def records(self, after: int = 0) -> Iterator[Record]:
+        """As `Store.records`."""
+        return map(self.gate.record, super().records(after))
+
+    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
+        """As `Store.latest`; what has not all of its arrays is not looked at."""
+        if only is not None:
+            return super().latest(only=only, late=late)
+        newest = super().latest(late=() if self.gate.thorough else late)
+        return None if newest is None else self.gate.checkpoint(newest)
+
+    def compaction(self) -> Checkpoint | None:
+        """As `Store.compaction`."""
+        found = super().compaction()
+        return None if found is None else self.gate.checkpoint(found)
+
+
+def open_store(
+    path: str | os.PathLike[str],
+    sensor: Sensor | None,
+    embedding: Embedding | None,
+    augmentation: Augmented | None,
+    exemplars: int | None,
+    kept_touches: int | None,
+    mode: Literal["write", "read"],
+) -> MemoryStore:
+    """The store in a folder; a new one where there is none and a sensor is given."""
+    try:
+        return MemoryStore.open(path, mode=mode)
+    except NotAStoreError:
+        if sensor is None or mode == "read":
+            raise
+    require_augmentable(sensor, augmentation)
+    chosen = usual_embedding(sensor) if embedding is None else embedding
+    identity = Identity.of(sensor, chosen, exemplars, augmentation, kept_touches)
+    return MemoryStore.open(path, identity=identity.to_json(), mode=mode)
+
+
+def require_counted(path: Path, checkpoint: Checkpoint, heads: Sequence[Head]) -> None:
+    """Raise DamageError where a checkpoint counts more touches of a material than the journal's rows name.
+
+    heads: all rows of the journal; where a repair lost some, nobody knows.
+    """
+    if heads and len(heads) < heads[-1].sequence:
+        return
+    named = Counter(
+        head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= checkpoint.last_sequence
+    )
+    touches = checkpoint.arrays["observations"].tolist()
+    for material, count in zip(cast("list[str]", checkpoint.attributes["materials"]), touches, strict=True):
+        if count > named[material]:
+            raise DamageError(
+                f"checkpoint {checkpoint.number} of {path} counts {count} touches of {material!r}, of which its "
+                f"journal names {named[material]}: it was made by another program, or for another journal",
+                path=path,
+            )
+
+
+def check_memory(path: str | os.PathLike[str]) -> list[str]:
+    """All that the gate finds in a folder, one sentence each; nothing of a sound memory, and nothing is replayed.
+
+    Checksums are `store.check_store`'s: a row that fails its own is passed over here. Raises StoreError where the
+    folder cannot be read, or holds no store.
+    """
+    with MemoryStore.open(path, mode="read") as store:
+        try:
+            identity = Identity.read(store)
+            plan = window_plan(identity.sensor, AbsentEmbedding(identity, store.path))
+            store.read_with(plan, thorough=True)
+            if identity.embedding.configuration is not None:
+                require_configuration(identity.embedding.configuration)
+        except (DamageError, EmbeddingError, MismatchError) as error:
+            return [str(error)]
+        heads, wrong = _in_rows(store)
+        passed = [head for head in heads if head.sequence not in wrong]
+        retractions = map(str, wrong_retractions(store.path, passed))
+        return [*_in_checkpoints(store, heads), *wrong.values(), *retractions]
+
+
+def _in_checkpoints(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
+    for read in (store.latest, store.compaction):
+        try:
+            if (checkpoint := read()) is not None:
+                require_counted(store.path, checkpoint, heads)
+        except DamageError as damage:
+            yield str(damage)
+
+
+def _in_rows(store: MemoryStore) -> tuple[list[Head], dict[int, str]]:
+    """The heads of the rows that verify, and by their sequence what is wrong with them."""
+    heads: list[Head] = []
+    wrong: dict[int, str] = {}
+    for row in _rows(store):
+        try:
+            store.gate.record(row) if isinstance(row, Record) else store.gate.head(row)
+        except (DamageError, MismatchError) as error:
+            wrong[row.sequence] = str(error)
+        heads.append(Head(**{field.name: getattr(row, field.name) for field in fields(Head)}))  # without arrays
+    return heads, wrong
+
+
+def wrong_retractions(path: Path, heads: Sequence[Head]) -> Iterator[DamageError]:
+    """What is wrong with the rows, in order, that retract what is no observation, or was retracted before."""
+    kinds = {head.sequence: head.kind for head in heads}
+    for head in heads:
+        if head.kind != RETRACT:
+            continue
+        gone = unspanned(head.attributes["sequences"])
+        if strange := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
+            yield DamageError(
+                f"row {head.sequence} of {path} retracts {strange[:5]}, which are no observations, or retracted before",
+                path=path,
+                sequence=head.sequence,
+            )
+        kinds.update((sequence, RETRACT) for sequence in gone)
+
+
+def _rows(store: MemoryStore) -> Iterator[Head]:
+    """The rows whose checksums hold, with their arrays where they were not compacted; they do not pass the gate."""
+    compacted, last, after = store.compacted, store.last, 0
+    while after < last:
+        try:
+            for row in Store.heads(store, after) if after < compacted else Store.records(store, after):
+                after = row.sequence
+                yield row
+                if after == compacted:
+                    break
+            else:
+                return
+        except DamageError as damage:
+            if damage.sequence is None or damage.sequence <= after:
+                return
+            after = damage.sequence

@@ -1,0 +1,366 @@
+"""Packed memories: one file that holds what a memory learned, is merged like its folder, and tells any damage."""
+
+import os
+import shutil
+import struct
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from touches import OBSERVED, SETTINGS, contents, fed, filled, require_same, spoil, stream
+
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import MismatchError, ObservationError
+from scroll_tactile.validation.gate import MemoryStore, check_memory
+from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, VersionError, archive, check_store
+from store.framing import FRAME_BYTES
+
+
+def packed(folder, observed, name="p", described=(), pack=None, **settings):
+    """A packed memory that observed these touches."""
+    learner, _ = filled(folder / f"{name}.memory", observed, **settings)
+    with learner:
+        for material, constituents in dict(described).items():
+            learner.describe(material, constituents)
+        learner.pack(folder / name, **pack or {})
+    return folder / name
+
+
+class TestMerging:
+    def test_rows_can_be_retracted_where_they_were_merged_and_after_a_checkpoint_was_lost(self, tmp_path):
+        file = packed(tmp_path, OBSERVED)
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+            learner.merge(file, shared="once")
+            learner.retract(1)
+            require_same(learner, OBSERVED[1:])
+        spoil(tmp_path / "m", 1)
+        with TactileLearner.open(tmp_path / "m") as again:
+            require_same(again, OBSERVED[1:])
+
+    def test_what_both_observed_counts_once_or_twice(self, tmp_path):
+        file = packed(tmp_path, OBSERVED[3:9])
+        for shared, expected in (("once", OBSERVED[:9]), ("twice", [*OBSERVED[:6], *OBSERVED[3:9]])):
+            learner, _ = filled(tmp_path / shared, OBSERVED[:6])
+            with learner:
+                done = learner.merge(file, shared=shared)
+                assert (done.observations, done.shared) == (3 if shared == "once" else 6, 3)
+                assert learner.digest() == fed(expected, again=True).digest()
+
+    def test_touches_without_rows_cannot_be_counted_once(self, tmp_path):
+        file = packed(tmp_path, OBSERVED[3:9], pack={"rows": False})
+        learner, _ = filled(tmp_path / "m", OBSERVED[:6])
+        with learner:
+            with pytest.raises(ObservationError, match="cannot be counted once"):
+                learner.merge(file, shared="once")
+            require_same(learner, OBSERVED[:6])
+
+    def test_descriptions_sources_and_times_travel_and_what_was_retracted_stays(self, tmp_path):
+        with TactileLearner.open(tmp_path / "robot", **SETTINGS) as robot:
+            robot.observe("a", stream((0, 60)), source="félt.npy[0:60]")
+            robot.observe("b", stream((1, 60)))
+            robot.retract(robot.observe("c", stream((2, 60))))
+            robot.describe("a", {"cotton": 1.0})
+            robot.pack(tmp_path / "p", source="robot 7")
+            before = [(row.material, row.time) for row in robot.observations()][:2]
+        with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+            assert learner.merge(tmp_path / "p", shared="once").described == 1
+            rows = learner.observations()
+            assert [(row.material, row.time) for row in rows] == before
+            assert [row.source for row in rows] == ["félt.npy[0:60]", "robot 7"]
+            assert learner.descriptions == {"a": {"cotton": 1.0}}
+
+    def test_without_readings_nothing_shows_a_touch_as_it_was_read(self, tmp_path):
+        file = packed(tmp_path, OBSERVED, pack={"readings": False})
+        with MemoryStore.open(file, mode="read") as store:
+            names = [name for head in store.heads() for name in head.attributes]
+            held = {*store.latest().arrays, *names}
+            assert store.compacted == store.last == 12
+            assert not {name for name in held if name.startswith(("kept", "exemplar", "readings", "nbytes"))}
+        shown = [stream(touch).astype(np.float32).tobytes()[:64] for _, touch in OBSERVED]
+        assert not any(part in file.read_bytes() for part in shown)
+        with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": 0, "kept_touches": 0}) as learner:
+            learner.merge(file, shared="once")
+            require_same(learner, OBSERVED, exemplars=False, kept_touches=0)
+        with TactileLearner.open(tmp_path / "other", **SETTINGS) as learner:
+            with pytest.raises(MismatchError, match="keeps exemplars"):
+                learner.merge(file, shared="once")
+            assert learner.materials == {}
+
+
+class TestReading:
+    @pytest.mark.parametrize("pack", [{}, {"rows": False}, {"readings": False}])
+    def test_it_is_opened_to_read_where_it_lies_and_left_as_it_is(self, tmp_path, pack):
+        file = packed(tmp_path, OBSERVED, described={"a": {"cotton": 1.0}}, pack=pack)
+        before = file.read_bytes()
+        with TactileLearner.open(file, mode="read") as learner:
+            if pack.get("readings", True):
+                assert contents(learner) == contents(fed(OBSERVED))
+            assert learner.digest() == fed(OBSERVED).digest()
+            assert learner.descriptions == {"a": {"cotton": 1.0}}
+            assert [row.material for row in learner.observations()] == [name for name, _ in OBSERVED]
+            assert not learner.refresh()
+            with pytest.raises(ReadOnlyError, match="mode"):
+                learner.observe("a", stream((80, 60)))
+        assert check_memory(file) == []
+        assert file.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["p", "p.memory"]
+
+    def test_it_is_not_opened_to_write(self, tmp_path):
+        file = packed(tmp_path, OBSERVED[:2])
+        with pytest.raises(NotAStoreError, match=r"opened with mode=\"read\", or merged"):
+            TactileLearner.open(file)
+
+    def test_names_that_a_file_has_in_its_folder_lead_nowhere_else(self, tmp_path):
+        file = packed(tmp_path, OBSERVED[:2])
+        with zipfile.ZipFile(file) as listed:
+            names = listed.namelist()
+        assert names[0] == "CURRENT" and names[1].startswith("log-")
+        assert all(name.startswith("checkpoints/") for name in names[2:])
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    """A packed memory of three touches; not to be changed."""
+    return packed(tmp_path_factory.mktemp("three"), OBSERVED[:3])
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """A memory that observed another touch, and that takes nothing in."""
+    with TactileLearner.open(tmp_path_factory.mktemp("other") / "m", **SETTINGS) as learner:
+        learner.observe("z", stream((50, 60)))
+        yield learner
+
+
+REFUSED = DamageError, NotAStoreError, MismatchError, VersionError
+
+
+def require_refused(learner, file, match=None):
+    """Merging and opening a file are refused by its name, within seconds, and change nothing."""
+    before, begun = learner.digest(), time.monotonic()
+    for use in (lambda: learner.merge(file, shared="once"), lambda: TactileLearner.open(file, mode="read").close()):
+        with pytest.raises(REFUSED, match=match) as raised:
+            use()
+        assert str(file) in str(raised.value)
+    assert (learner.digest(), len(learner.observations())) == (before, 1)
+    assert time.monotonic() - begun < 20
+
+
+class TestDamage:
+    @pytest.mark.parametrize("pack", [{}, {"rows": False}])
+    def test_a_flipped_bit_anywhere_is_refused_by_name_or_changes_nothing(self, tmp_path, pack):
+        """Dates and the like are not verified; where there are rows they say all that a checkpoint says."""
+        file = packed(tmp_path, OBSERVED[:3], pack=pack)
+        whole, draw, digest, refused = file.read_bytes(), np.random.default_rng(7), fed(OBSERVED[:3]).digest(), 0
+        listed = archive.Archive(file)
+        listed.close()
+        inside = listed._ranges
+        described = [name for name in inside if name.count("/") == 3 and name.endswith("/zarr.json")]  # not read whole
+        spare = described if pack else [name for name in inside if name.startswith("checkpoints")]
+        # The frame that ends a log proves what is before it, and nothing proves that.
+        shorter = {name: FRAME_BYTES for name in inside if name.startswith("log-")}
+        needed = [(begin, size - shorter.get(name, 0)) for name, (begin, size) in inside.items() if name not in spare]
+        within = [begin + int(draw.integers(size)) for begin, size in needed for _ in range(1 if pack else 8)]
+        outside = [*range(0, 30, 3), *range(len(whole) - 60, len(whole), 4)]
+        outside += [begin - 30 for begin, _ in inside.values()]
+        places = [*within, *outside, *draw.integers(0, len(whole), size=15).tolist()]
+        for place in places:
+            flipped = bytearray(whole)
+            flipped[place] ^= 1 << int(draw.integers(8))
+            file.write_bytes(bytes(flipped))
+            try:
+                with TactileLearner.open(tmp_path / f"m{place}", **SETTINGS) as learner:
+                    learner.merge(file, shared="once")
+                    assert learner.digest() == digest, place
+                    assert place not in within, place
+            except REFUSED as error:
+                refused += 1
+                assert str(file) in str(error)
+        assert refused >= len(within)
+
+    def test_a_file_that_was_cut_off_anywhere(self, tmp_path, other):
+        file = packed(tmp_path, OBSERVED[:2])
+        whole = file.read_bytes()
+        for size in [0, 1, 10, 37, 100, *range(1000, len(whole), len(whole) // 8), len(whole) - 22, len(whole) - 1]:
+            file.write_bytes(whole[:size])
+            require_refused(other, file, "fetch it again from where it was packed")
+
+    def test_a_newer_version_is_refused_by_its_number(self, tmp_path, other, monkeypatch):
+        monkeypatch.setattr("store.layout.FORMAT_VERSION", 9)
+        file = packed(tmp_path, OBSERVED[:2])
+        monkeypatch.undo()
+        require_refused(other, file, "format 9; this release reads format 1: upgrade it")
+
+    def test_sums_of_other_touches_than_its_rows(self, tmp_path, other):
+        """Rows of one memory, the checkpoint of another, and right checksums."""
+        one, two = packed(tmp_path, OBSERVED[:4], "one"), packed(tmp_path, OBSERVED[1:5], "two")
+        del one, two
+        with Store.open(tmp_path / "two.memory", mode="read") as store:
+            newest = store.latest()
+        with Store.open(tmp_path / "one.memory") as store:
+            store.commit(newest.arrays, last_sequence=newest.last_sequence, attributes=newest.attributes)
+        archive.write_archive(tmp_path / "one.memory", tmp_path / "forged")
+        before = other.digest()
+        with pytest.raises(DamageError, match=r"forged counts other touches than it names|forged counts \d touches of"):
+            other.merge(tmp_path / "forged", shared="once")
+        assert other.digest() == before
+
+    def test_a_full_disk_leaves_nothing_behind(self, tmp_path, monkeypatch):
+        learner, _ = filled(tmp_path / "m", OBSERVED[:2])
+
+        def full(*_):
+            raise OSError(28, "No space left on device")
+
+        with learner:
+            monkeypatch.setattr("store.archive.os.fsync", full)
+            with pytest.raises(StoreError, match="no space left"):
+                learner.pack(tmp_path / "p")
+            monkeypatch.undo()
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
+
+
+def entries(file):
+    """The names and contents of a zip."""
+    with zipfile.ZipFile(file) as listed:
+        return [(entry.filename, listed.read(entry)) for entry in listed.infolist()]
+
+
+def zipped(file, files, compress=zipfile.ZIP_STORED, links=()):
+    """Write a zip of these names and contents, whatever they are."""
+    with zipfile.ZipFile(file, "w", compress) as made:
+        for name, content in files:
+            entry = zipfile.ZipInfo(name)
+            entry.compress_type = compress
+            entry.external_attr = (0o120777 if name in links else 0o100644) << 16
+            made.writestr(entry, content)
+
+
+def patched(file, mark, offset, value):
+    """Change bytes behind each mark of a zip."""
+    data = bytearray(file.read_bytes())
+    place = data.find(mark)
+    while place >= 0:
+        data[place + offset : place + offset + len(value)] = value
+        place = data.find(mark, place + 4)
+    file.write_bytes(bytes(data))
+
+
+LISTED, LOCAL = b"PK\1\2", b"PK\3\4"
+
+
+def doubled(name):
+    """A file more, of this name."""
+    return lambda file: zipped(file, [*entries(file), (name, b"any")])
+
+
+def relisted(offset, form, *values):
+    """The list of files says other things of each."""
+
+    def change(file):
+        zipped(file, entries(file))
+        patched(file, LISTED, offset, struct.pack(form, *values))
+
+    return change
+
+
+def holding(make):
+    """A zip of other files."""
+    return lambda file: zipped(file, make(file))
+
+
+def overlapping(file):
+    zipped(file, [("CURRENT", b"{}"), ("log-00000001", b"x" * 100), ("log-00000002", b"y" * 100)])
+    data = bytearray(file.read_bytes())
+    second = data.rfind(LISTED, 0, data.rfind(LISTED))
+    data[second + 20 : second + 28] = struct.pack("<II", 200, 200)
+    file.write_bytes(data)
+
+
+def of_too_many_files(file):
+    with zipfile.ZipFile(file, "a") as many:
+        for number in range(2, 10**5):
+            many.writestr(f"log-{number:08d}", b"")
+
+
+def of_a_full_list(file):
+    zipped(file, entries(file))
+    patched(file, b"PK\5\6", 12, struct.pack("<I", 2**31))
+
+
+def bomb(compress):
+    return lambda file: zipped(file, [*entries(file), ("log-00000002", bytes(2**26))], compress)
+
+
+def in_its_place(make):
+    """Something else under the file's name."""
+
+    def replace(file):
+        file.rename(file.with_name("moved"))
+        make(file)
+
+    return replace
+
+
+NAMES = ["../outside", "checkpoints/../../outside", "/tmp/outside", "C:\\outside", "checkpoints\\00000001\\zarr.json"]
+NAMES += ["current", "Log-00000001", "log-00000001/", "lock", "log-٠٠٠٠٠٠٠١", "x" * 60_000]
+NAMES += ["checkpoints/00000001/a/c/" + "0/" * 70 + "0", "CURRENT", "log-00000001"]
+SHELL = b"#!/bin/sh\n"
+HARMS = {
+    # what is done to a packed memory; what is said of it
+    **{f"a file {name[:30]}": (doubled(name), "(?i)fetch it again") for name in NAMES},
+    "a link": (lambda file: zipped(file, entries(file), links=["log-00000001"]), "as a link"),
+    "deflated": (bomb(zipfile.ZIP_DEFLATED), "as compressed or encrypted"),
+    "bzip2": (bomb(zipfile.ZIP_BZIP2), "as compressed or encrypted"),
+    "lzma": (bomb(zipfile.ZIP_LZMA), "as compressed or encrypted"),
+    "encrypted": (lambda file: patched(file, LISTED, 8, struct.pack("<H", 1)), "as compressed or encrypted"),
+    "another name in the list": (lambda file: patched(file, b"CURRENT", 0, b"CURRENS"), None),
+    "a place in a file": (relisted(42, "<I", 7), "where another file begins, or none"),
+    "a place of another": (relisted(42, "<I", 0), "where another file begins, or none"),
+    **{f"{size} bytes each": (relisted(20, "<II", size, size), None) for size in (0, 1, 10**6, 2**32 - 2)},
+    "files that overlap": (overlapping, "files that overlap"),
+    "a script before it": (lambda file: file.write_bytes(SHELL + file.read_bytes()), "cut off or added to"),
+    "zeros before it": (lambda file: file.write_bytes(bytes(1000) + file.read_bytes()), "cut off or added to"),
+    "a byte behind it": (lambda file: file.write_bytes(file.read_bytes() + b"x"), "cut off or added to"),
+    "nothing in it": (holding(lambda file: []), "no packed store"),
+    "other things": (holding(lambda file: [("readme.txt", b"any")]), "no packed store"),
+    "itself": (holding(lambda file: [("memory.zip", file.read_bytes())]), "no packed store"),
+    "all in a folder": (holding(lambda file: [("m/" + name, data) for name, data in entries(file)]), "no packed store"),
+    "itself for CURRENT": (holding(lambda file: [("CURRENT", file.read_bytes())]), None),
+    "a list that fills the memory": (of_a_full_list, "its list of files takes 2147483648 bytes"),
+    "too many files": (of_too_many_files, "(?i)fetch it again"),
+    "a pipe": (in_its_place(os.mkfifo), None),
+    "a link to one": (in_its_place(lambda file: file.symlink_to("moved")), None),
+    "a folder": (in_its_place(os.mkdir), None),
+    "holes": (lambda file: os.truncate(file, 2**40), "nothing of it was read"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize(("harm", "match"), HARMS.values(), ids=HARMS)
+def test_one_that_was_made_to_harm(three, other, tmp_path, harm, match):
+    file = Path(shutil.copy(three, tmp_path / "p"))
+    harm(file)
+    before = sorted(tmp_path.iterdir())
+    require_refused(other, file, match)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_rows_that_no_memory_packs(tmp_path, other):
+    """A retraction of all rows that there could ever be, in a file with right checksums."""
+    with Store.open(tmp_path / "m", identity=dict(other._ledger.store.identity)) as store:
+        store.append("retract", "", b"", attributes={"sequences": [[1, 2**60]]})
+        store.commit({}, last_sequence=1, attributes={})
+    archive.write_archive(tmp_path / "m", tmp_path / "forged")
+    require_refused(other, tmp_path / "forged", "row 1|checkpoint")
+    assert check_memory(tmp_path / "forged")
+
+
+def test_checking_one(three, tmp_path):
+    file = Path(shutil.copy(three, tmp_path / "p"))
+    assert check_store(file) == [] == check_memory(file)
+    begin, size = archive.Archive(file)._ranges["log-00000001"]
+    whole = bytearray(file.read_bytes())
+    whole[begin + size // 2] ^= 1
+    file.write_bytes(bytes(whole))
+    assert check_store(file)

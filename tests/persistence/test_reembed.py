@@ -1,0 +1,234 @@
+"""A memory carried over to another embedding is what that one would have made of the same touches, or as it was."""
+
+import threading
+
+import numpy as np
+import pytest
+from commands import refused, run
+from forging import put_row
+from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, stream, without
+
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
+from scroll_tactile.persistence import reembed
+from scroll_tactile.prediction.reembedding import reembed_memory
+from store import DamageError, LockedError, Store, StoreFullError
+
+OTHER = {
+    "exact": lambda: Kernels(seed=3, dimension=128),
+    "not exact": lambda: Maps(layout=(2,)),
+    "its own": lambda: Kernels(seed=0, dimension=64),
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "m"
+
+
+@pytest.fixture(params=OTHER)
+def other(request):
+    return OTHER[request.param]()
+
+
+def eventful(path):
+    """A memory with observations, a description and retractions, and its receipts; row 13 retracts row 5."""
+    learner, receipts = filled(path)
+    learner.retract(receipts[4])
+    learner.describe("a", {"wool": 1.0})
+    learner.observe("d", stream((9, 60)))
+    learner.forget("d")
+    return learner, receipts
+
+
+def require_carried(learner, embedding):
+    whole = fed(without(4), {"a": {"wool": 1.0}}, embedding=embedding)
+    assert contents(learner) == contents(whole)
+    assert learner.descriptions == whole.descriptions
+
+
+def rows(path):
+    with Store.open(path, mode="read") as store:
+        return [(head.sequence, head.kind, head.label, head.key, head.time) for head in store.heads()]
+
+
+def test_it_is_what_the_other_embedding_would_have_made(path, other):
+    learner, receipts = eventful(path)
+    before = rows(path)
+    with learner:
+        old = learner.reembed(other)
+        require_carried(learner, other)
+        assert (learner.path, learner.embedding) == (path, other)
+        assert rows(path) == rows(old) == before
+    with TactileLearner.open(path, embedding=other) as again:
+        require_carried(again, other)
+        again.retract(receipts[11])
+        assert again.digest() == fed(without(4, 11), embedding=other).digest()
+    with TactileLearner.open(old, **SETTINGS) as learner:
+        require_carried(learner, SMALL)
+
+
+@pytest.mark.parametrize("stopped", [1, 2, 3])
+def test_a_run_that_was_cut_short_goes_on(path, other, stopped, monkeypatch):
+    monkeypatch.setattr(reembed, "BATCH", 4)
+    monkeypatch.setattr(reembed, "SNAPSHOT_EVERY", 5)
+    learner, _ = eventful(path)
+    steps = []
+
+    def stop(what, done, of):
+        steps.append((done, of))
+        if len(steps) == stopped:
+            raise KeyboardInterrupt
+
+    with learner:
+        with pytest.raises(KeyboardInterrupt):
+            learner.reembed(other, progress=stop)
+        require_carried(learner, SMALL)
+        learner.observe("a", stream((10, 60)))
+        learner.retract(17)
+        learner.reembed(other, progress=lambda what, *step: steps.append(step))
+        assert steps[stopped][0] == min(4 * (stopped + 1), 18)
+        assert steps[-1] == (18, 18)
+        require_carried(learner, other)
+
+
+def test_a_run_for_another_embedding_begins_anew(path):
+    learner, _ = eventful(path)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with learner:
+        with pytest.raises(KeyboardInterrupt):
+            learner.reembed(OTHER["exact"](), progress=stop)
+        learner.reembed(Kernels(seed=5, dimension=64))
+        require_carried(learner, Kernels(seed=5, dimension=64))
+
+
+@pytest.mark.parametrize("call", range(3))
+def test_killed_in_the_exchange_one_of_them_is_whole(path, call, monkeypatch):
+    learner, _ = eventful(path)
+    kind, rename, calls = type(path), type(path).rename, []
+
+    def killed(self, target):
+        if self.parent == path.parent:
+            calls.append(target)
+            if len(calls) == call + 1:
+                raise KeyboardInterrupt
+        return rename(self, target)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(kind, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            learner.reembed(OTHER["exact"]())
+    made = OTHER["exact"]() if call == 2 else SMALL
+    with TactileLearner.open(path) as again:
+        require_carried(again, made)
+    reembed_memory(path, OTHER["exact"]())
+    with TactileLearner.open(path) as again:
+        require_carried(again, OTHER["exact"]())
+
+
+def test_what_is_observed_meanwhile_is_in_it(path, other, monkeypatch):
+    monkeypatch.setattr(reembed, "BATCH", 4)
+    learner, _ = filled(path, OBSERVED[:6])
+    late = iter(OBSERVED[6:9])
+
+    def progress(what, done, of):
+        for name, touch in late:
+            thread = threading.Thread(target=learner.observe, args=(name, stream(touch)))
+            thread.start()
+            thread.join()
+            break
+
+    with learner:
+        learner.reembed(other, progress=progress)
+        kept = len(learner.observations())
+        assert 8 <= kept <= 9
+        assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
+
+
+def test_rows_that_are_not_those_of_the_checkpoint_are_not_carried_over(path):
+    filled(path)[0].close()
+    put_row(path, kind="describe", label="a", attributes={"constituents": {"wool": 1.0}}, sequence=3)
+    before = rows(path)
+    with TactileLearner.open(path) as learner:
+        held = contents(learner)
+        with pytest.raises(DamageError, match="counts"):
+            learner.reembed(OTHER["exact"]())
+        assert contents(learner) == held
+    assert rows(path) == before
+
+
+class TestRefused:
+    def test_a_compacted_memory(self, path):
+        learner, _ = filled(path)
+        with learner:
+            learner.compact(keep=3)
+            with pytest.raises(MismatchError, match=r"readings of every observation: rows 1 to 9 were compacted"):
+                learner.reembed()
+            assert learner.digest() == fed(OBSERVED).digest()
+
+    def test_one_that_a_compacted_memory_came_into(self, path, tmp_path):
+        ours, _ = filled(path, OBSERVED[:4])
+        theirs, _ = filled(tmp_path / "other", OBSERVED[4:])
+        with ours, theirs:
+            theirs.compact()
+            ours.merge(theirs, shared="once")
+            with pytest.raises(MismatchError, match=r"row 5 brought in a compacted memory"):
+                ours.reembed()
+
+    def test_one_that_kept_no_readings(self, path):
+        learner, _ = filled(path, embedding=Maps(layout=(2,)), exemplars=0)
+        with learner, pytest.raises(MismatchError, match=r"12 rows, such as 1, were observed without keeping them"):
+            learner.reembed(SMALL)
+
+    def test_without_a_path_and_in_a_batch(self, path):
+        with pytest.raises(InputError, match="without a path"):
+            fed(OBSERVED).reembed()
+        learner, _ = filled(path)
+        with learner, learner.batch(), pytest.raises(InputError, match="in a batch"):
+            learner.reembed()
+
+    def test_while_another_has_it(self, path):
+        learner, _ = filled(path)
+        with learner, pytest.raises(LockedError):
+            reembed_memory(path)
+
+
+def test_on_a_full_disk_the_memory_stays_as_it_was(path, monkeypatch):
+    learner, _ = eventful(path)
+
+    def full(*_, **__):
+        raise StoreFullError("no space left")
+
+    with learner:
+        for call in ("append", "commit"):
+            with monkeypatch.context() as broken:
+                broken.setattr(Store, call, full)
+                with pytest.raises(StoreFullError):
+                    learner.reembed(OTHER["exact"]())
+            if call == "append":
+                require_carried(learner, SMALL)
+    with TactileLearner.open(path) as again:
+        require_carried(again, SMALL)
+        again.reembed(OTHER["exact"]())
+        require_carried(again, OTHER["exact"]())
+
+
+def test_a_memory_whose_features_are_others_now_is_carried_over_by_the_command_it_names(path):
+    then = Kernels(seed=0, dimension=64)
+    then.__dict__["fingerprint"] = "ab" * 32  # as another version of a library embedded
+    filled(path, without(4), embedding=then)[0].close()
+    with pytest.raises(EmbeddingMismatchError, match=f"scroll-tactile memory reembed {path}"):
+        TactileLearner.open(path, embedding=Kernels(seed=0, dimension=64))
+    np.save(path.parent / "t.npy", stream((9, 60)))
+    assert f"memory reembed {path}" in refused("predict", path, path.parent / "t.npy")
+    assert "m.before" in run("memory", "reembed", path).stdout
+    with TactileLearner.open(path) as again:
+        assert contents(again) == contents(fed(without(4), embedding=Kernels(seed=0, dimension=64)))
+    assert run("memory", "reembed", path, "--default").exit_code == 0
+    with TactileLearner.open(path) as again:
+        assert again.embedding.name == "kernels"
+        assert again.digest() == fed(without(4), embedding=Kernels()).digest()

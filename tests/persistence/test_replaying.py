@@ -1,0 +1,166 @@
+"""However a memory came to be, it holds the same bytes: observed, replayed, merged, compacted, followed by a reader."""
+
+import json
+import shutil
+
+import pytest
+from commands import run
+from forging import spoil_row
+from touches import OBSERVED, PAD, stream, without
+
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import Augmented, Capabilities, Joined, Kernels, TactileLearner
+from scroll_tactile.persistence import open_memory
+from store import DamageError, Store
+
+
+class OwnKernels(Kernels):
+    """An embedding of a user's own, exact: a memory cannot make it, and keeps codes beside the readings."""
+
+    name = "own kernels"
+    capabilities = Capabilities(embeds_windows=True, exact=True)
+
+
+SMALL = Kernels(seed=0, dimension=64)
+MADE = {
+    "kernels": {"embedding": SMALL},
+    "kernels, no exemplars": {"embedding": SMALL, "exemplars": 0},
+    "a user's own": {"embedding": OwnKernels(seed=0, dimension=64)},
+    "maps": {"embedding": Maps(layout=(2,))},
+    "maps, no exemplars": {"embedding": Maps(layout=(2,)), "exemplars": 0},
+    "joined": {"embedding": Joined(SMALL, Maps(layout=(2,)))},
+    "copies": {"embedding": SMALL, "augmentation": Augmented(copies=2)},
+}
+
+
+@pytest.fixture(params=MADE)
+def made(request):
+    return {"sensor": PAD, "exemplars": 4} | MADE[request.param]
+
+
+def observe(learner, touches):
+    return [learner.observe(name, stream(touch)) for name, touch in touches]
+
+
+def held(learner):
+    """What answers follow from: digest, exemplars and sample, to the byte."""
+    sample = [(name, key, touch.rows.tobytes(), touch.pairs.tobytes()) for name, key, touch in learner.memory.sample]
+    return learner.digest(), learner.exemplars, sample
+
+
+HELD = {}
+
+
+def fresh(made, touches):
+    """What a memory holds that observed these touches; made once of each."""
+    key = repr((sorted((name, id(value)) for name, value in made.items()), touches))
+    if key not in HELD:
+        learner = TactileLearner(**made)
+        observe(learner, touches)
+        HELD[key] = held(learner), made  # which no other object is then taken for
+    return HELD[key][0]
+
+
+def test_replayed_retracted_merged_and_compacted_it_is_what_observing_gives(made, tmp_path):
+    with TactileLearner.open(tmp_path / "m", **made) as learner:
+        receipts = observe(learner, OBSERVED[:8])
+        learner.retract(receipts[2])
+    shutil.rmtree(tmp_path / "m" / "checkpoints")
+    with TactileLearner.open(tmp_path / "m", **made) as learner:
+        learner.retract(receipts[5])
+        with TactileLearner.open(tmp_path / "other", **made) as other:
+            observe(other, OBSERVED[6:])
+        learner.merge(tmp_path / "other", shared="once")
+        assert held(learner) == fresh(made, without(2, 5))
+        learner.compact(keep=5)
+        assert held(learner) == fresh(made, without(2, 5))
+        learner.retract(learner.observations()[-1].sequence)
+        assert held(learner) == fresh(made, without(2, 5, 11))
+    with TactileLearner.open(tmp_path / "m", **made) as learner:
+        assert held(learner) == fresh(made, without(2, 5, 11))
+        learner.compact()
+        assert held(learner) == fresh(made, without(2, 5, 11))
+
+
+def test_a_reader_follows_every_change(made, tmp_path, monkeypatch):
+    with TactileLearner.open(tmp_path / "m", **made) as writer:
+        receipts = observe(writer, OBSERVED[:4])
+        with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
+            monkeypatch.setattr(reader._ledger, "_load", None)  # row by row, and not from the beginning
+            reader._ledger.follow = True
+            for at, (name, touch) in enumerate(OBSERVED[4:], start=4):
+                writer.observe(name, stream(touch))
+                assert reader.refresh()
+                assert not reader.refresh()
+                assert held(reader) == fresh(made, OBSERVED[: at + 1])
+            writer.describe("a", {"wool": 1.0})
+            writer.retract(receipts[1])
+            assert reader.refresh()
+            assert held(reader) == fresh(made, without(1))
+            assert reader.descriptions == {"a": {"wool": 1.0}}
+            writer.forget("a")
+            reader._ledger.added = []
+            reader.refresh()
+            assert [(name, sign) for name, _, sign in reader._ledger.added] == [("a", -1)] * 4
+            assert held(reader) == fresh(made, [pair for pair in without(1) if pair[0] != "a"])
+            assert reader.descriptions == {}
+
+
+def test_a_reader_stays_as_it_was_where_a_row_is_damaged(tmp_path):
+    made = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
+    with TactileLearner.open(tmp_path / "m", **made) as writer:
+        observe(writer, OBSERVED[:4])
+        with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
+            observe(writer, OBSERVED[4:])
+            spoil_row(tmp_path / "m", 8)
+            for _ in range(2):
+                with pytest.raises(DamageError):
+                    reader.refresh()
+                assert held(reader) == fresh(made, OBSERVED[:4])
+
+
+def test_a_reader_takes_an_f_star_where_it_is_another_one(tmp_path):
+    made = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
+    with TactileLearner.open(tmp_path / "m", **made) as writer:
+        receipts = observe(writer, OBSERVED)
+        with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
+            writer.fine_tune(epochs=1)
+            assert reader.refresh()
+            assert reader.tuned_digest() == writer.tuned_digest() is not None
+            tuned = reader.memory.tuned
+            observe(writer, [("a", (9, 60))])
+            writer._ledger._snapshot()
+            assert reader.refresh()
+            assert reader.memory.tuned is tuned
+            writer.fine_tune(epochs=1)
+            writer.retract(receipts[0])  # behind the checkpoint that has it
+            assert reader.refresh()
+            assert reader.tuned_digest() is writer.tuned_digest() is None
+
+
+def test_rows_hold_readings_alone_where_the_memory_can_embed_them_again(made, tmp_path):
+    with TactileLearner.open(tmp_path / "m", **made) as learner:
+        observe(learner, OBSERVED[:1])
+    with Store.open(tmp_path / "m", mode="read") as store:
+        kinds = {name.partition("-")[0] for name in store.record(1).arrays}
+    bare = made["embedding"] is SMALL
+    assert kinds == ({"readings"} if bare else {"codes"} | ({"readings"} if made["exemplars"] else set()))
+
+
+def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_path):
+    learner = TactileLearner.open(tmp_path / "m", **made)
+    observe(learner, OBSERVED)
+    learner._ledger.store.close()  # as if the power failed: the rows are in no checkpoint
+    assert json.loads(run("inspect", tmp_path / "m", "--json").stdout)["digest"] == learner.digest()
+
+
+def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
+    monkeypatch.setattr(open_memory, "SNAPSHOT_EVERY", 5)
+    killed = TactileLearner.open(tmp_path / "m", **made)
+    observe(killed, OBSERVED)
+    killed._ledger.store.close()
+    with TactileLearner.open(tmp_path / "m", **made) as learner:
+        assert learner.memory.saved == 10
+        assert held(learner) == fresh(made, OBSERVED)
+    with Store.open(tmp_path / "m", mode="read") as store:
+        assert not any(name.startswith("exemplar-readings") for name in store.latest().arrays)

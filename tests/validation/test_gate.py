@@ -1,0 +1,599 @@
+"""Folders from somebody else: rows, identities and checkpoints that verify, and are none of a memory's."""
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+from forging import checkpoint_of, copied, get_identity, put_checkpoint, put_row, row_of, set_identity
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from touches import PAD, SETTINGS, contents, filled, stream
+
+from scroll_tactile import Augmented, Kernels, TactileLearner
+from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
+from scroll_tactile.memory.rows import pack_readings
+from scroll_tactile.pipelines.plain_export import export_plain
+from scroll_tactile.signals.stream import validate
+from scroll_tactile.validation.gate import check_memory
+from store import DamageError, StoreError
+
+TYPED = (ScrollTactileError, StoreError)
+OTHER = [("d", (9, 60)), ("e", (10, 60)), ("d", (11, 60))]
+
+
+class Inexact(Kernels):
+    """Kernels whose codes are kept in the rows."""
+
+    name = "inexact"
+    capabilities = Kernels.capabilities.__class__(embeds_windows=True, reads_whole_touches=True)
+
+
+STORED = SETTINGS | {"embedding": Inexact(seed=0, dimension=64)}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A memory with a checkpoint, one as if its power had failed, one with codes in its rows, and a compacted one."""
+    folder = tmp_path_factory.mktemp("made")
+    for name, settings_ in (("whole", {}), ("coded", STORED), ("compacted", {}), ("other", {})):
+        learner, _ = (
+            filled(folder / name, OTHER, **settings_) if name == "other" else filled(folder / name, **settings_)
+        )
+        learner.describe("a", {"wool": 0.5, "silk": 0.5})
+        if name == "compacted":
+            learner.compact()
+        learner.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def others(made, tmp_path_factory):
+    """A memory into which no merge of what is refused brings anything, and what it holds."""
+    path = copied(made / "other", tmp_path_factory.mktemp("others") / "m")
+    with opened(path) as learner:
+        return path, contents(learner)
+
+
+@pytest.fixture
+def path(made, tmp_path):
+    return copied(made / "whole", tmp_path / "m")
+
+
+def opened(path, **settings_):
+    return TactileLearner.open(path, **settings_)
+
+
+def require_refused(path, match, expected=DamageError, others=None, **settings_):
+    """Whoever reads it is told what is wrong, a merge of it changes nothing, and a check finds it."""
+    for mode in ("read", "write"):
+        with pytest.raises(expected, match=match), opened(path, mode=mode, **settings_) as learner:
+            learner.settle()  # reads what opening does not
+    if others is not None:
+        target_path, before = others
+        with opened(target_path) as target:
+            with pytest.raises(expected, match=match) as error:
+                target.merge(path, shared="twice")
+            assert str(path) in str(error.value)
+            assert contents(target) == before
+        with opened(target_path) as target:
+            assert contents(target) == before
+    assert any(found for found in check_memory(path))
+
+
+def readings_row(path, **changes):
+    """A row of readings with some of its arrays changed; None leaves one out."""
+    touch = validate(stream((20, 60)), PAD)
+    arrays = {**pack_readings(touch.readings), **changes}
+    arrays = {name: array for name, array in arrays.items() if array is not None}
+    return put_row(path, key=touch.key, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
+
+
+def test_a_sound_memory_has_nothing_that_is_found(made):
+    for name in ("whole", "coded", "compacted", "other"):
+        assert check_memory(made / name) == []
+
+
+def test_a_forged_row_that_fits_is_a_row(path):
+    readings_row(path)
+    with opened(path) as learner:
+        assert learner.materials["silk"] == 1
+    assert check_memory(path) == []
+
+
+NAN = np.full((60, 2), np.nan, np.float32)
+ROWS = {
+    "no attributes": ("columns: expected a whole number", {"attributes": {}}),
+    "columns below one": ("columns", {"attributes": {"columns": -1, "nbytes": 480}}),
+    "columns beyond all": ("columns", {"attributes": {"columns": 10**9, "nbytes": 480}}),
+    "columns of others": ("columns", {"attributes": {"columns": 59, "nbytes": 480}}),
+    "columns true": ("columns", {"attributes": {"columns": True, "nbytes": 480}}),
+    "bytes in words": ("nbytes", {"attributes": {"columns": 60, "nbytes": "a"}}),
+    "bytes of others": ("columns", {"attributes": {"columns": 60, "nbytes": 488}}),
+    "bytes of none": ("nbytes", {"attributes": {"columns": 60, "nbytes": 480}, "payload": {}}),
+    "another shape": ("readings", {"payload": {"readings-2e0": np.zeros(3, np.int8)}}),
+    "another type": ("readings", {"payload": {"readings-2e0": np.zeros((2, 60))}}),
+    "text": ("readings", {"payload": {"readings-2e0": np.full((2, 60), "x")}}),
+    "not finite": ("range of 'pad'", {"payload": pack_readings(NAN)}),
+    "out of range": ("range of 'pad'", {"payload": pack_readings(np.full((60, 2), 1.5, np.float32))}),
+    "a power beyond all": ("2e200", {"payload": {"readings-2e200": np.ones((2, 60), np.int8)}}),
+    "two ways": (
+        "one way",
+        {"payload": {"readings-2e0": np.zeros((2, 60), np.int8), "readings-2e1": np.ones((2, 60), np.int8)}},
+    ),
+    "a short key": ("key: expected 32 bytes", {"key": b"abc"}),
+    "no name": ("name of 1 to 200", {"label": ""}),
+    "a long name": ("name of 1 to 200", {"label": "x" * 10**6}),
+    "an escape for a name": ("printable", {"label": "\x1b[2J"}),
+    "an escape for a source": ("printable", {"attributes": {"columns": 60, "nbytes": 480, "source": "\x1b[2J"}}),
+    "a long source": ("1 to 1000", {"attributes": {"columns": 60, "nbytes": 480, "source": "x" * 10**6}}),
+    "no text for a source": ("as a string", {"attributes": {"columns": 60, "nbytes": 480, "source": ["x"]}}),
+}
+ROW = {"attributes": {"columns": 60, "nbytes": 480}, "payload": pack_readings(validate(stream((20, 60)), PAD).readings)}
+SEQUENCES = [None, [], "x", [3], [[1]], [[1, 10**12]], [[1, 14]], [[0, 1]], [[2, 1]], [[True, 1]], [[1.0, 1.0]]]
+SEQUENCES += [[[3, 4], [1, 2]], [[1, 2], [2, 3]]]
+CONSTITUENTS = ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}]
+ZEROS = {
+    "readings-shape": np.array([60, 2]),
+    "readings-zero": np.full(15, 255, np.uint8),
+    "readings-rest": np.zeros(0, np.float32),
+}
+UNFIT = {
+    "a large shape": {"readings-shape": np.array([2**40, 2])},
+    "three axes": {"readings-shape": np.array([60, 2, 1])},
+    "a shape of floats": {"readings-shape": np.array([60.0, 2.0])},
+    "few zeros": {"readings-zero": np.full(14, 255, np.uint8)},
+    "zeros of int16": {"readings-zero": np.full(15, 255, np.int16)},
+    "more than zeros": {"readings-rest": np.zeros(1, np.float32)},
+    "no rest": {"readings-rest": None},
+}
+LARGE = 2**20 + 1
+CODES = {
+    "large": ("magnitude", lambda codes: codes + LARGE),
+    "least": ("magnitude", lambda codes: np.full_like(codes, np.iinfo(np.int32).min)),
+    "not a number": ("int32", lambda codes: codes.astype(np.float32) * np.nan),
+    "of int64": ("int32", lambda codes: codes.astype(np.int64)),
+    "of fewer features": ("int32", lambda codes: codes[:, :-1]),
+    "of fewer rows": ("rows", lambda codes: codes[:-1]),
+    "of more rows": ("rows", lambda codes: np.concatenate([codes, codes])),
+}
+
+
+def row(**changes):
+    return lambda path: put_row(path, **ROW | changes)
+
+
+def retraction(sequences):
+    attributes = {} if sequences is None else {"sequences": sequences}
+    return lambda path: put_row(path, kind="retract", label="", key=b"", attributes=attributes)
+
+
+def description(constituents):
+    said = {"constituents": constituents}
+    return lambda path: put_row(path, kind="describe", label="a", key=b"", attributes=said)
+
+
+def codes(name, of, change):
+    """The first row again, with other codes: one of its arrays is made of one that there is."""
+
+    def put(path):
+        attributes, arrays = row_of(path)
+        arrays[name] = change(arrays[of])
+        put_row(path, attributes=attributes, payload={name: one for name, one in arrays.items() if one is not None})
+
+    return put
+
+
+def packed_row(**changes):
+    return lambda path: readings_row(path, **changes)
+
+
+def identity(field, value, part=None):
+    def change(path):
+        known = get_identity(path)
+        (known if part is None else known[part])[field] = value
+        set_identity(path, known)
+
+    return change
+
+
+def deep(depth):
+    def change(path):
+        known = get_identity(path)
+        known["embedding"]["configuration"]["parts"] = json.loads("[" * depth + "]" * depth)
+        set_identity(path, known)
+
+    return change
+
+
+def checkpoint(change, *, compaction=False):
+    def put(path):
+        attributes, arrays = checkpoint_of(path)
+        change(attributes, arrays)
+        put_checkpoint(
+            path, attributes, {name: one for name, one in arrays.items() if one is not None}, compaction=compaction
+        )
+
+    return put
+
+
+def summed(name, spoil, **options):
+    def change(attributes, arrays):
+        triangle(name, attributes, arrays)
+        arrays[name] = spoil(arrays[name])
+
+    return checkpoint(change, **options)
+
+
+def triangle(name, attributes, arrays):
+    """The second moment of this name as its triangle, as of more rows: no array but it where it is none."""
+    what, _, scale = name.partition("-")
+    if what == "second" and name not in arrays:
+        rows = arrays.pop(f"values-{scale}")[arrays.pop(f"places-{scale}")].T
+        arrays[name] = (rows.astype(np.int64).T @ rows)[np.tril_indices(attributes["dimension"])]
+
+
+def attributed(name, value):
+    return checkpoint(lambda attributes, arrays: attributes.update({name: value}))
+
+
+def pairs(values_by_name):
+    return ((name, value) for name, values in values_by_name.items() for value in values)
+
+
+def one_after_another(*changes):
+    return lambda path: [change(path) for change in changes]
+
+
+def under_anothers_key(path):
+    """What would be left out of a merge as "shared" though it was never there."""
+    put_row(path, **ROW | {"key": validate(stream(OTHER[0][1]), PAD).key, "label": OTHER[0][0]})
+
+
+def of_another_key_and_retracted(path):
+    """What a merge leaves out passes the gate, too."""
+    readings = validate(stream(OTHER[0][1]), PAD).readings
+    put_row(path, **ROW | {"label": "d", "key": bytes(32), "payload": pack_readings(readings)})
+    retraction([[14, 14]])(path)
+
+
+IDENTITIES = {
+    "sensor": ["x", None, [], {}, {"name": "pad"}],
+    "embedding": ["x", {}, [], None],
+    "grid": [None, {}, {"bits": 20, "scales": ["a"]}, {"bits": 20, "scales": []}, {"bits": True, "scales": [15]}],
+    "exemplars": ["abc", [1], -1, True, 10**30, None],
+    "augmentation": [{"x": 1}, "x", {"copies": 10**9}, {"copies": 2, "speed": 1e300}, {"copies": True}],
+    "kept_touches": ["x", -1, True, 10**30, None],
+    "views": [1, "true", None],
+    "reading": [[1, "all"], ["x", "y"], [True], None],
+}
+EMBEDDINGS = {
+    "dimension": [0, 10**9, True, ""],
+    "bound": [-5, 10**400, True, None],
+    "name": [0, "", None],
+    "fingerprint": [-5, 1e308, []],
+    "configuration": [0, "", []],
+}
+SENSORS = {
+    "channels": ["x", -1, True, 10**400],
+    "rate": [-1, 10**400, None],
+    "low": ["x", 1e308, []],
+    "high": [-1, True, None],
+    "duration": ["x", 10**400, []],
+    "name": [-1, None, []],
+    "layout": ["x", -1, [1e308]],
+}
+SUMS = {
+    "observations": [lambda a: a - 10, lambda a: a + 1, lambda a: a.astype(float), lambda a: a[:-1]],
+    "lengths": [lambda a: -a, lambda a: a * [0, 1], lambda a: np.concatenate([a, a]), lambda a: a[:, :1]],
+    "rows-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a * 0],
+    "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
+    "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],
+    "second-1048576": [lambda a: a * 0],
+    "values-15": [lambda a: a[::-1], lambda a: a + LARGE, lambda a: a[:-1], lambda a: a[:0], lambda a: a * 0],
+    "values-1048576": [lambda a: a + 1, lambda a: a.astype(np.int64), lambda a: None],
+    "places-15": [lambda a: a[:, :-1], lambda a: a[:-1], lambda a: a + 1, lambda a: a - 1, lambda a: a + 2**30],
+    "places-1048576": [lambda a: a[:, :0], lambda a: a * 0, lambda a: a[::-1], lambda a: None],
+    "rows-1048576": [lambda a: a * 0, lambda a: a - 1],
+    "sample-keys": [lambda a: a[:-1], lambda a: a[:, :3], lambda a: a * 0],
+    "sample-sizes": [lambda a: a * 0, lambda a: a + 1, lambda a: -a, lambda a: None],
+    "sample-pairs": [lambda a: a[::-1], lambda a: -a, lambda a: a + 2**40, lambda a: a * 0],
+    "sample-rows": [lambda a: a + LARGE, lambda a: a[:, :-1], lambda a: a.astype(np.int64)],
+    "kept-keys": [lambda a: a * 0],
+    "kept-columns": [lambda a: -a, lambda a: a + 1, lambda a: None],
+    "kept-levels": [lambda a: a[:-1], lambda a: a.astype(np.int16)],
+    "exemplar-keys": [lambda a: a[:-1]],
+    "exemplar-sources": [lambda a: a + 10**6, lambda a: -a - 1, lambda a: a.astype(float)],
+    "retracted": [lambda a: np.array([10**12]), lambda a: np.array([0]), lambda a: np.array([1.5])],
+    "excluded": [lambda a: np.array([1, 1])],
+}
+ABOUT = {
+    "dimension": [63, "x", None],
+    "scales": [[], [15], [15, 15], "x", [-1], [15, 37, 2**20], [15.0, 37, 2**20, 2**20 + 1]],
+    "materials": [["a", "a", "b"], ["a", "b", "\n"], ["a", "b", 3], "abc", None],
+    "sample": [[], ["a"], ["z"] * 12, None],
+    "copies": [None, [1], [0] * 12, [True] * 12],
+    "kept": [[], ["z"] * 12, None],
+    "exemplars": [None, [], {}, {"materials": ["z"] * 12}],
+    "descriptions": [None, [], {"a": None}, {"a": {"wool": "x"}}, {"": {"wool": 1.0}}],
+    "tuned_last_sequence": [None, -1, 10**9, "x"],
+    "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
+}
+IN_GENERATIONS = "observations|lengths|rows|sums|second|values|places|sample|kept|exemplar|retracted|excluded"
+
+
+def forged_rows():
+    """What somebody put into the log of a whole memory: its name, what does it, what is said of it, and how."""
+    for name, (match, changes) in ROWS.items():
+        yield f"a row: {name}", row(**changes), match, DamageError
+    for kind in ("exec", "", "OBSERVE"):
+        yield f"a kind {kind!r}", row(kind=kind, label="", key=b""), f"row 14 .* of kind {kind!r}", MismatchError
+    for spans in SEQUENCES:
+        yield f"a retraction of {spans}", retraction(spans), "sequences: expected", DamageError
+    for said in CONSTITUENTS:
+        yield f"a description {said}", description(said), "constituents", DamageError
+    twice = one_after_another(retraction([[1, 1]]), retraction([[1, 1]]))
+    yield "a retracted description", retraction([[13, 13]]), "retracts", DamageError
+    yield "two retractions", twice, "retracts", DamageError
+    said = r"row 14 .* key: expected the content hash of its readings"
+    yield "another touch's key", under_anothers_key, said, DamageError
+    yield "another key, retracted", of_another_key_and_retracted, said, DamageError
+    nobodys = checkpoint(lambda attributes, _: attributes.update(sample=["nobody"] * len(attributes["sample"])))
+    yield "a sample of nobody's", nobodys, "sample: expected materials that were observed", DamageError
+
+
+def forged_memories():
+    """What else somebody made of a memory: its name and which, what does it, what is said of it, and how."""
+    nothing = row(attributes={"columns": 60}, payload={})
+    yield "a row of nothing", "whole", nothing, "codes or readings", DamageError
+    later, said = packed_row(dreams=np.zeros(3)), r"arrays \['dreams'\], which this version does not know"
+    yield "arrays of a later version", "whole", later, said, MismatchError
+    for name, changes in UNFIT.items():
+        yield f"packed readings: {name}", "whole", packed_row(**ZEROS | changes), "readings", DamageError
+    for scale, (name, (match, spoil)) in itertools.product((15, 1048576), CODES.items()):
+        yield f"codes-{scale} {name}", "coded", codes(f"codes-{scale}", f"codes-{scale}", spoil), match, DamageError
+    yield "a scale less", "coded", codes("codes-37", "codes-37", lambda _: None), "scales", DamageError
+    yield "a scale more", "coded", codes("codes-38", "codes-37", np.copy), "scales", DamageError
+    others, said = (
+        summed("exemplar-keys", np.flipud, compaction=True),
+        "exemplar-keys: expected the content hashes of their",
+    )
+    yield "exemplars under other keys", "compacted", others, said, DamageError
+    for field, value in pairs(IDENTITIES):
+        yield f"{field} {value}", "whole", identity(field, value), f"identity of .*{field}", DamageError
+    for part, fields in (("embedding", EMBEDDINGS), ("sensor", SENSORS)):
+        for field, value in pairs(fields):
+            yield f"{part}'s {field} {str(value)[:9]}", "whole", identity(field, value, part), "identity|range", TYPED
+    for depth in (17, 400):
+        yield f"an identity {depth} deep", "whole", deep(depth), "identity", DamageError
+    for i, (name, spoil) in enumerate(pairs(SUMS)):
+        yield f"{name} {i}", "whole", summed(name, spoil), f"checkpoint 2 .*: ({IN_GENERATIONS})", DamageError
+    for name, value in pairs(ABOUT):
+        said = f"checkpoint 2 .*({name}|tuned|exemplar)"
+        yield f"{name} {str(value)[:40]}", "whole", attributed(name, value), said, DamageError
+
+
+@pytest.mark.parametrize(("do", "match", "expected"), [pytest.param(*one, id=name) for name, *one in forged_rows()])
+def test_what_no_memory_writes_is_refused_by_whoever_reads_or_merges_it(path, others, do, match, expected):
+    do(path)
+    require_refused(path, match, expected, others)
+
+
+@pytest.mark.parametrize(
+    ("source", "do", "match", "expected"), [pytest.param(*one, id=name) for name, *one in forged_memories()]
+)
+def test_what_no_memory_holds_is_refused(made, tmp_path, source, do, match, expected):
+    path = copied(made / source, tmp_path / "m")
+    do(path)
+    require_refused(path, match, expected, **({"embedding": STORED["embedding"]} if source == "coded" else {}))
+
+
+@pytest.mark.parametrize("where", ["here", "there"])
+def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
+    """Row 1 lies under a checkpoint: opening does not read it, but a touch is left out for its key."""
+    theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
+    theirs.close()
+    attributes, arrays = row_of(path, 1)
+    put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=arrays)
+    assert any("content hash" in found for found in check_memory(path))
+    ours, theirs = (path, tmp_path / "theirs") if where == "here" else (tmp_path / "theirs", path)
+    with opened(ours) as learner:
+        before = learner.digest(), len(learner.observations())
+        with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
+            learner.merge(theirs, shared="once")
+        assert (learner.digest(), len(learner.observations())) == before
+
+
+def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
+    for time in (-1e14, 1e300):
+        readings = validate(stream((int(abs(math.log(abs(time)))), 60)), PAD)
+        put_row(
+            path,
+            key=readings.key,
+            attributes={"columns": 60, "nbytes": 480},
+            payload=pack_readings(readings.readings),
+            time=time,
+        )
+    with opened(path, mode="read") as learner:
+        assert [row.time for row in learner.observations()][-2:] == [-1e14, 1e300]
+        export_plain(learner, tmp_path / "plain")
+    assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
+
+
+def hollow(attributes, arrays):
+    """A second moment that no rows have: its diagonal is theirs, and beside it is more."""
+    dimension = attributes["dimension"]
+    triangle("second-15", attributes, arrays)
+    square = np.zeros((dimension, dimension), np.int64)
+    square[np.tril_indices(dimension)] = arrays["second-15"]
+    square[1, 0] = int(np.sqrt(float(square[0, 0])) * np.sqrt(float(square[1, 1]))) * 2
+    limit = int(arrays["rows-15"].sum()) << 40
+    square[1, 0] = min(int(square[1, 0]), limit)
+    return arrays | {"second-15": square[np.tril_indices(dimension)]}
+
+
+@pytest.mark.parametrize("changed", [{"descriptions": 1}, {"descriptions": {"a": {"x": 2.0}}}, {"tuned": 1}])
+def test_what_a_merge_leaves_out_is_looked_at_where_it_is_there(made, tmp_path, changed):
+    path = copied(made / "whole", tmp_path / "m")
+    attributes, arrays = checkpoint_of(made / "compacted")
+    put_row(path, kind="merge", attributes=attributes | changed, payload=arrays)
+    require_refused(path, next(iter(changed)))
+
+
+def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
+    path = copied(made / "compacted", tmp_path / "m")
+    attributes, arrays = checkpoint_of(path)
+    put_checkpoint(path, attributes, hollow(attributes, arrays), compaction=True)
+    others = copied(made / "other", tmp_path / "other")
+    with opened(others) as target:
+        before = contents(target)
+        with pytest.raises(DamageError, match="second-15"):
+            target.merge(path, shared="twice")
+        assert contents(target) == before
+    assert any("second-15" in found for found in check_memory(path))
+    with opened(path) as learner, pytest.raises(ScrollTactileError, match="no readout"):
+        learner.predict(stream((7, 25)))
+
+
+def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
+    path = copied(made / "compacted", tmp_path / "m")
+    attributes, arrays = checkpoint_of(path)
+    views = (1048576, 1048577, 1048578)
+    for scale in views:
+        triangle(f"second-{scale}", attributes, arrays)
+    for name in ("observations", *(f"rows-{scale}" for scale in views)):
+        arrays[name] = arrays[name] + 1
+    arrays["lengths"][0, 1] += len(arrays["observations"])
+    put_checkpoint(path, attributes, arrays, compaction=True)
+    assert any("its journal names 4" in found for found in check_memory(path))
+    with opened(copied(made / "other", tmp_path / "other")) as target, pytest.raises(DamageError, match="names 4"):
+        target.merge(path, shared="twice")
+
+
+def test_what_a_compaction_checkpoint_brings_is_looked_at_again_when_it_is_read(made, tmp_path):
+    others = copied(made / "other", tmp_path / "other")
+    with opened(others) as target:
+        target.merge(made / "compacted", shared="twice")
+    assert check_memory(others) == []
+    with opened(others, mode="read") as learner:
+        assert learner.materials == {"a": 4, "b": 4, "c": 4, "d": 2, "e": 1}
+
+
+JUNK = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**70), 2**70)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inside: st.lists(inside, max_size=3) | st.dictionaries(st.text(max_size=5), inside, max_size=3),
+    max_leaves=5,
+)
+
+
+@st.composite
+def changed_array(draw, array):
+    """An array like another: of another type, shape or values."""
+    kind = draw(st.sampled_from(["type", "cut", "longer", "axis", "value", "empty"]))
+    if kind == "type":
+        types = ["bool", "int8", "uint8", "int16", "int32", "int64", "float16", "float32", "float64", "<U2"]
+        with np.errstate(all="ignore"):
+            return array.astype(draw(st.sampled_from(types)))
+    if kind == "cut" and array.ndim:
+        return array[:-1]
+    if kind == "longer" and array.ndim:
+        return np.concatenate([array, array])
+    if kind == "axis":
+        return array[None]
+    if kind == "value" and array.size and array.dtype.kind in "iuf":
+        changed = array.copy().reshape(-1)
+        extremes = [0, 1, np.finfo(np.float32).max, np.nan] if array.dtype.kind == "f" else [0, 1, -1, 2**20, 2**31]
+        with np.errstate(all="ignore"):
+            changed[draw(st.integers(0, changed.size - 1))] = np.array(draw(st.sampled_from(extremes))).astype(
+                array.dtype
+            )
+        return changed.reshape(array.shape)
+    return array[:0] if array.ndim else array
+
+
+@st.composite
+def changed(draw, attributes, arrays):
+    """Attributes and arrays of which one was changed, left out or added."""
+    attributes, arrays = dict(attributes), dict(arrays)
+    what = draw(st.sampled_from(["attribute", "array"]))
+    chosen = attributes if what == "attribute" else arrays
+    names = sorted(chosen)
+    if names and draw(st.booleans()):
+        name = draw(st.sampled_from(names))
+        chosen[name] = draw(JUNK if what == "attribute" else changed_array(chosen[name]))
+    elif names and draw(st.booleans()):
+        del chosen[draw(st.sampled_from(names))]
+    elif what == "array":
+        arrays[draw(st.sampled_from(["x", "codes-15", "codes-015", "readings", "tuned-bias"]))] = np.zeros(3)
+    return attributes, arrays
+
+
+LIMITS = settings(deadline=None, max_examples=20, suppress_health_check=list(HealthCheck))
+
+
+def require_typed_or_equal(path, **settings_):
+    """It answers, or says what is wrong; and a check that finds nothing is of a memory that opens."""
+    found = check_memory(path)
+    try:
+        with opened(path, mode="read", **settings_) as learner:
+            learner.predict(stream((7, 25)))
+            learner.observations()
+            learner.exemplars  # noqa: B018
+    except EmbeddingMismatchError:  # it may be of another version of its embedding, which a check does not make
+        return
+    except TYPED:
+        assert found
+        return
+
+
+@LIMITS
+@given(st.data())
+def test_a_row_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+    source, settings_ = data.draw(st.sampled_from([("whole", {}), ("coded", {"embedding": STORED["embedding"]})]))
+    path = copied(made / source, tmp_path_factory.mktemp("row") / "m")
+    attributes, arrays = data.draw(changed(*row_of(path, data.draw(st.sampled_from([1, 13])))))
+    kind = data.draw(st.sampled_from(["observe", "observe", "retract", "describe", "merge", "member", "dream"]))
+    put_row(path, kind=kind, attributes=attributes, payload=arrays)
+    require_typed_or_equal(path, **settings_)
+
+
+@LIMITS
+@given(st.data())
+def test_a_checkpoint_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+    source = data.draw(st.sampled_from(["whole", "compacted"]))
+    path = copied(made / source, tmp_path_factory.mktemp("checkpoint") / "m")
+    attributes, arrays = data.draw(changed(*checkpoint_of(path)))
+    put_checkpoint(path, attributes, arrays, compaction=source == "compacted")
+    require_typed_or_equal(path)
+
+
+@LIMITS
+@given(st.data())
+def test_an_identity_with_anything_in_it_opens_or_says_what_is_wrong(made, tmp_path_factory, data):
+    path = copied(made / "whole", tmp_path_factory.mktemp("identity") / "m")
+    identity = get_identity(path)
+    part = data.draw(st.sampled_from([identity, identity["sensor"], identity["embedding"], identity["grid"]]))
+    part[data.draw(st.sampled_from(sorted(part)))] = data.draw(JUNK)
+    set_identity(path, json.dumps(identity))
+    require_typed_or_equal(path)
+
+
+@pytest.mark.parametrize("configuration", [{}, {"kind": "no such"}, {"kind": "kernels", "dimension": 64, "more": 1}])
+def test_a_configuration_that_makes_nothing_is_found_before_it_is_opened(path, configuration):
+    identity = get_identity(path)
+    identity["embedding"]["configuration"] = configuration
+    set_identity(path, json.dumps(identity))
+    assert any("configuration" in found for found in check_memory(path))
+    with pytest.raises(EmbeddingError):
+        opened(path)
+
+
+def test_copies_have_bounds():
+    for wrong in ({"copies": 1001}, {"speed": 101.0}):
+        with pytest.raises(ValueError, match="expected"):
+            Augmented(**wrong)

@@ -1,16 +1,18 @@
 """Runtimes: what runs a frozen network on one thread, behind one small interface.
 
-torch is always there. ONNX Runtime is given the same folded network as an ONNX graph, which is written node by node: a
-folded network is convolutions, ReLUs, sums and one max-pooling, and so its graph holds for any batch, height and width,
-where tracing exporters specialise to the sizes that they were shown. Each runtime gives the same bytes for the same
-planes, and other last bits than the other does.
+torch is always there. ONNX Runtime is given the same folded network, which torch traces: a folded network is
+convolutions, ReLUs, sums and one max-pooling, without a branch on a size, and so its graph holds for any batch, height
+and width. Each runtime gives the same bytes for the same planes, and other last bits than the other does.
 """
 
 from __future__ import annotations
 
 import importlib
+import threading
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -25,9 +27,7 @@ if TYPE_CHECKING:
     from scroll_tactile.embeddings.resnet import ResNet
 
 __all__ = [
-    "OPSET",
     "RUNTIMES",
-    "Graph",
     "Precision",
     "Run",
     "RuntimeName",
@@ -35,6 +35,7 @@ __all__ = [
     "make_runtime",
     "network_model",
     "one_torch_thread",
+    "onnx_model",
     "steady",
     "version_of",
 ]
@@ -48,7 +49,7 @@ Run = Callable[[FloatArray], list[FloatArray]]
 
 RUNTIMES: Final[tuple[RuntimeName, ...]] = ("torch", "onnxruntime")
 OPSET: Final = 17  # of 2022: every ONNX Runtime in use reads it
-IR_VERSION = 8  # the file format of that year; the onnx package would write its newest
+_TRACING = threading.Lock()  # torch refuses to trace in two threads
 
 
 def make_runtime(name: RuntimeName, net: ResNet, last: int, precision: Precision = "float32") -> Run:
@@ -164,101 +165,54 @@ def _package(name: RuntimeName) -> Any:
         return importlib.import_module(name)
 
 
-class Graph:
-    """Nodes and constants of a graph under construction; each method returns the name of what it adds."""
-
-    def __init__(self) -> None:
-        self.onnx = _onnx()
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-        self._weights: dict[nn.Conv2d, tuple[str, str]] = {}
-
-    def add(self, kind: str, *inputs: str, name: str = "", **attributes: Any) -> str:
-        """Add an operator with one output, called `name` where one is given."""
-        name = name or f"{kind}_{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(kind, list(inputs), [name], name=name, **attributes))
-        return name
-
-    def constant(self, values: npt.ArrayLike) -> str:
-        """Add an array."""
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
-        return name
-
-    def network(self, quick: ResNet, planes: str, last: int, name: str = "stage") -> list[str]:
-        """Add stages 0 to `last` of a folded network to its input `planes`; the names of their maps, name_0 …
-
-        The same network can be added for several inputs: its weights are kept once.
-        """
-        maps = [self.add("Relu", self._convolution(quick.conv1, planes), name=f"{name}_0")]
-        for stage in range(1, last + 1):
-            planes = maps[-1]
-            if stage == 1 and quick.stem == "torchvision":
-                planes = self.add("MaxPool", planes, kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1])
-            blocks = list(quick.get_submodule(f"layer{stage}").children())
-            for i, block in enumerate(blocks):
-                planes = self._block(block, planes, f"{name}_{stage}" if i + 1 == len(blocks) else "")
-            maps.append(planes)
-        return maps
-
-    def model(self, inputs: dict[str, list[Any]], outputs: dict[str, list[Any]], **metadata: str) -> bytes:
-        """The bytes of the finished model; float32 inputs and outputs by name, with their shapes."""
-        helper, kind = self.onnx.helper, self.onnx.TensorProto.FLOAT
-        made = helper.make_graph(
-            self.nodes,
-            "scroll-tactile",
-            [helper.make_tensor_value_info(name, kind, shape) for name, shape in inputs.items()],
-            [helper.make_tensor_value_info(name, kind, shape) for name, shape in outputs.items()],
-            self.constants,
-        )
-        model = helper.make_model(
-            made, producer_name="scroll-tactile", opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
-        )
-        helper.set_model_props(model, metadata)
-        self.onnx.checker.check_model(model, full_check=True)
-        serialised: bytes = model.SerializeToString()
-        return serialised
-
-    def _block(self, block: Any, planes: str, name: str) -> str:
-        convolutions = [block.conv1, block.conv2] + ([block.conv3] if block.bottleneck else [])
-        inner = planes
-        for i, convolution in enumerate(convolutions):
-            inner = self._convolution(convolution, self.add("Relu", inner) if i else inner)
-        shortcut = planes if block.downsample is None else self._convolution(block.downsample[0], planes)
-        return self.add("Relu", self.add("Add", inner, shortcut), name=name)
-
-    def _convolution(self, convolution: nn.Conv2d, planes: str) -> str:
-        assert convolution.bias is not None
-        assert not isinstance(convolution.padding, str)
-        if convolution not in self._weights:
-            weight, bias = self.constant(convolution.weight.numpy()), self.constant(convolution.bias.numpy())
-            self._weights[convolution] = weight, bias
-        return self.add(
-            "Conv",
-            planes,
-            *self._weights[convolution],
-            kernel_shape=list(convolution.kernel_size),
-            strides=list(convolution.stride),
-            pads=[*convolution.padding, *convolution.padding],
-        )
-
-
 def network_model(net: ResNet, last: int) -> bytes:
     """An ONNX model from `planes` (B, 3, H, W) to the maps `stage_0` … `stage_<last>`, for any B, H and W.
 
     Raises InputError where the package onnx is missing.
     """
+    import torch
+
     from scroll_tactile.embeddings.resnet import folded
 
-    graph = Graph()
-    maps = graph.network(folded(net, last), "planes", last)
-    shapes = {name: ["B", net.widths[i], f"H{i}", f"W{i}"] for i, name in enumerate(maps)}
-    return graph.model({"planes": ["B", 3, "H", "W"]}, shapes)
+    names = [f"stage_{i}" for i in range(last + 1)]
+    axes = {"planes": {0: "B", 2: "H", 3: "W"}} | {name: {0: "B", 2: f"H_{name}", 3: f"W_{name}"} for name in names}
+    return onnx_model(folded(net, last), (torch.zeros(1, 3, 32, 32), last), "planes", names, axes)
 
 
-def _onnx() -> Any:
+def onnx_model(
+    module: nn.Module,
+    example: tuple[Any, ...],
+    name: str,
+    outputs: list[str],
+    axes: dict[str, dict[int, str]] | None = None,
+    metadata: dict[str, str] | None = None,
+) -> bytes:
+    """The bytes of a module as an ONNX model with one input.
+
+    example: what the module is called with to be traced. axes: those that may have any length, by input or output;
+    all others are as long as in the example.
+
+    Raises InputError where the package onnx is missing.
+    """
+    import torch
+
     with optional("onnx", "onnx", "an ONNX graph", "use runtime='torch'"):
         import onnx
-        import onnx.helper
-        import onnx.numpy_helper
-    return onnx
+    file = BytesIO()
+    with _TRACING, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it is deprecated, and branches on sizes, which the example has
+        torch.onnx.export(
+            module,
+            example,
+            file,  # type: ignore[arg-type]
+            input_names=[name],
+            output_names=outputs,
+            dynamic_axes=axes,
+            opset_version=OPSET,
+            dynamo=False,
+        )
+    model = onnx.load_from_string(file.getvalue())
+    onnx.helper.set_model_props(model, metadata or {})
+    onnx.checker.check_model(model, full_check=True)
+    serialised: bytes = model.SerializeToString()
+    return serialised

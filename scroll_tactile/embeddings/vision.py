@@ -256,7 +256,7 @@ def pool_windows(maps: Sequence[torch.Tensor], columns: int, windows: Sequence[t
     """
     parts = []
     for stage in maps:
-        across = stage.shape[-1]
+        across = int(stage.shape[-1])  # a number where this is traced: ONNX divides negative ones otherwise
         # Window by window: what is asked for beside a window must not change its bits, and a product would.
         averages = []
         for start, width in windows:

@@ -11,7 +11,7 @@ import os
 import pickle
 import re
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
@@ -210,12 +210,9 @@ def _read_safetensors(path: Path) -> Tensors:
 
 def _numpy_scalars_allowed() -> AbstractContextManager[None]:
     """Checkpoints often hold a best accuracy that is a NumPy scalar, beside the tensors; to read one runs nothing."""
-    allow = getattr(torch.serialization, "safe_globals", None)  # torch 2.5
-    if allow is None:
-        return nullcontext()
     scalar: Any = np.float64(0).__reduce__()[0]
     kinds = [type(np.dtype(kind)) for kind in ("f8", "f4", "i8", "i4", "?")]
-    context: AbstractContextManager[None] = allow(
+    context: AbstractContextManager[None] = torch.serialization.safe_globals(
         [np.dtype, *kinds, scalar, (scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar")]
     )
     return context

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from scroll_tactile.embeddings.protocol import TOGETHER
-from scroll_tactile.embeddings.resnet import ResNet, folded
-from scroll_tactile.embeddings.runtimes import Graph
-from scroll_tactile.embeddings.vision import DEVIATION, MEAN, MOST_COLUMNS, Vision
+from scroll_tactile.embeddings.resnet import folded
+from scroll_tactile.embeddings.runtimes import onnx_model
+from scroll_tactile.embeddings.vision import MOST_COLUMNS, Vision, pool_windows, to_planes
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
@@ -24,10 +24,9 @@ from scroll_tactile.statistics.grid import BITS
 
 with optional("torch", "torch", "an export to ONNX"):
     import torch
+    from torch import nn
 
 __all__ = ["export_onnx"]
-
-TINY = 1e-12  # below it a vector is taken for zero, as torch's normalize does
 
 
 def export_onnx(learner: TactileLearner, path: str | os.PathLike[str]) -> None:
@@ -56,17 +55,14 @@ def export_onnx(learner: TactileLearner, path: str | os.PathLike[str]) -> None:
     model = learner.model()
     channels, columns = _shape(learner.sensor)
     read = min(columns, model.longest) if not learner.sensor.camera else columns  # no further than was learned
-    graph = Graph()
-    scores = _scores(graph, model, _features(graph, embedding, model, (channels, columns), read), read)
-    graph.add("Cast", scores, name="scores", to=graph.onnx.TensorProto.FLOAT)
-    serialised = graph.model(
-        {"image": [channels, columns]},
-        {"scores": [len(model.names)]},
-        materials=json.dumps(model.names, ensure_ascii=False),
-        sensor=learner.sensor.name,
-        fingerprint=embedding.fingerprint,
-    )
-    Path(path).write_bytes(serialised)
+    metadata = {
+        "materials": json.dumps(model.names, ensure_ascii=False),
+        "sensor": learner.sensor.name,
+        "fingerprint": embedding.fingerprint,
+    }
+    example = torch.zeros(channels, columns)
+    scores = _Scores(embedding, model, read)
+    Path(path).write_bytes(onnx_model(scores, (example,), "image", ["scores"], metadata=metadata))
 
 
 def _shape(sensor: Sensor) -> tuple[int, int]:
@@ -89,89 +85,43 @@ def _scales(model: Model, columns: int) -> tuple[int, list[Scale]]:
     return stage, scales
 
 
-def _features(graph: Graph, embedding: Vision, model: Model, shape: tuple[int, int], read: int) -> dict[Scale, str]:
-    """Scale → the features (windows, d) of the windows that are scored, float32."""
-    net = embedding.network().net
-    quick, last = folded(net, embedding.stages[-1]), embedding.stages[-1]
-    planes = _planes(graph, shape[1], read)
-    windows = model.plan.extent(read)
-    places = model.plan.places(read)
-    whole: list[str] = []
-    features = {}
-    for scale in _scales(model, read)[1]:
-        starts = [windows[scale.width][place] for place in places[scale]]
-        width = min(scale.width, read)
-        if scale.width >= TOGETHER and read <= MOST_COLUMNS:
-            whole = whole or graph.network(quick, planes, last)
-            spans = [(start, start + width) for start in starts]
-            features[scale] = _pooled(graph, embedding, net, whole, (shape[0], read), spans)
-        else:
-            cuts = [_slice(graph, planes, start, start + width, axis=3) for start in starts]
-            maps = graph.network(quick, graph.add("Concat", *cuts, axis=0), last, name=f"narrow_{scale}")
-            features[scale] = _pooled(graph, embedding, net, maps, (shape[0], width), None)
-    return features
-
-
-def _planes(graph: Graph, columns: int, read: int) -> str:
-    """The image's first columns as scaled colour planes (1, 3, C, T)."""
-    image = "image" if read == columns else _slice(graph, "image", 0, read, axis=1)
-    half = graph.add("Mul", graph.add("Add", image, graph.constant(np.float32(1))), graph.constant(np.float32(0.5)))
-    mean, deviation = (np.array(planes, np.float32).reshape(1, 3, 1, 1) for planes in (MEAN, DEVIATION))
-    return graph.add("Div", graph.add("Sub", half, graph.constant(mean)), graph.constant(deviation))
-
-
-def _pooled(
-    graph: Graph,
-    embedding: Vision,
-    net: ResNet,
-    maps: list[str],
-    shape: tuple[int, int],
-    spans: list[tuple[int, int]] | None,
-) -> str:
-    """`pool_windows` of spans of an image of this shape, or of all of each image of a batch where there are none."""
-    with torch.inference_mode():
-        widths = [stage.shape[-1] for stage in net(torch.zeros(1, 3, *shape), embedding.stages[-1])]
-    parts = []
-    for stage in embedding.stages:
-        if spans is None:
-            means = graph.add("ReduceMean", maps[stage], axes=[2, 3], keepdims=0)
-        else:
-            across, columns = widths[stage], shape[1]
-            covered = [
-                (first := start * across // columns, max(first + 1, -(-end * across // columns)))
-                for start, end in spans
-            ]
-            cuts = [_slice(graph, maps[stage], first, after, axis=3) for first, after in covered]
-            rows = [graph.add("ReduceMean", cut, axes=[2, 3], keepdims=0) for cut in cuts]
-            means = graph.add("Concat", *rows, axis=0)
-        length = graph.add("ReduceL2", means, axes=[1], keepdims=1)
-        parts.append(graph.add("Div", means, graph.add("Max", length, graph.constant(np.float32(TINY)))))
-    return graph.add("Min", graph.add("Concat", *parts, axis=1), graph.constant(np.float32(1)))
-
-
-def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int) -> str:
-    """Log probabilities (materials,) in double precision: the readouts' scores, weighed as the stage is calibrated.
+class _Scores(nn.Module):
+    """Log probabilities (materials,) of a tactile image (C, T): the readouts' scores, weighed as they are calibrated.
 
     A share of them is left for touches that are unlike all others, as in a prediction.
     """
-    stage, scales = _scales(model, columns)
-    logits = ""
-    for scale, weight in zip(scales, model.calibrations[stage].weights, strict=True):
-        readout = model.readouts[scale]
-        weights, offsets = readout.linear(model.names, model.kind)
-        fine = graph.add("Cast", features[scale], to=graph.onnx.TensorProto.DOUBLE)
-        units = graph.add("Mul", fine, graph.constant(np.float64(2.0**BITS / Vision.bound)))
-        mean = graph.add("ReduceMean", units, axes=[0], keepdims=1)
-        about = graph.add("Sub", mean, graph.constant(readout.origin))
-        scores = graph.add("Add", graph.add("MatMul", about, graph.constant(weights)), graph.constant(offsets))
-        weighed = graph.add("Mul", scores, graph.constant(np.float64(weight)))
-        logits = graph.add("Add", logits, weighed) if logits else weighed
-    odd = model.moment("complete" if columns >= model.least else "beginning", columns).model_outlier_rate
-    familiar = graph.add("Mul", graph.add("Softmax", logits, axis=1), graph.constant(np.float64(1 - odd)))
-    chances = graph.add("Add", familiar, graph.constant(np.float64(odd / len(model.names))))
-    return graph.add("Squeeze", graph.add("Log", chances), graph.constant(np.array([0])))
 
+    def __init__(self, embedding: Vision, model: Model, columns: int) -> None:
+        super().__init__()
+        self.stages, self.columns = embedding.stages, columns
+        self.net = folded(embedding.network().net, embedding.stages[-1])
+        stage, self.scales = _scales(model, columns)
+        windows, places = model.plan.extent(columns), model.plan.places(columns)
+        self.starts = {scale: [windows[scale.width][place] for place in places[scale]] for scale in self.scales}
+        # As arrays of doubles: the exporter rounds numbers of Python to float32.
+        self.readouts = []
+        for scale, weight in zip(self.scales, model.calibrations[stage].weights, strict=True):
+            slopes, offsets = model.readouts[scale].linear(model.names, model.kind)
+            arrays = model.readouts[scale].origin, weight * slopes, weight * offsets
+            self.readouts.append([torch.from_numpy(array) for array in arrays])
+        self.odd = model.moment("complete" if columns >= model.least else "beginning", columns).model_outlier_rate
 
-def _slice(graph: Graph, what: str, first: int, after: int, *, axis: int) -> str:
-    bounds = [graph.constant(np.array([bound])) for bound in (first, after, axis)]
-    return graph.add("Slice", what, *bounds)
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        planes = to_planes(image[None, :, : self.columns])
+        whole = [scale for scale in self.scales if scale.width >= TOGETHER and self.columns <= MOST_COLUMNS]
+        maps = self._maps(planes) if whole else []
+        logits = torch.zeros(1)
+        for scale, (origin, slopes, offsets) in zip(self.scales, self.readouts, strict=True):
+            width, starts = min(scale.width, self.columns), self.starts[scale]
+            if scale in whole:
+                features = pool_windows(maps, self.columns, [(start, width) for start in starts])[0]
+            else:
+                cuts = torch.cat([planes[..., start : start + width] for start in starts])
+                features = pool_windows(self._maps(cuts), width, [(0, width)])[:, 0]
+            units = features.clamp(max=1).double() * (2.0**BITS / Vision.bound)
+            logits = logits + (units.mean(dim=0) - origin) @ slopes + offsets
+        return torch.log(torch.softmax(logits, -1) * (1 - self.odd) + self.odd / len(logits)).float()
+
+    def _maps(self, planes: torch.Tensor) -> list[torch.Tensor]:
+        maps = self.net(planes, self.stages[-1])
+        return [maps[stage] for stage in self.stages]

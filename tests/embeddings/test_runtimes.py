@@ -1,6 +1,7 @@
 """What runs the network: the same features in each, the same bytes from one."""
 
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from images import image
 
 from scroll_tactile import Vision
 from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.embeddings.runtimes import make_runtime, steady
+from scroll_tactile.embeddings.runtimes import make_runtime, network_model, steady
 from scroll_tactile.errors import InputError
 from scroll_tactile.testing import check_embedding
 
@@ -52,6 +53,15 @@ def test_the_graph_is_the_network_in_other_arrangements_too(depth, stem):
     assert [each.shape for each in maps] == [each.shape for each in truth]
     assert all(np.allclose(a, b, atol=1e-4 * np.abs(b).max()) for a, b in zip(maps, truth, strict=True))
     assert len(make_runtime("onnxruntime", net, 0)(planes)) == 1
+
+
+def test_graphs_are_made_in_several_threads_at_once():
+    """torch's exporter refuses a second trace beside the first."""
+    pytest.importorskip("onnx", reason="onnx is not installed")
+    net = ResNet.random(0)
+    with ThreadPoolExecutor(3) as pool:
+        made = list(pool.map(lambda _: network_model(net, 1), range(6)))
+    assert made == made[:1] * 6
 
 
 def test_what_no_runtime_has_is_refused():

@@ -174,8 +174,11 @@ def test_planes_are_scaled_as_in_the_networks_training():
 def test_settings_that_do_not_fit_are_refused(wrong):
     with pytest.raises(InputError, match=r"expected|needs a seed"):
         Vision(None, **({"seed": 0} | wrong))
+
+
+def test_given_weights_take_no_seed():
     with pytest.raises(InputError, match="needs a seed"):
-        Vision(ResNet.random(0).state_dict(), seed=0)
+        Vision({}, seed=0)
 
 
 def test_the_universal_stem_says_what_is_too_small_for_it():

@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.everyday import Columns, MemoryFolder
+from scroll_tactile.cli.options import Columns, MemoryFolder
 from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
@@ -48,7 +48,7 @@ def live(
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
-    from scroll_tactile.recordings.columns import places
+    from scroll_tactile.recordings.recording import places
 
     screen = console()
     with opened(memory, mode="read") as learner:

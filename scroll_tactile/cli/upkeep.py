@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from scroll_tactile.cli.everyday import MemoryFolder
+from scroll_tactile.cli.options import MemoryFolder
 from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say, say_json, shown
 from scroll_tactile.errors import ScrollTactileError
 from store import Store, StoreError, repair_store

@@ -3,6 +3,8 @@
 A path is names joined by dots. `[2]` takes an element, `[*]` all of them, `[4:23]` some; `{x,y,z}` takes several fields
 of one message, in this order. Values come out message by message: x, y, z of the first taxel, then of the second. Names
 are compared as written, then without regard to case, since ROS 2 writes in lower case what ROS 1 does not.
+
+A file of arrays has no messages: there a field is an array's name, or the end of it, with an index behind (`matched`).
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import array
 import difflib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,7 +20,10 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError
 
-__all__ = ["FieldPath", "fields_of", "nearest", "select"]
+__all__ = ["CLOCK_KEYS", "FieldPath", "fields_of", "matched", "nearest", "select"]
+
+CLOCK_KEYS = ("timestamp", "timestamps", "time", "times")
+"""What an array of times is called, seconds."""
 
 _Collect = Callable[[Any, list[Any]], None]
 _Step = str | int | slice | list["list[_Step]"]
@@ -86,6 +91,25 @@ class FieldPath:
             )
         kind = "text" if isinstance(message, str | bytes | np.str_) else f"a {type(message).__name__}"
         raise FieldError(f"field {self.text!r} leads to {kind}, {str(value)!r:.40}; expected numbers")
+
+
+def matched(field: str, keys: Collection[str], source: str) -> tuple[str, str]:
+    """The key that a field names, and the index behind it.
+
+    Raises FieldError where no key is called so, naming the nearest, or the end of several is.
+    """
+    if field in keys:
+        return field, ""
+    written = re.fullmatch(r"\s*(.*?)\s*((?:\[[^\]]*\])?)\s*", field, re.DOTALL)
+    name, rest = written.groups() if written else (field, "")
+    if name in keys:
+        return name, rest
+    ends = [key for key in keys if re.split(r"[/.]", key)[-1] == name or key.endswith(f"/{name}")]
+    if len(ends) == 1:
+        return ends[0], rest
+    if ends:
+        raise FieldError(f"{source}: field {field!r} may be any of {', '.join(ends)}: name it in full")
+    raise FieldError(f"{source} has no field {field!r}{nearest(name, list(keys))}")
 
 
 def select(array: npt.NDArray[Any], rest: str, text: str) -> npt.NDArray[Any]:

@@ -14,7 +14,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
-from scroll_tactile.recordings.rosbag import picture
+from scroll_tactile.recordings.ros.rosbag import picture
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.ranges import all_clipped
 

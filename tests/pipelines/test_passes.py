@@ -8,10 +8,9 @@ import pytest
 from scroll_tactile import sensors
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
-from scroll_tactile.pipelines.demo import Demo
+from scroll_tactile.pipelines.demo import Demo, pull_the_plug
 from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
-from scroll_tactile.pipelines.unplugged import pull_the_plug
 from scroll_tactile.simulation.scene import Scene
 
 

@@ -19,7 +19,8 @@ from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, ros
 from numcodecs import Blosc
 
 from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings import bounds, describe, find, iterate, read, zarrfile
+from scroll_tactile.recordings import bounds, describe, find, iterate, read
+from scroll_tactile.recordings.arrays import zarrfile
 
 # How they are refused, where that says more than that they are.
 SAID = {

@@ -1,19 +1,20 @@
-"""`scroll-tactile demo`."""
+"""`scroll-tactile demo` and `report`: simulated touches, learned and answered; a memory or a recording as a page."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scroll_tactile.cli.terminal import percent, progress_bar, say, shown, verdict
+from scroll_tactile.cli.terminal import opened_for_upkeep, percent, progress_bar, say, shown, verdict
+from scroll_tactile.errors import InputError
+from store import NotAStoreError
 
 if TYPE_CHECKING:
-    from scroll_tactile.pipelines.demo import Demo, Outcome
-    from scroll_tactile.pipelines.unplugged import Unplugged
+    from scroll_tactile.pipelines.demo import Demo, Outcome, Unplugged
 
-__all__ = ["demo"]
+__all__ = ["demo", "report"]
 
 
 def demo(
@@ -34,8 +35,7 @@ def demo(
     and for the first 0.3 s of touches; and a process that learns is killed. It needs no data, and keeps nothing unless
     you give --memory.
     """
-    from scroll_tactile.pipelines.demo import Demo
-    from scroll_tactile.pipelines.unplugged import pull_the_plug
+    from scroll_tactile.pipelines.demo import Demo, pull_the_plug
     from scroll_tactile.sensors import read_sensor
 
     task = Demo(
@@ -54,17 +54,17 @@ def demo(
     learned: list[str] = []
     with progress_bar() as progress:
 
-        def report(name: str) -> None:
+        def count(name: str) -> None:
             learned.append(name)
             progress(f"learned {name}", len(learned), materials)
 
-        outcome = task.run(report)
+        outcome = task.run(count)
         progress("a process is killed while it learns", len(learned), materials)
         plug = pull_the_plug(task.sensor, seed)
-    _report(task, outcome, learned, plug)
+    _report_demo(task, outcome, learned, plug)
 
 
-def _report(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugged) -> None:
+def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugged) -> None:
     half, middle, answers, short = outcome.half, max(1, len(learned) // 2), outcome.answers, outcome.short
     first, others = learned[:middle], learned[middle:]
     say(f"[bold]learned[/] {len(first)} materials, {task.touches} touches of each: {', '.join(first)}")
@@ -91,3 +91,50 @@ def _report(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugged) -
     say(f"[bold]observed now:[/] {outcome.observed} touches; [bold]digest:[/] {outcome.digest}")
     if task.folder is not None:
         say(f"kept: try  scroll-tactile inspect {shown(task.folder / 'memory')}")
+
+
+def report(
+    source: Annotated[Path, typer.Argument(help="The folder of a memory, or a recording.", show_default=False)],
+    page: Annotated[Path, typer.Argument(help="The page to write, such as page.html.", show_default=False)],
+    topic: Annotated[str | None, typer.Option(help="Of a recording: which topic.")] = None,
+    field: Annotated[str | None, typer.Option(help="Of a recording: where its numbers are.")] = None,
+    preset: Annotated[str | None, typer.Option(help="Of a recording: a known sensor, in place of both.")] = None,
+    clock: Annotated[str | None, typer.Option(help="Of a recording: whose times.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Of a recording without times: readings a second.")] = None,
+    intervals: Annotated[
+        Path | None, typer.Option(help="Of a recording: a CSV of file, begin, end, material that cuts it to touches.")
+    ] = None,
+) -> None:
+    """Write a page that shows what a memory knows, or what a recording holds; any browser opens it, without network."""
+    from scroll_tactile.report.page import require_page, save
+
+    require_page(page)
+    chosen: dict[str, Any] = {"topic": topic, "field": field, "preset": preset, "clock": clock, "rate": rate}
+    if _is_memory(source):
+        given = [f"--{name}" for name, value in {**chosen, "intervals": intervals}.items() if value is not None]
+        if given:
+            raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
+        from scroll_tactile.report.memory_page import memory_page
+
+        with opened_for_upkeep(source, mode="read") as learner, progress_bar() as progress:
+            html = memory_page(learner, progress=progress)
+    else:
+        from scroll_tactile.recordings import read_intervals
+        from scroll_tactile.report.recording_page import recording_page
+
+        cut = None if intervals is None else read_intervals(intervals)
+        html = recording_page(source, intervals=cut, **chosen)
+    save(html, page)
+    say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")
+
+
+def _is_memory(source: Path) -> bool:
+    """Whether a memory lies there, sound or not; what holds no store may be a recording."""
+    from store.layout import holds_store
+
+    if not source.is_dir():
+        return False
+    try:
+        return holds_store(source)
+    except NotAStoreError:
+        return False

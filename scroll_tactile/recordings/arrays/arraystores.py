@@ -15,11 +15,10 @@ import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.arrays.zarrfile import open_zarr
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, SPARE, Budget, stored_bytes
-from scroll_tactile.recordings.keys import CLOCK_KEYS, matched
-from scroll_tactile.recordings.paths import select
-from scroll_tactile.recordings.zarrfile import open_zarr
+from scroll_tactile.recordings.paths import CLOCK_KEYS, matched, select
 
 __all__ = ["Hdf5", "Npy", "ZarrBuffer"]
 

@@ -14,11 +14,10 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.arrays.parquetpages import LONGEST_LIST, require_bounded_pages
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
-from scroll_tactile.recordings.keys import matched
-from scroll_tactile.recordings.parquetpages import LONGEST_LIST, require_bounded_pages
-from scroll_tactile.recordings.paths import select
+from scroll_tactile.recordings.paths import matched, select
 
 __all__ = ["LeRobot", "is_lerobot"]
 

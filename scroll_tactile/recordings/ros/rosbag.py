@@ -17,14 +17,14 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
 from scroll_tactile.recordings import presets
-from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import Budget, read_text, require_inside, stored_bytes
-from scroll_tactile.recordings.clocks import Stamps
-from scroll_tactile.recordings.decoding import MessageTypes
-from scroll_tactile.recordings.mcapfile import scan_mcap
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
-from scroll_tactile.recordings.sqlitefile import scan_db3
+from scroll_tactile.recordings.ros.bagfiles import Channel, Message, Scan, inflated, scan_bag
+from scroll_tactile.recordings.ros.decoding import MessageTypes
+from scroll_tactile.recordings.ros.mcapfile import scan_mcap
+from scroll_tactile.recordings.ros.sqlitefile import scan_db3
+from scroll_tactile.recordings.ros.stamps import Stamps
 
 __all__ = ["SUFFIXES", "RosBag", "is_rosbag", "picture"]
 

@@ -31,8 +31,8 @@ def demo(
 ) -> None:
     """Ten seconds of learning: simulated materials, unknown first, then learned, and none forgotten.
 
-    When half of them are learned, it is asked for touches of the others, which it has never felt; in the end for all,
-    and for the first 0.3 s of touches; and a process that learns is killed. It needs no data, and keeps nothing unless
+    When half of them are learned, it answers touches of the others, which it has never felt; in the end of all,
+    and the first 0.3 s of touches; and a process that learns is killed. It needs no data, and keeps nothing unless
     you give --memory.
     """
     from scroll_tactile.pipelines.demo import Demo, pull_the_plug
@@ -73,7 +73,7 @@ def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugg
         f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{said}[/] "
         f"(nearest is {half.nearest}, novelty {half.novelty:.1f})"
     )
-    say(f"  of {half.asked} touches of materials that it had never felt it called {half.unknown} unknown")
+    say(f"  of {half.tested} touches of materials that it had never felt it called {half.unknown} unknown")
     say(f"[bold]then learned[/] {len(others)} more, {task.touches} touches of each: {', '.join(others)}")
     say(f"[bold]learned from {task.touches} touches:[/] {half.material}: {verdict(answers.predictions[outcome.first])}")
     say(f"  of {len(answers.truth)} touches held out, of all materials, it names {percent(answers.accuracy)} right")

@@ -105,7 +105,7 @@ class Commands(TyperGroup):
         return found
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was asked for."""
+        """Run the command that was typed."""
         try:
             with _warnings_as_lines():
                 return super().invoke(ctx)

@@ -34,13 +34,13 @@ ACKNOWLEDGED = 5  # touches, before the process is killed
 class Half:
     """What was said when half of the materials were learned.
 
-    right: share of right answers to touches of these, held out. unknown, asked: how many touches of the other half were
+    right: share of right answers to touches of these, held out. unknown, tested: how many touches of the other half were
     called unknown, of how many. material, nearest, novelty, known: the answer to the first of those.
     """
 
     right: float
     unknown: int
-    asked: int
+    tested: int
     material: str
     nearest: str
     novelty: float
@@ -133,11 +133,11 @@ class Demo:
 
     def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
         right = evaluate(learner, self._held_out(learned)).accuracy
-        asked = evaluate(learner, self._held_out(others))
-        unknown = sum(answer.known is False for answer in asked.predictions)
-        first = asked.predictions[0]
+        answers = evaluate(learner, self._held_out(others))
+        unknown = sum(answer.known is False for answer in answers.predictions)
+        first = answers.predictions[0]
         nearest = str(first.material)
-        return Half(right, unknown, len(asked.truth), asked.truth[0], nearest, first.novelty, first.known)
+        return Half(right, unknown, len(answers.truth), answers.truth[0], nearest, first.novelty, first.known)
 
     def _held_out(self, names: Sequence[str]) -> list[Labelled]:
         return [touch for name in names for touch in self._touches(name, self.touches, self.held_out)]

@@ -159,7 +159,7 @@ class Evaluation:
     """Answers to touches whose material is known.
 
     answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory.
-    seen: touches that the memory had learned, under any name; left out, or answered where that was asked for.
+    seen: touches that the memory had learned, under any name; left out, or answered with `with_learned`.
     """
 
     answered: tuple[Answered, ...]

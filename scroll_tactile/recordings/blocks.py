@@ -25,7 +25,7 @@ _BYTES = 1 << 24  # … unless they would hold more than this
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a file; see `read`."""
+    """What is requested of a file; see `read`."""
 
     topic: str | None = None
     field: str | None = None
@@ -99,7 +99,7 @@ class Contents:
 class Source(ABC):
     """A file that was opened for reading; `notes`, `names` and `marks` fill up as blocks are read.
 
-    path, address: where it is on this machine, and as it was asked for. request: what is asked of it.
+    path, address: where it is on this machine, and as it was given. request: what is requested of it.
     topic: the topic that is read; None where the format has none.
     notes: what went wrong without losing everything, as sentences. cut_off: whether the file ends before its end.
     names: what each episode is called, by its number.

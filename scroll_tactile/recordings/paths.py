@@ -275,7 +275,7 @@ def _actual(message: Any, name: str) -> str:
     if isinstance(message, _ARRAYS):
         raise FieldError(f"an array of {len(message)} stands before {name!r}: write [0] or [*] between them")
     if not names:
-        raise FieldError(f"{name!r} is asked of a {type(message).__name__}, which has no fields")
+        raise FieldError(f"{name!r} is wanted of a {type(message).__name__}, which has no fields")
     raise FieldError(f"the message has no {name!r}{nearest(name, names)}")
 
 
@@ -296,7 +296,7 @@ def _several(paths: list[_Collect], rest: _Collect) -> _Collect:
 def _element(step: int | slice, rest: _Collect) -> _Collect:
     def collect(message: Any, found: list[Any]) -> None:
         if not isinstance(message, _ARRAYS):
-            raise FieldError(f"{_shown(step)} is asked of a {type(message).__name__}, which is no array")
+            raise FieldError(f"{_shown(step)} is wanted of a {type(message).__name__}, which is no array")
         if isinstance(step, slice) and (rest is not _append or _messages(message)):
             for value in message[step]:
                 rest(value, found)
@@ -304,7 +304,7 @@ def _element(step: int | slice, rest: _Collect) -> _Collect:
         try:
             value = message[step]
         except IndexError:
-            raise FieldError(f"{_shown(step)} is asked of an array of {len(message)}") from None
+            raise FieldError(f"{_shown(step)} is wanted of an array of {len(message)}") from None
         rest(value, found)
 
     return collect

@@ -66,7 +66,7 @@ class Report:
     None where nothing counts. repeated: readings with the count, or the time, of the one before.
     backward: how often time goes back inside an episode.
     unset: stamps of zero in a header, whose clock is then not used.
-    cut_off: whether the file ends before its end. resampled: the rate in Hz that was asked for, and how.
+    cut_off: whether the file ends before its end. resampled: the requested rate in Hz, and how.
     notes: further sentences.
     """
 

@@ -58,7 +58,7 @@ def recording_page(path: str | PathLike[str], *, intervals: Sequence[Interval] |
 
 
 def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, str]:
-    """The recording, of what was asked for or of the first field there is; and what to say of that choice."""
+    """The recording, of the requested field or of the first there is; and a sentence on that choice."""
     try:
         return read(path, **chosen), ""
     except FieldError:

@@ -104,7 +104,7 @@ class TestDemo:
 
     def test_what_is_new_is_shown(self) -> None:
         outcome = Demo(sensors.BIOTAC, materials=8, touches=5, held_out=2, features=64).run()
-        assert (outcome.half.asked, outcome.first) == (8, 8)
+        assert (outcome.half.tested, outcome.first) == (8, 8)
         assert outcome.half.unknown >= 6 and outcome.half.right == 1.0 and outcome.still_right == 1.0
         outcome.answers.predictions[:2] = outcome.answers.predictions[-2:]  # what was said to the last, to the first
         assert outcome.still_right == 0.75  # forgetting would be seen

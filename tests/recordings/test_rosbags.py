@@ -291,7 +291,7 @@ def test_a_wrong_topic_or_field_names_what_there_is(tmp_path, store2):
         ({"topic": "/skin", "field": "dta"}, r"no 'dta'; nearest is 'data' \(of layout, data\)"),
         ({"topic": "/name", "field": "data"}, "leads to text, 'felt'"),
         ({"topic": "/rh/tactile", "field": "tactiles"}, "leads to a message, not to numbers; inside it are pac0"),
-        ({"topic": "/rh/tactile", "field": "tactiles[7].electrodes"}, r"\[7\] is asked of an array of 5"),
+        ({"topic": "/rh/tactile", "field": "tactiles[7].electrodes"}, r"\[7\] is wanted of an array of 5"),
         ({"topic": "/rh/tactile", "field": "tactiles.electrodes"}, r"write \[0\] or \[\*\]"),
         ({"topic": "/skin"}, r"read\('.*', topic='/skin', field='data'\)"),
         ({}, r"/skin  data  \[19\], 5 readings, 100 Hz(?s:.*)/rh/tactile  tactiles\[0\].electrodes  \[19\]"),

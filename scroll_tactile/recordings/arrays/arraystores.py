@@ -118,7 +118,7 @@ class Npy(_Arrays):
 
 
 class _NpyArray:
-    """The array of a `.npy`, of which rows are read when they are asked for.
+    """The array of a `.npy`, of which rows are read by a slice.
 
     It is not mapped: a file that another program cuts off meanwhile would end this one, and holes would take memory
     where the disk is memory.

@@ -93,8 +93,8 @@ class LeRobot(Source):
     def _opened(self, path: Path, columns: list[str] | None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
 
-        The budget is charged for what their pages claim, before pyarrow is asked. pyarrow itself is not asked for what
-        the footer says of columns: where that is damaged, its answer is to end the process.
+        The budget is charged for what their pages claim, before pyarrow opens it. What the footer holds
+        about columns is not read by pyarrow: where that is damaged, pyarrow ends the process.
         """
         require_inside(self.path, path)
         self.budget.add(stored_bytes(path))

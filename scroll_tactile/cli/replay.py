@@ -135,8 +135,8 @@ def _judged(ended: LiveTouch) -> str:
 
 def _table(now: LiveState) -> Table:
     """The likeliest materials of a touch under way."""
-    said = "decided" if now.decided else "not yet decided"
-    table = Table(title=f"touched for {now.seconds:.2f} s, {said}")
+    state = "decided" if now.decided else "not yet decided"
+    table = Table(title=f"touched for {now.seconds:.2f} s, {state}")
     for heading in ("material", "probability", ""):
         table.add_column(heading)
     if now.prediction is not None:

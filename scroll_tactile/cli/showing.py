@@ -68,9 +68,9 @@ def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugg
     half, middle, answers, short = outcome.half, max(1, len(learned) // 2), outcome.answers, outcome.short
     first, others = learned[:middle], learned[middle:]
     say(f"[bold]learned[/] {len(first)} materials, {task.touches} touches of each: {', '.join(first)}")
-    said = "never felt this" if half.known is False else f"known, as {half.nearest}"
+    answer = "never felt this" if half.known is False else f"known, as {half.nearest}"
     say(
-        f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{said}[/] "
+        f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{answer}[/] "
         f"(nearest is {half.nearest}, novelty {half.novelty:.1f})"
     )
     say(f"  of {half.tested} touches of materials that it had never felt it called {half.unknown} unknown")
@@ -85,7 +85,7 @@ def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugg
     say(f"  of 0.3 s of a touch of every material it names {percent(short.accuracy)} right")
     bits = "the very bits of a memory that nothing interrupted" if plug.same else "[bold red]not as it was[/]"
     say(
-        f"[bold]survives the power plug:[/] a process was killed when it had said that {plug.acknowledged} touches "
+        f"[bold]survives the power plug:[/] a process was killed when it had reported that {plug.acknowledged} touches "
         f"were learned; its memory has {plug.found}, {bits}"
     )
     say(f"[bold]observed now:[/] {outcome.observed} touches; [bold]digest:[/] {outcome.digest}")

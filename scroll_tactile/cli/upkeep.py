@@ -215,7 +215,7 @@ def pack(
         bool, typer.Option(help="With each touch's readings, so that it can be retracted where the file is merged.")
     ] = True,
     readings: Annotated[bool, typer.Option(help="With anything that shows a touch as it was read.")] = True,
-    source: Annotated[str | None, typer.Option(help="What is said of touches that say no source.")] = None,
+    source: Annotated[str | None, typer.Option(help="The source of touches that name none.")] = None,
 ) -> None:
     """Write a memory as one file that travels, and that merge takes."""
     with opened_for_upkeep(folder, mode="read") as learner:

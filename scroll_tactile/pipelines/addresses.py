@@ -33,7 +33,7 @@ def is_memory(address: str, patience: float | None = None) -> bool:
     remote = is_remote(address)
     try:
         return _answered(partial(_is_remote_memory, address), patience) if remote else _is_local_memory(Path(address))
-    except Exception as error:  # each file system has errors of its own; reading it tells what is wrong
+    except Exception as error:  # each file system has errors of its own; reading it raises what is wrong
         if remote and isinstance(error, TimeoutError):
             raise
         return False

@@ -32,7 +32,7 @@ ACKNOWLEDGED = 5  # touches, before the process is killed
 
 @dataclass(frozen=True)
 class Half:
-    """What was said when half of the materials were learned.
+    """The answers when half of the materials were learned.
 
     right: share of right answers to touches of these, held out. unknown, tested: how many touches of the other half were
     called unknown, of how many. material, nearest, novelty, known: the answer to the first of those.
@@ -51,7 +51,7 @@ class Half:
 class Outcome:
     """How a demonstration ended.
 
-    half: what was said half-way. answers: to the held-out touches of all materials. first: of which as many are of the
+    half: the answers half-way. answers: to the held-out touches of all materials. first: of which as many are of the
     first half. short: answers to 0.3 s of one touch of each. observed: how many touches this run observed; a resumed
     one fewer. digest: of the memory.
     """

@@ -206,9 +206,9 @@ def evaluate_sources(
     *,
     with_learned: bool = False,
 ) -> Evaluation:
-    """Answer every touch in sources with what the memory knows, settled, and keep what it should have said.
+    """Answer every touch in sources with what the memory knows, settled, and keep the right answers.
 
-    with_learned: also those that the memory learned, of which it says what it was told.
+    with_learned: also those that the memory learned, of which it knows the answer.
     """
     learner.settle()
     answered: list[Answered] = []

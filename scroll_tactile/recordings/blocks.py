@@ -103,7 +103,7 @@ class Source(ABC):
     topic: the topic that is read; None where the format has none.
     notes: what went wrong without losing everything, as sentences. cut_off: whether the file ends before its end.
     names: what each episode is called, by its number.
-    marks: what a topic of labels said when: seconds by the clock "log", and a text.
+    marks: the texts of a topic of labels, each with its time in seconds by the clock "log".
     continuous: whether time goes on from one episode to the next, and does not begin anew.
     budget: what reading it may still cost.
     topics, labels: whether the format has topics, and something that labels.

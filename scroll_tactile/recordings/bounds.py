@@ -76,7 +76,7 @@ def stored_bytes(path: Path) -> int:
     """The bytes that a file has on the disk, holes left out; raises RecordingError for what is no file."""
     about = path.stat()
     _require_regular(about, path)
-    # Some file systems tell of no blocks.
+    # Some file systems count no blocks.
     return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 

@@ -29,7 +29,7 @@ ROW = 15.0  # units a row of names
 LETTER = 7.0  # a letter's width, about
 RIGHT = WIDTH - 15.0
 FIRST_DATE = 1e8  # seconds since 1970: less are counted from some other moment
-COLUMNS = 256  # places along a time axis that are told apart
+COLUMNS = 256  # places along a time axis that are distinguished
 
 
 def dated(seconds: float) -> str:

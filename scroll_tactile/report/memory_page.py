@@ -20,7 +20,7 @@ from scroll_tactile.report.sensing import channel_card, channel_section, exempla
 
 __all__ = ["memory_page"]
 
-FEW = 30  # touches left out: with fewer, nothing said of them is certain
+FEW = 30  # touches left out: with fewer, no figure of them is certain
 FEW_TOUCHES = 3  # of a material
 RIGHT, POOR = 0.95, 0.8  # shares: what is fine, and what is bad
 BARS = 60

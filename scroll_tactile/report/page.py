@@ -33,7 +33,7 @@ Card = tuple[State, str, str, str]
 
 SIGNS = {"good": ("✓", "fine"), "look": ("!", "look at it"), "bad": ("✕", "bad"), "none": ("–", "not measured")}
 
-# The palette is Okabe and Ito's (2008), which the colour-blind tell apart; lighter on dark.
+# The palette is Okabe and Ito's (2008), which the colour-blind distinguish; lighter on dark.
 STYLE = """
 :root{color-scheme:light dark;--paper:#fcfcfa;--ink:#1c2126;--soft:#5b6570;--line:#dfe2e4;--card:#fff;
 --blue:#0067a8;--red:#c04a00;--green:#00795a;--band:#eef2f5}

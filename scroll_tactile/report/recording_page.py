@@ -110,7 +110,7 @@ def _clock(recording: Recording) -> Card:
 def _losses(recording: Recording) -> Card:
     report = recording.report
     counted = (
-        "No counter tells whether readings were lost." if report.lost is None else "By the counter in its messages."
+        "No counter shows whether readings were lost." if report.lost is None else "By the counter in its messages."
     )
     if report.lost is None and not report.repeated and not report.unset:
         return "none", "What was lost", "not counted", counted
@@ -201,9 +201,9 @@ def _time(recording: Recording) -> str:
     gaps = table(["before reading", "after (s)", "lasts (s)"], rows[:MOST_ROWS], "gaps") if rows else ""
     more = note(f"{len(rows) - MOST_ROWS} shorter gaps are left out.") if len(rows) > MOST_ROWS else ""
     first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > FIRST_DATE else ""
-    said = "".join(note(text) for text in recording.report.notes)
+    notes = "".join(note(text) for text in recording.report.notes)
     return (
-        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + said
+        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + notes
     )
 
 

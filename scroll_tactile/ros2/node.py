@@ -49,7 +49,7 @@ class TactileNode:
         ros2 param set /scroll_tactile material silk
         ros2 service call /scroll_tactile/learn std_srvs/srv/Trigger
 
-    A wrong name, a full disk or a missing touch reaches whoever called, which a topic of names could not tell.
+    A wrong name, a full disk or a missing touch reaches whoever called, which a topic of names could not report.
 
     Raises MissingLibraryError where a package of ROS is missing, InputError for a type that is none, and what `Bridge`
     raises. A field that the first message does not have raises FieldError from the node's executor.
@@ -134,8 +134,8 @@ class TactileNode:
             durability=DurabilityPolicy.VOLATILE,
         )
         # Humble does not say when a message was published; later distributions do.
-        told = hasattr(Subscription, "CallbackType")
-        receive = self.receive if told else lambda message: self.receive(message, {})
+        dated = hasattr(Subscription, "CallbackType")
+        receive = self.receive if dated else lambda message: self.receive(message, {})
         self.subscription = self.node.create_subscription(message, self.topic, receive, profile)
         self._log.info(f"reading {self.bridge.field.text} of {self.topic}, {self.kind}")
 

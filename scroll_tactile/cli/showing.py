@@ -24,7 +24,9 @@ def demo(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the simulated materials.")] = 0,
     sensor: Annotated[str, typer.Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",
-    features: Annotated[int, typer.Option(min=64, help="Features of the embedding: fewer than the usual 1008.")] = 504,
+    features: Annotated[
+        int, typer.Option(min=64, help="Features of the embedding: fewer than the default, 1008.")
+    ] = 504,
     materials: Annotated[int, typer.Option(hidden=True, min=2, max=20)] = 12,
     touches: Annotated[int, typer.Option(hidden=True, min=1)] = 6,
     held_out: Annotated[int, typer.Option(hidden=True, min=1)] = 4,

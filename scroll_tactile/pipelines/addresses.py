@@ -19,7 +19,7 @@ from store.layout import CURRENT_FILE, holds_store
 __all__ = ["expand", "fetched", "is_memory"]
 
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
-PACKED = (".part",)  # what is looked for in a remote folder: usual names of packed memories
+PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
 T = TypeVar("T")

@@ -155,9 +155,9 @@ def reliability(bins: Sequence[Bin], confidences: Sequence[float]) -> str:
     return drawing.svg()
 
 
-def shares(rows: Sequence[tuple[str, float, str]], usual: float | None, label: str) -> str:
-    """Bars of shares from 0 to 1. rows: name, share, what shows over it; usual: where a line stands."""
-    most = max([share for _, share, _ in rows] + [usual or 0.0, 0.1])
+def shares(rows: Sequence[tuple[str, float, str]], expected: float | None, label: str) -> str:
+    """Bars of shares from 0 to 1. rows: name, share, what shows over it; expected: where a line stands."""
+    most = max([share for _, share, _ in rows] + [expected or 0.0, 0.1])
     drawing = Drawing(ROW * len(rows) + 34, label)
     axis, bottom = Axis(0, most, LEFT, RIGHT - 30), ROW * len(rows) + 4
     drawing.across(axis, 4, bottom, label, "{:.0%}", 4)
@@ -166,8 +166,8 @@ def shares(rows: Sequence[tuple[str, float, str]], usual: float | None, label: s
         drawing.text(LEFT - 6, y + 11, clipped_name(name), anchor="end", title=name)
         drawing.box(LEFT, y + 2, max(axis(share) - LEFT, 0.8), ROW - 4, "fill", title=title)
         drawing.text(axis(share) + 4, y + 10.5, f"{share:.0%}", "tiny")
-    if usual is not None:
-        drawing.line([(axis(usual), 2), (axis(usual), bottom)], "ideal")
+    if expected is not None:
+        drawing.line([(axis(expected), 2), (axis(expected), bottom)], "ideal")
     return drawing.svg()
 
 

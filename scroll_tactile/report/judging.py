@@ -107,7 +107,7 @@ def trusted(facts: MemoryFacts) -> str:
     verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
     caption = (
         "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
-        f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is usual of perfect answers. "
+        f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is the mean of perfect answers. "
         "Upright lines are 95% intervals."
     )
     drawn = reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out])

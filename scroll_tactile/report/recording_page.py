@@ -188,9 +188,9 @@ def _time(recording: Recording) -> str:
     if not len(steps):
         return note("Not shown: its readings have no times. Give --clock, or --rate to count them.")
     longest = float(np.quantile(steps, 0.999)) * 1e3
-    usual = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
-    high = float(usual.max()) * 1.1 if len(usual) and usual.max() > 0 else 1.0
-    counts, _ = np.histogram(usual, bins=60, range=(0, high))
+    regular = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
+    high = float(regular.max()) * 1.1 if len(regular) and regular.max() > 0 else 1.0
+    counts, _ = np.histogram(regular, bins=60, range=(0, high))
     drawn = histogram(counts.tolist(), 0, high, "ms from a reading to the next", "readings")
     caption = (
         "How long it takes from one reading to the next: one narrow peak is a steady clock, two are lost readings."

@@ -53,10 +53,10 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 
     The exit code is 1 where something is damaged.
     """
-    from scroll_tactile.pipelines.checking import check_memory_apart
+    from scroll_tactile.pipelines.checking import check_in_process
 
     with progress_bar() as progress:
-        problems = check_memory_apart(folder, progress=progress)
+        problems = check_in_process(folder, progress=progress)
     damaged = [problem for problem in problems if problem.kind != "leftover"]
     if as_json:
         found = [{"path": str(problem.path), "what": problem.what, "kind": problem.kind} for problem in problems]

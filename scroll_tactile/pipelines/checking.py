@@ -22,7 +22,7 @@ from store import check_store as check_checksums
 from store.exceptions import reported
 from store.files import store_folder, tree_size
 
-__all__ = ["check_memory_apart"]
+__all__ = ["check_in_process"]
 
 # Address space beyond what the process has when it begins: arrays are stored compressed, some a hundredfold.
 SPARE_BYTES = 2**30
@@ -36,7 +36,7 @@ REFUSALS = {
 }
 
 
-def check_memory_apart(
+def check_in_process(
     path: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
 ) -> list[Problem]:
     """All that is wrong with the memory in folder `path`, as `store.check_store`; nothing for a sound one.

@@ -21,12 +21,12 @@ PAIRS = 30
 
 def alike(facts: MemoryFacts) -> tuple[str, list[str]]:
     """Who is near whom, and the order of materials that brings near ones together; empty where there are many."""
-    names, apart = facts.near
+    names, separation = facts.near
     if len(names) < 2:
         many = len(facts.counts) > MOST_NEAR
         why = f"there are more than {MOST_NEAR} materials." if many else "it takes two materials, touched long enough."
         return facts.lacks("Who is near whom", why), []
-    pairs = table(["material", "feels like", "separation"], _nearest(names, apart), "nearest pairs")
+    pairs = table(["material", "feels like", "separation"], _nearest(names, separation), "nearest pairs")
     found = f"<div><h3>Nearest pairs</h3>{pairs}</div>"
     words = (
         "Separation is the log-odds that a typical touch of one has over the other. Of touches that scatter as a bell "
@@ -34,22 +34,22 @@ def alike(facts: MemoryFacts) -> tuple[str, list[str]]:
     )
     if len(names) > ROWS:
         return note(words) + found, []
-    drawn, order = tree(names, _joins(apart))
+    drawn, order = tree(names, _joins(separation))
     caption = f"Materials that join further to the left feel more alike (average linkage). {words}"
     return side_by_side(figure(drawn, caption), found), order
 
 
-def _joins(apart: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _joins(separation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     from scipy.cluster.hierarchy import linkage
     from scipy.spatial.distance import squareform
 
-    return np.asarray(linkage(squareform(apart, checks=False), "average"))
+    return np.asarray(linkage(squareform(separation, checks=False), "average"))
 
 
-def _nearest(names: list[str], apart: npt.NDArray[np.float64]) -> list[list[object]]:
+def _nearest(names: list[str], separation: npt.NDArray[np.float64]) -> list[list[object]]:
     first, second = np.triu_indices(len(names), 1)
-    order = np.argsort(apart[first, second], kind="stable")[:PAIRS]
-    return [[names[i], names[j], float(apart[i, j])] for i, j in zip(first[order], second[order], strict=True)]
+    order = np.argsort(separation[first, second], kind="stable")[:PAIRS]
+    return [[names[i], names[j], float(separation[i, j])] for i, j in zip(first[order], second[order], strict=True)]
 
 
 def mixed_up(facts: MemoryFacts, order: list[str]) -> str:

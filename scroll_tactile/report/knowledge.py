@@ -26,7 +26,7 @@ BINS = 10
 
 
 def separations(learner: TactileLearner, model: Model) -> tuple[list[str], FloatArray]:
-    """How far materials feel apart: names, and the log-odds that a typical touch of one has over another, (C, C).
+    """The separation of materials: names, and the log-odds that a typical touch of one has over another, (C, C).
 
     Half the squared Mahalanobis distance of their means, of each scale that judges whole touches, as far as the
     calibration believes it. Materials that were never touched long enough are left out. None are there before a

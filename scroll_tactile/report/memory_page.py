@@ -154,10 +154,10 @@ def _known(facts: MemoryFacts) -> str:
     """Materials, and when they were observed."""
     if not facts.counts:
         return facts.lacks("What it knows", "no touch was observed yet.")
-    names, apart = facts.near
+    names, separation = facts.near
     nearest: dict[str, tuple[str, float]] = {}
     if len(names) > 1:
-        far = apart + np.diag(np.full(len(names), np.inf))
+        far = separation + np.diag(np.full(len(names), np.inf))
         nearest = {name: (names[int(row.argmin())], float(row.min())) for name, row in zip(names, far, strict=True)}
     first: dict[str, float] = {}
     for row in facts.journal:

@@ -104,7 +104,7 @@ def page(title: str, under: str, summary: str, sections: Sequence[tuple[str, str
 
 
 def name_of(text: object) -> str:
-    """A name, set apart from the text around it, in which direction it may be read."""
+    """A name, isolated from the text around it, in which direction it may be read."""
     return f"<bdi>{shown(text)}</bdi>"
 
 

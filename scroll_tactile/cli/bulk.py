@@ -264,19 +264,19 @@ def _refusals(refused: Sequence[Refused]) -> list[dict[str, str]]:
 
 
 def _figures(done: Evaluation) -> dict[str, Any]:
-    familiar, strange = done.familiar, done.strange
+    learned, never_learned = done.of_learned, done.of_others
     wrong = [
         dict(zip(ANSWER, answer_row(each), strict=True)) | {"material": each.touch.material} for each in done.wrong
     ]
     return {
-        "touches": len(familiar),
+        "touches": len(learned),
         "learned_before": done.seen,
-        "accuracy": done.answers.accuracy if familiar else None,
-        "called_unknown": sum(each.prediction.known is False for each in familiar),
+        "accuracy": done.answers.accuracy if learned else None,
+        "called_unknown": sum(each.prediction.known is False for each in learned),
         "calibration_error": done.calibration_error,
         "confusions": [list(confusion) for confusion in done.answers.confusions()],
-        "never_learned": len(strange),
-        "never_learned_called_unknown": sum(each.prediction.known is False for each in strange),
+        "never_learned": len(never_learned),
+        "never_learned_called_unknown": sum(each.prediction.known is False for each in never_learned),
         "wrong": wrong,
     }
 

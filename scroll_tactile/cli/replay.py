@@ -161,10 +161,10 @@ def _summed_up(report: LiveReport, as_json: bool) -> None:
         f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
         f"{report.revised} revised"
     )
-    strange = [
+    irregular = [
         name
         for name in ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
         if counted.get(name)
     ]
-    if strange:
-        say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in strange))
+    if irregular:
+        say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in irregular))

@@ -168,34 +168,34 @@ class Evaluation:
     seen: int = 0
 
     @property
-    def familiar(self) -> list[Answered]:
+    def of_learned(self) -> list[Answered]:
         """Touches of materials that the memory has: accuracy, confusions and calibration are theirs."""
         return [each for each in self.answered if each.touch.material in self.learned]
 
     @property
-    def strange(self) -> list[Answered]:
+    def of_others(self) -> list[Answered]:
         """Touches of materials that it never learned, which it should call unknown."""
         return [each for each in self.answered if each.touch.material not in self.learned]
 
     @property
     def answers(self) -> Answers:
-        """Of the familiar ones."""
+        """Those to touches of materials that the memory has."""
         return Answers(
-            [str(each.touch.material) for each in self.familiar], [each.prediction for each in self.familiar]
+            [str(each.touch.material) for each in self.of_learned], [each.prediction for each in self.of_learned]
         )
 
     @property
     def wrong(self) -> list[Answered]:
-        """Touches taken for another material: the familiar ones, and strange ones that it called known."""
+        """Touches taken for another material: of materials that the memory has, and of others that it called known."""
         mistaken = (each for each in self.answered if each.prediction.material != each.touch.material)
         return [each for each in mistaken if each.touch.material in self.learned or each.prediction.known is not False]
 
     @property
     def calibration_error(self) -> float | None:
-        """Expected calibration error of the familiar ones, see `metrics`; None without any."""
-        familiar, truth = self.familiar, self.answers
+        """Expected calibration error of touches of materials that the memory has, see `metrics`; None without any."""
+        learned, truth = self.of_learned, self.answers
         right = [name == predicted for name, predicted in zip(truth.truth, truth.predicted, strict=True)]
-        return calibration_error([each.prediction.probability for each in familiar], right) if familiar else None
+        return calibration_error([each.prediction.probability for each in learned], right) if learned else None
 
 
 def evaluate_sources(

@@ -111,15 +111,15 @@ def trusted(facts: MemoryFacts) -> str:
         "Upright lines are 95% intervals."
     )
     drawn = reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out])
-    strange = unknown_by(facts.held_out)
+    unknown_touches = unknown_by(facts.held_out)
     words = (
         f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} are meant to be. A "
         "material far above that varies more than it was shown to: teach more of it."
     )
-    if len(strange) <= ROWS:
-        bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in strange]
+    if len(unknown_touches) <= ROWS:
+        bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in unknown_touches]
         return side_by_side(figure(drawn, caption), figure(shares(bars, alarms, "called unknown, left out"), words))
-    rows = [[name, unknown, count] for name, unknown, count in strange if unknown]
+    rows = [[name, unknown, count] for name, unknown, count in unknown_touches if unknown]
     listed = table(["material", "called unknown", "of"], rows, "touches called unknown")
     return side_by_side(figure(drawn, caption), f"<div>{note(words)}{listed if rows else ''}</div>")
 

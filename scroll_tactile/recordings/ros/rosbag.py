@@ -323,7 +323,7 @@ def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
         from PIL import Image
     except ImportError as error:
         raise missing("Pillow", "gelsight", "a topic of compressed pictures", cause=error) from error
-    # Of what sensors send; other formats start other programs, or are decoded by what was not made for strangers.
+    # What sensors send: decoders of other formats start programs, or were not made for files from elsewhere.
     with Image.open(BytesIO(data), formats=("JPEG", "PNG")) as picture:
         if picture.width * picture.height > _PIXELS:
             raise RecordingError(f"a picture of {picture.width} × {picture.height} pixels; expected at most {_PIXELS}")

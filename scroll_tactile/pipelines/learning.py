@@ -54,7 +54,7 @@ def learn_sources(
     *,
     every: bool = False,
 ) -> Learned:
-    """Observe the touches in sources, each once: a pass that was cut short is gone on with by the same call.
+    """Observe the touches in sources, each once: a pass that was cut short is continued by the same call.
 
     At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
     has under another name is refused. every: learn also what came before, under any name: whoever merges it decides.

@@ -48,7 +48,7 @@ def timeline(rows: Sequence[tuple[str, Sequence[float], Sequence[float]]], begin
         top = ROW * i + 2
         drawing.text(LEFT - 6, top + 11, clipped_name(name), anchor="end", title=name)
         drawing.line([(LEFT, top + ROW / 2), (RIGHT, top + ROW / 2)], "grid")
-        for times, kind in ((kept, "tick"), (retracted, "tick gone")):
+        for times, kind in ((kept, "tick"), (retracted, "tick retracted")):
             places = sorted({round(axis(time) * COLUMNS / WIDTH) * WIDTH / COLUMNS for time in times})
             drawing.ticks(places, top + 2, ROW - 4, kind)
     of_day = begin > FIRST_DATE

@@ -186,8 +186,8 @@ def _over_time(facts: MemoryFacts) -> str:
         return facts.lacks("Touches over time", why)
     times = [row.time for row in facts.journal if math.isfinite(row.time)] or [0.0]
     begin, end = min(times), max(times)
-    gone = sum(row.state == "retracted" for row in facts.journal)
-    also = f" {gone} of them were retracted: dashed." if gone else ""
+    retracted = sum(row.state == "retracted" for row in facts.journal)
+    also = f" {retracted} of them were retracted: dashed." if retracted else ""
     if len(facts.counts) <= ROWS:
         rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
         for row in facts.journal:

@@ -34,7 +34,7 @@ ACKNOWLEDGED = 5  # touches, before the process is killed
 class Half:
     """The answers when half of the materials were learned.
 
-    right: share of right answers to touches of these, held out. unknown, tested: how many touches of the other half were
+    right: share of right answers to touches of these, held out. unknown, tested: how many touches of the others were
     called unknown, of how many. material, nearest, novelty, known: the answer to the first of those.
     """
 

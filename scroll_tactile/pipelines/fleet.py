@@ -37,7 +37,7 @@ from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.pipelines.addresses import expand, fetched
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.runfile import alone_in
-from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches, bounded_name
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches, said_of
 from scroll_tactile.pipelines.workers.engines import Engine, engine, require_workers
 from scroll_tactile.pipelines.workers.jobs import Made, Making, hush, learn_job
 from scroll_tactile.pipelines.workers.steps import NOTES, Step, Steps
@@ -321,7 +321,7 @@ class _Run:
         place = Path(source)
         try:
             with fetched(source, self._patience) as place:
-                refused = self._into.merge(place, self._merging, source=bounded_name(source))
+                refused = self._into.merge(place, self._merging, source=said_of(source))
         except (InputError, MismatchError, StoreError, OSError) as error:
             if isinstance(error, StoreError) and not _is_of(error, place):
                 raise

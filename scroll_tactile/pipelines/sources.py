@@ -32,7 +32,7 @@ __all__ = [
     "contact_spans",
     "find_sources",
     "has_touches",
-    "bounded_name",
+    "said_of",
     "source_touches",
 ]
 
@@ -214,10 +214,10 @@ def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:
     whole = (touch.begin, touch.end) == (0, len(recording))
     where = recording.source + ("" if whole else f"[{touch.begin}:{touch.end}]")
     within = [recording.topic, recording.field] if recording.topic is not None else [options.field]
-    return bounded_name(" ".join([where, *(part for part in (*within, options.columns) if part)]))
+    return said_of(" ".join([where, *(part for part in (*within, options.columns) if part)]))
 
 
-def bounded_name(source: str) -> str:
+def said_of(source: str) -> str:
     """What a memory keeps of a source's name: printable, and bounded."""
     text = printable(source)
     return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"

@@ -14,7 +14,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.report.judging import ROWS, alike, growing_answers, mixed_up, trusted
+from scroll_tactile.report.judgement import ROWS, alike, growing_answers, mixed_up, trusted
 from scroll_tactile.report.page import Card, State, cards, figure, page, table
 from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
 
@@ -132,14 +132,14 @@ def _trusts(facts: MemoryFacts) -> Card:
 
 
 def _soon(facts: MemoryFacts) -> Card:
-    said, heading = facts.soon, "It decides"
-    if said is None:
+    measured, heading = facts.soon, "It decides"
+    if measured is None:
         return "none", heading, "not known", "Too few touches are kept to measure it."
-    wrong = said.wrong[-1] / said.decided[-1] if said.decided[-1] else 0.0
-    more = f"{said.decided[-1]:.0%} are decided within {said.seconds[-1]:.3g} s, {wrong:.0%} of these wrongly."
-    if said.median is None:
+    wrong = measured.wrong[-1] / measured.decided[-1] if measured.decided[-1] else 0.0
+    more = f"{measured.decided[-1]:.0%} are decided within {measured.seconds[-1]:.3g} s, {wrong:.0%} of these wrongly."
+    if measured.median is None:
         return "look", heading, "not before the end", more
-    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {said.median:.2g} s", more
+    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {measured.median:.2g} s", more
 
 
 def _state(right: float) -> State:

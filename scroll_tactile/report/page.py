@@ -61,7 +61,8 @@ figure{margin:.8rem 0;max-width:34rem;break-inside:avoid}figcaption{font-size:.8
 svg text{font-size:11px;fill:var(--ink);unicode-bidi:isolate}svg .small{font-size:10px;fill:var(--soft)}
 svg .tiny{font-size:8.5px;fill:var(--soft)}svg .strong{fill:var(--card);font-weight:600}
 svg path{fill:none;stroke-width:1.4}.grid{stroke:var(--line)}svg .grid{stroke-width:.7}.tick{stroke:var(--blue)}
-.retracted{stroke:var(--red);stroke-dasharray:2 2}.branch{stroke:var(--blue)}.fill{fill:var(--blue)}.wrong{fill:var(--red)}
+.retracted{stroke:var(--red);stroke-dasharray:2 2}.branch{stroke:var(--blue)}
+.fill{fill:var(--blue)}.wrong{fill:var(--red)}
 .none{fill:var(--band)}.point{fill:var(--blue)}.whisker{stroke:var(--blue)}
 .ideal{stroke:var(--soft);stroke-dasharray:4 3}.own{stroke:var(--blue)}svg .own{stroke-width:2.2}
 .rival{stroke:var(--red);stroke-dasharray:6 3}.other{stroke:var(--soft);stroke-opacity:.5}

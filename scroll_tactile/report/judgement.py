@@ -138,15 +138,15 @@ def growing_answers(facts: MemoryFacts) -> str:
 
 
 def _soon(facts: MemoryFacts) -> str:
-    said = facts.soon
-    if said is None:
+    measured = facts.soon
+    if measured is None:
         return facts.lacks("How soon answers come", "too few touches are kept to measure it.")
-    lines = {"right": said.right, "decided": said.decided, "decided and wrong": said.wrong}
+    lines = {"right": measured.right, "decided": measured.decided, "decided and wrong": measured.wrong}
     caption = (
-        f"Of {said.count} touches left out, after each time: the share whose likeliest material is the true one, the "
+        f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, the "
         "share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
     )
-    return figure(over_time(said.seconds, lines), caption)
+    return figure(over_time(measured.seconds, lines), caption)
 
 
 def _grown(touch: Growing) -> str:

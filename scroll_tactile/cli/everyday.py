@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -111,7 +112,7 @@ def predict(
     Of many the exit code is 1 where some were refused.
     """
     from scroll_tactile.pipelines.learning import answers
-    from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources
+    from scroll_tactile.pipelines.sources import SourceOptions, find_sources
 
     candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
     found, refused = find_sources(sources)
@@ -125,20 +126,29 @@ def predict(
                 _show_answer(several[0], as_json)
                 return
             refused, answered = [], iter(several)
-        if as_csv:
-            say_csv(*ANSWER)
-        for each in answered:
-            if isinstance(each, Refused):
-                refused.append(each)
-            elif as_csv:
-                say_csv(*answer_row(each))
-            elif as_json:
-                say_json({"source": each.touch.source} | _answer(each.prediction))
-            else:
-                say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+        refused += _show_answers(answered, as_json, as_csv)
     say_refused(refused)
     if refused:
         raise typer.Exit(1)
+
+
+def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv: bool) -> list[Refused]:
+    """Print a line for each answer, as it comes; returns what was refused."""
+    from scroll_tactile.pipelines.sources import Refused
+
+    refused = []
+    if as_csv:
+        say_csv(*ANSWER)
+    for each in answered:
+        if isinstance(each, Refused):
+            refused.append(each)
+        elif as_csv:
+            say_csv(*answer_row(each))
+        elif as_json:
+            say_json({"source": each.touch.source} | _answer(each.prediction))
+        else:
+            say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+    return refused
 
 
 def _show_answer(found: Answered | Refused, as_json: bool) -> None:

@@ -50,10 +50,6 @@ def check_in_process(
     folder = store_folder(path)
     with reported(folder, "measuring the memory"):
         seconds = SPARE_SECONDS + tree_size(folder) / BYTES_A_SECOND
-    # Not from the working directory: it may be the folder that came from elsewhere.
-    imports = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path if entry)
-    environment = os.environ | {"PYTHONPATH": imports, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-    command = [sys.executable, "-P", "-m", __name__, str(folder)]
     problems: list[Problem] = []
     doing, ended, expired = "begun", False, Event()
 
@@ -61,9 +57,7 @@ def check_in_process(
         expired.set()
         process.kill()
 
-    with subprocess.Popen(
-        command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
+    with _begun(folder) as process:
         timer = Timer(seconds, end)
         timer.start()
         try:
@@ -88,6 +82,16 @@ def check_in_process(
         what = f"the check itself {how}, when it had {doing} of {folder}: what it was reading is not as it was written"
         problems.append(Problem(folder, what, "lost"))
     return problems
+
+
+def _begun(folder: Path) -> subprocess.Popen[str]:
+    """The process that checks a folder, and prints what it finds."""
+    # Not from the working directory: it may be the folder that came from elsewhere.
+    imports = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path if entry)
+    environment = os.environ | {"PYTHONPATH": imports, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    nowhere = subprocess.DEVNULL
+    command = [sys.executable, "-P", "-m", __name__, str(folder)]
+    return subprocess.Popen(command, env=environment, stdin=nowhere, stdout=subprocess.PIPE, stderr=nowhere, text=True)
 
 
 def _reports(process: subprocess.Popen[str]) -> Iterator[tuple[str, Any]]:

@@ -143,8 +143,8 @@ def _soon(facts: MemoryFacts) -> str:
         return facts.lacks("How soon answers come", "too few touches are kept to measure it.")
     lines = {"right": measured.right, "decided": measured.decided, "decided and wrong": measured.wrong}
     caption = (
-        f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, the "
-        "share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
+        f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, "
+        "the share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
     )
     return figure(over_time(measured.seconds, lines), caption)
 

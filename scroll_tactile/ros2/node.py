@@ -78,17 +78,9 @@ class TactileNode:
         self._diagnostics = _Diagnostics(node)
         if not node.has_parameter("material"):
             node.declare_parameter("material", "")
-        bridge = self.bridge
-        calls: dict[str, Callable[[], str]] = {
-            "learn": lambda: bridge.learn(self._material()),
-            "forget": lambda: bridge.forget(self._material()),
-            "begin": bridge.begin,
-            "end": bridge.end,
-            "again": bridge.again,
-        }
-        for name, call in calls.items():
+        for name, call in self._calls().items():
             node.create_service(trigger, f"~/{name}", _service(call))
-        self._heard = self._said = time.monotonic()
+        self._received = self._reported = time.monotonic()
         self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
         self.subscription: Any = None
         if message is not None:
@@ -97,9 +89,20 @@ class TactileNode:
             self._looking = node.create_timer(LOOKED, self._look)
         node.create_timer(1.0, self._each_second)
 
+    def _calls(self) -> dict[str, Callable[[], str]]:
+        """What each service calls."""
+        bridge = self.bridge
+        return {
+            "learn": lambda: bridge.learn(self._material()),
+            "forget": lambda: bridge.forget(self._material()),
+            "begin": bridge.begin,
+            "end": bridge.end,
+            "again": bridge.again,
+        }
+
     def receive(self, message: Any, about: Mapping[str, Any]) -> None:
         """Take a message; about: what ROS says of it."""
-        self._heard = time.monotonic()
+        self._received = time.monotonic()
         published = about.get("source_timestamp") or about.get("received_timestamp") or time.time_ns()
         self._count(about)
         try:
@@ -162,9 +165,9 @@ class TactileNode:
 
     def _each_second(self) -> None:
         now = time.monotonic()
-        silent = now - self._heard
-        if silent > MISSED and now - self._said > MISSED:
-            self._said = now
+        silent = now - self._received
+        if silent > MISSED and now - self._reported > MISSED:
+            self._reported = now
             self._log.warning(self._absent(silent))
         self._diagnostics.publish(self.bridge, silent > SILENT)
 

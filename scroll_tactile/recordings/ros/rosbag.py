@@ -224,6 +224,24 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         for file in there:
             require_inside(path, file)
         return there, False
+    about = _listing(path, listed)
+    names = [str(name) for name in about["relative_file_paths"]]
+    if any("\\" in name or Path(name).name in ("", "..") for name in names):
+        raise RecordingError(f"{listed} lists what are no names of files: {names!r:.200}")
+    files = [path / Path(name).name for name in names]
+    absent = [file.name for file in files if not file.exists()]
+    if absent:
+        raise RecordingError(
+            f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
+            f"{', '.join(p.name for p in there) or 'none'}, one by one"
+        )
+    for file in files:
+        require_inside(path, file)
+    return files, str(about.get("compression_mode", "")).lower() == "message"
+
+
+def _listing(path: Path, listed: Path) -> Any:
+    """The part of a metadata.yaml that lists files; raises RecordingError where reading it would take for ever."""
     try:
         from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
         from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
@@ -243,20 +261,7 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         if depth > _DEEPEST:  # each level makes all that follows slower
             raise RecordingError(f"{listed} has more than {_DEEPEST} lists within each other")
     about = YAML(typ="safe").load(lists)
-    about = about if len(parts) == 2 else about["rosbag2_bagfile_information"]
-    names = [str(name) for name in about["relative_file_paths"]]
-    if any("\\" in name or Path(name).name in ("", "..") for name in names):
-        raise RecordingError(f"{listed} lists what are no names of files: {names!r:.200}")
-    files = [path / Path(name).name for name in names]
-    absent = [file.name for file in files if not file.exists()]
-    if absent:
-        raise RecordingError(
-            f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
-            f"{', '.join(p.name for p in there) or 'none'}, one by one"
-        )
-    for file in files:
-        require_inside(path, file)
-    return files, str(about.get("compression_mode", "")).lower() == "message"
+    return about if len(parts) == 2 else about["rosbag2_bagfile_information"]
 
 
 def _natural(name: str) -> list[Any]:

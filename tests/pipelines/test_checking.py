@@ -71,7 +71,8 @@ def test_a_check_that_dies_is_damage(path, tmp_path, monkeypatch, death):
         "store.survey.Survey.problems = problems\n"
     )
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    monkeypatch.setattr(checking, "SPARE_SECONDS", 10.0)
+    if death == "a hang":  # the others end by themselves, however long a busy machine takes to start them
+        monkeypatch.setattr(checking, "SPARE_SECONDS", 10.0)
     (problem,) = check_in_process(path)
     assert problem.kind == "lost"
     assert re.search(said, problem.what)

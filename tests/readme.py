@@ -30,7 +30,7 @@ def run_session() -> int:
 
 def set_up_lines() -> list[str]:
     """The lines that set up and run something at once: the demo, and the tests."""
-    return [line.strip() for line in TEXT.splitlines() if line.startswith("    python3 -m venv ")]
+    return [line.strip() for line in TEXT.splitlines() if line.startswith("    python3 .ci/check_python.py ")]
 
 
 def command_lines() -> list[list[str]]:

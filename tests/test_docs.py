@@ -34,6 +34,20 @@ def test_the_lines_that_set_up_are_those_that_ci_runs():
     assert demo.endswith("scroll-tactile demo") and demo.replace(".venv", ".venv-plain") in script
 
 
+@pytest.mark.parametrize("line", set_up_lines())
+def test_an_old_python_is_refused_in_one_sentence_before_anything_is_made(line, tmp_path):
+    old = tmp_path / "python3"
+    patched = (
+        "import runpy, sys; sys.version, sys.version_info = '3.10.13 (main)', (3, 10, 13); runpy.run_path(sys.argv[1])"
+    )
+    old.write_text(f'#!/bin/sh\ncase "$1" in -*) echo made; exit;; esac\nexec {sys.executable} -c "{patched}" "$1"\n')
+    old.chmod(0o755)
+    path = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    done = subprocess.run(["sh", "-c", line], cwd=ROOT, env=path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and not done.stdout
+    assert done.stderr.count("\n") == 1 and "needs Python 3.11 or newer, and python3 is 3.10.13" in done.stderr
+
+
 @BUCKETS
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 def test_every_command_line_runs_as_it_stands(tmp_path, monkeypatch):

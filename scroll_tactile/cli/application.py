@@ -7,14 +7,11 @@ from typing import Annotated
 import typer
 
 from scroll_tactile import __version__
-from scroll_tactile.cli.bulk import evaluate, learn
-from scroll_tactile.cli.demonstration import demo
-from scroll_tactile.cli.everyday import inspect, observe, predict
-from scroll_tactile.cli.fleet import fleet
-from scroll_tactile.cli.makeup import compose, describe
+from scroll_tactile.cli.bulk import evaluate, fleet, learn
+from scroll_tactile.cli.everyday import compose, describe, inspect, observe, predict
 from scroll_tactile.cli.replay import live
-from scroll_tactile.cli.reporting import report
 from scroll_tactile.cli.robot import PASSED_ON, ros2
+from scroll_tactile.cli.showing import demo, report
 from scroll_tactile.cli.terminal import Commands
 from scroll_tactile.cli.upkeep import memory
 
@@ -30,8 +27,8 @@ app = typer.Typer(
 )
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"scroll-tactile {__version__}")
         raise typer.Exit
 

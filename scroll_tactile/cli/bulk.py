@@ -1,27 +1,31 @@
-"""`scroll-tactile learn` and `evaluate`: the touches of many files and folders in one process."""
+"""`scroll-tactile learn`, `fleet` and `evaluate`: the touches of many files and folders."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
-from enum import StrEnum
-from pathlib import Path
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
-from scroll_tactile.cli.everyday import (
-    ANSWER,
+from scroll_tactile.cli.everyday import ANSWER, answer_row
+from scroll_tactile.cli.options import (
+    AsJson,
     Clock,
     Columns,
+    CutBy,
     Field,
+    Label,
+    LabelBy,
+    Labels,
+    LabelTopic,
     MemoryFolder,
     Preset,
     Sources,
     Topic,
-    answer_row,
     sensor_for,
+    source_options,
 )
 from scroll_tactile.cli.terminal import (
     confusion_text,
@@ -36,57 +40,18 @@ from scroll_tactile.cli.terminal import (
     verdict,
 )
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
+    from scroll_tactile.pipelines.fleet import FleetReport
     from scroll_tactile.pipelines.learning import Evaluation, Learned
-    from scroll_tactile.pipelines.sources import Refused, SourceOptions
+    from scroll_tactile.pipelines.sources import Refused
 
-__all__ = [
-    "AsJson",
-    "CutBy",
-    "Label",
-    "LabelBy",
-    "LabelTopic",
-    "Labels",
-    "evaluate",
-    "learn",
-    "source_options",
-]
+__all__ = ["evaluate", "fleet", "learn"]
 
 MOST_SHOWN = 20  # mistakes; JSON and CSV have all
 MOST_NAMES = 40  # of a table of confusions
-
-
-class Place(StrEnum):
-    """What names a touch."""
-
-    FILE = "file"
-    FOLDER = "folder"
-    TOPIC = "topic"
-    TASK = "task"
-
-
-class Cut(StrEnum):
-    """How a recording is cut into touches."""
-
-    EPISODES = "episodes"
-    INTERVALS = "intervals"
-    NONE = "none"
-    CONTACT = "contact"
-
-
-Label = Annotated[str | None, typer.Option(help="What all of them are touches of.")]
-LabelBy = Annotated[Place | None, typer.Option(help="What names each touch.")]
-Labels = Annotated[
-    Path | None, typer.Option(help="A .csv of touches, with columns file, begin, end (in seconds) and material.")
-]
-LabelTopic = Annotated[
-    str | None, typer.Option(help="A topic with texts, or a column, that says what is touched from then on.")
-]
-CutBy = Annotated[
-    Cut | None, typer.Option(help="Where touches begin and end; without it by intervals or episodes if there are any.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+SECONDS = 20  # in which a scheduler answers
 
 
 def learn(
@@ -133,42 +98,6 @@ def learn(
         raise typer.Exit(1)
 
 
-def source_options(
-    found: Sequence[str],
-    preset: str | None,
-    topic: str | None,
-    field: str | None,
-    clock: str | None,
-    columns: str | None,
-    label: str | None,
-    label_by: Place | None,
-    labels: Path | None,
-    label_topic: str | None,
-    cut: Cut | None,
-) -> SourceOptions:
-    """How these recordings are cut and named, by the options of a command."""
-    from scroll_tactile.pipelines.sources import SourceOptions
-    from scroll_tactile.recordings import read_intervals
-
-    if labels is not None and label_topic is not None:
-        raise InputError("give intervals= or labels=: both say where touches begin")
-    intervals = None if labels is None else tuple(read_intervals(labels, found))
-    if intervals == ():
-        raise InputError(f"expected touches in {labels}, one row each; there are none")
-    return SourceOptions(
-        topic=topic,
-        field=field,
-        clock=clock,
-        columns=columns,
-        preset=preset,
-        labels=label_topic,
-        cut=None if cut is None else cut.value,
-        material=label,
-        by=None if label_by is None else label_by.value,
-        intervals=intervals,
-    )
-
-
 def _report_learned(done: Learned, held: int, as_json: bool) -> None:
     count = done.learned.total()
     if as_json:
@@ -189,6 +118,100 @@ def _report_learned(done: Learned, held: int, as_json: bool) -> None:
     if done.skipped:
         say(f"[bold]skipped:[/] {done.skipped} touches that it had already")
     say_refused(done.refused)
+
+
+def fleet(
+    destination: MemoryFolder,
+    sources: Sources,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as there are cores.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
+    ] = None,
+    add: Annotated[bool, typer.Option("--add", help="Add to a memory that was made in another way.")] = False,
+    patience: Annotated[
+        float | None, typer.Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
+    ] = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    columns: Columns = None,
+    label: Label = None,
+    label_by: LabelBy = None,
+    labels: Labels = None,
+    label_topic: LabelTopic = None,
+    cut: CutBy = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn recordings and memories, in folders, files and buckets, by many workers into one memory.
+
+    The memory is, to the byte, that of one process which observed each touch once. Interrupt it, type it again, and it
+    goes on. The exit code is 1 where something was refused.
+    """
+    from scroll_tactile.pipelines.fleet import learn
+
+    if workers is not None and scheduler is not None:
+        raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
+    options = source_options(sources, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    chosen = sensor_for(destination, sensor, preset)
+    with ExitStack() as stack:
+        client = None if scheduler is None else stack.enter_context(_connected(scheduler))
+        progress = stack.enter_context(progress_bar())
+        done = learn(
+            destination,
+            sources,
+            options,
+            sensor=chosen,
+            workers=workers,
+            client=client,
+            add=add,
+            patience=patience,
+            progress=progress,
+        )
+    _report_fleet(done, as_json)
+    if done.refused:
+        raise typer.Exit(1)
+
+
+def _connected(scheduler: str) -> Any:
+    with optional("dask[distributed]", "fleet", "--scheduler"):
+        import distributed
+    connect: Any = distributed.Client
+    try:
+        return connect(scheduler, timeout=SECONDS)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(f"no scheduler answers at {scheduler}: {type(error).__name__}: {error!s:.200}") from error
+
+
+def _report_fleet(done: FleetReport, as_json: bool) -> None:
+    if as_json:
+        say_json(
+            {
+                "sources": done.sources,
+                "observations": done.observations,
+                "repeated": done.repeated,
+                "refused": _refusals(done.refused),
+                "deaths": done.deaths,
+                "seconds": done.seconds,
+                "held": done.held,
+                "digest": done.digest,
+            }
+        )
+        return
+    rate = done.observations / done.seconds if done.seconds else 0.0
+    say(
+        f"[bold]learned:[/] {done.observations} touches from {done.sources} sources in {done.seconds:.1f} s, "
+        f"{rate:.0f} a second; {done.held} are in the memory now"
+    )
+    if done.repeated:
+        say(f"[bold]skipped:[/] {done.repeated} touches that came before")
+    if done.deaths:
+        say(f"[bold]begun again:[/] {done.deaths} jobs whose workers ended")
+    say_refused(done.refused)
+    say(f"[bold]digest:[/] {done.digest}")
 
 
 def evaluate(
@@ -241,19 +264,19 @@ def _refusals(refused: Sequence[Refused]) -> list[dict[str, str]]:
 
 
 def _figures(done: Evaluation) -> dict[str, Any]:
-    familiar, strange = done.familiar, done.strange
+    learned, never_learned = done.of_learned, done.of_others
     wrong = [
         dict(zip(ANSWER, answer_row(each), strict=True)) | {"material": each.touch.material} for each in done.wrong
     ]
     return {
-        "touches": len(familiar),
+        "touches": len(learned),
         "learned_before": done.seen,
-        "accuracy": done.answers.accuracy if familiar else None,
-        "called_unknown": sum(each.prediction.known is False for each in familiar),
+        "accuracy": done.answers.accuracy if learned else None,
+        "called_unknown": sum(each.prediction.known is False for each in learned),
         "calibration_error": done.calibration_error,
         "confusions": [list(confusion) for confusion in done.answers.confusions()],
-        "never_learned": len(strange),
-        "never_learned_called_unknown": sum(each.prediction.known is False for each in strange),
+        "never_learned": len(never_learned),
+        "never_learned_called_unknown": sum(each.prediction.known is False for each in never_learned),
         "wrong": wrong,
     }
 

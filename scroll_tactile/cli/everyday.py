@@ -1,13 +1,24 @@
-"""`scroll-tactile observe`, `predict` and `inspect`: a memory on disk, and streams in files."""
+"""`scroll-tactile observe`, `predict`, `inspect`, `describe` and `compose`: a memory on disk, and touches in files."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
+from scroll_tactile.cli.options import (
+    Clock,
+    Columns,
+    Field,
+    MemoryFolder,
+    Preset,
+    Sources,
+    StreamFile,
+    Topic,
+    sensor_for,
+)
 from scroll_tactile.cli.terminal import (
     console,
     opened,
@@ -20,41 +31,17 @@ from scroll_tactile.cli.terminal import (
     shown,
     verdict,
 )
-from scroll_tactile.errors import InputError, printable
+from scroll_tactile.errors import DescriptionError, InputError, printable
 from scroll_tactile.results import Prediction
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 
 if TYPE_CHECKING:
     from scroll_tactile.pipelines.learning import Answered
     from scroll_tactile.pipelines.sources import Refused
-    from scroll_tactile.sensors import Sensor
 
-__all__ = ["ANSWER", "answer_row", "inspect", "observe", "predict", "sensor_for"]
+__all__ = ["ANSWER", "answer_row", "compose", "describe", "inspect", "observe", "predict"]
 
-MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", show_default=False)]
-StreamFile = Annotated[
-    Path, typer.Argument(help="A recording of one touch, such as a .npy or .csv: a row a reading.", show_default=False)
-]
-
-Sources = Annotated[
-    list[str],
-    typer.Argument(
-        help="Recordings, or folders of them: .npy, .csv, .bag, .db3, .mcap, .h5, .zarr, LeRobot data sets, "
-        "and addresses such as s3://…",
-        show_default=False,
-    ),
-]
-Topic = Annotated[str | None, typer.Option(help="The topic that has the readings, in a recording of several.")]
-Field = Annotated[str | None, typer.Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")]
-Clock = Annotated[str | None, typer.Option(help="device, header, publish or log; or a field, column or array.")]
-Columns = Annotated[str | None, typer.Option(help="Of wider arrays and tables, by places from 0: 25:44, or 0,3,5:9.")]
-Preset = Annotated[
-    str | None,
-    typer.Option(
-        help="A known sensor under its driver, in place of sensor, topic and field: biotac, biotac-sp, xela-uskin, "
-        "papillarray, anyskin, robotiq-tsf, digit, gelsight."
-    ),
-]
+WORDS = {"yes": True, "no": False, "unknown": None}
 
 ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
 
@@ -104,16 +91,6 @@ def observe(
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 
-def sensor_for(memory: Path, sensor: str | None, preset: str | None) -> Sensor | None:
-    """The sensor that was asked for; for a new memory also that of a preset."""
-    from scroll_tactile.recordings import presets
-    from scroll_tactile.sensors import read_sensor
-
-    if sensor is None and preset is not None and not memory.exists():
-        return presets.find(preset).sensor
-    return None if sensor is None else read_sensor(sensor)
-
-
 def predict(
     memory: MemoryFolder,
     sources: Sources,
@@ -135,7 +112,7 @@ def predict(
     Of many the exit code is 1 where some were refused.
     """
     from scroll_tactile.pipelines.learning import answers
-    from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources
+    from scroll_tactile.pipelines.sources import SourceOptions, find_sources
 
     candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
     found, refused = find_sources(sources)
@@ -149,20 +126,29 @@ def predict(
                 _show_answer(several[0], as_json)
                 return
             refused, answered = [], iter(several)
-        if as_csv:
-            say_csv(*ANSWER)
-        for each in answered:
-            if isinstance(each, Refused):
-                refused.append(each)
-            elif as_csv:
-                say_csv(*answer_row(each))
-            elif as_json:
-                say_json({"source": each.touch.source} | _answer(each.prediction))
-            else:
-                say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+        refused += _show_answers(answered, as_json, as_csv)
     say_refused(refused)
     if refused:
         raise typer.Exit(1)
+
+
+def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv: bool) -> list[Refused]:
+    """Print a line for each answer, as it comes; returns what was refused."""
+    from scroll_tactile.pipelines.sources import Refused
+
+    refused = []
+    if as_csv:
+        say_csv(*ANSWER)
+    for each in answered:
+        if isinstance(each, Refused):
+            refused.append(each)
+        elif as_csv:
+            say_csv(*answer_row(each))
+        elif as_json:
+            say_json({"source": each.touch.source} | _answer(each.prediction))
+        else:
+            say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+    return refused
 
 
 def _show_answer(found: Answered | Refused, as_json: bool) -> None:
@@ -225,3 +211,76 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
     )
     say(f"[bold]digest:[/] {digest}")
     say(f"[bold]on disk:[/] {size / 2**20:.1f} MB")
+
+
+def describe(
+    memory: MemoryFolder,
+    material: Annotated[str, typer.Argument(help="A material, observed or not yet.", show_default=False)],
+    constituents: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown. None: its "
+            "description is removed.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
+    named = [_constituent(text) for text in constituents or []]
+    shares = dict(named)
+    if len(shares) < len(named):
+        raise DescriptionError(f"expected each constituent once; came {', '.join(name for name, _ in named)}")
+    with opened(memory) as learner:
+        learner.describe(material, shares or None)
+        count = learner.materials.get(material, 0)
+    now = "its description is removed" if not shares else f"made of {', '.join(map(shown, shares))}"
+    say(f"{shown(material)}: {now}; observed {count} time{'s' * (count != 1)}")
+
+
+def _constituent(text: str) -> tuple[str, float | bool | None]:
+    name, sign, value = text.rpartition("=")
+    if value in WORDS and sign:
+        return name.strip(), WORDS[value]
+    try:
+        return name.strip(), float(value if sign else "")
+    except ValueError:
+        raise DescriptionError(
+            f"expected a constituent as NAME=SHARE, such as wool=0.65, or NAME=yes, no or unknown; came {text!r}"
+        ) from None
+
+
+def compose(
+    memory: MemoryFolder,
+    file: StreamFile,
+    columns: Columns = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
+    from scroll_tactile.recordings import read
+
+    recording = read(file, columns=columns)
+    with opened(memory, mode="read") as learner:
+        made_of = learner.compose(recording.stream(learner.sensor))
+    if as_json:
+        found = [
+            {
+                "constituent": constituent.name,
+                "presence": constituent.presence,
+                "share": constituent.share,
+                "evidence": constituent.evidence,
+                "unlearned": constituent.unlearned,
+            }
+            for constituent in made_of.constituents
+        ]
+        answer = {"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material}
+        say_json(answer)
+        return
+    table = Table("constituent", "there with", "share", "feels most like")
+    for constituent in made_of.constituents:
+        there = shown(constituent.unlearned) if constituent.presence is None else percent(constituent.presence)
+        share = "" if constituent.share is None else percent(constituent.share)
+        table.add_row(
+            shown(constituent.name), there, share, shown(constituent.evidence[0][0]) if constituent.evidence else ""
+        )
+    console().print(table)
+    say(f"a material never observed: {percent(made_of.unfamiliar)}")

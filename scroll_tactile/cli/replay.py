@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.everyday import Columns, MemoryFolder
+from scroll_tactile.cli.options import Columns, MemoryFolder
 from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
@@ -48,7 +48,7 @@ def live(
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
-    from scroll_tactile.recordings.columns import places
+    from scroll_tactile.recordings.recording import places
 
     screen = console()
     with opened(memory, mode="read") as learner:
@@ -135,8 +135,8 @@ def _judged(ended: LiveTouch) -> str:
 
 def _table(now: LiveState) -> Table:
     """The likeliest materials of a touch under way."""
-    said = "decided" if now.decided else "not yet decided"
-    table = Table(title=f"touched for {now.seconds:.2f} s, {said}")
+    state = "decided" if now.decided else "not yet decided"
+    table = Table(title=f"touched for {now.seconds:.2f} s, {state}")
     for heading in ("material", "probability", ""):
         table.add_column(heading)
     if now.prediction is not None:
@@ -161,10 +161,10 @@ def _summed_up(report: LiveReport, as_json: bool) -> None:
         f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
         f"{report.revised} revised"
     )
-    strange = [
+    irregular = [
         name
         for name in ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
         if counted.get(name)
     ]
-    if strange:
-        say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in strange))
+    if irregular:
+        say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in irregular))

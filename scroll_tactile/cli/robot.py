@@ -7,7 +7,7 @@ from typing import Annotated, Literal, cast
 
 import typer
 
-from scroll_tactile.cli.everyday import sensor_for
+from scroll_tactile.cli.options import sensor_for
 from scroll_tactile.cli.terminal import opened, say, shown
 from scroll_tactile.errors import InputError
 

@@ -68,8 +68,8 @@ def say_json(found: Mapping[str, Any]) -> None:
 def say_csv(*cells: object) -> None:
     """Print a line of CSV; what is None has an empty cell."""
     line = io.StringIO()
-    told = [plain_cell(cell) if isinstance(cell, str) else "" if cell is None else cell for cell in cells]
-    csv.writer(line, lineterminator="").writerow(told)
+    written = [plain_cell(cell) if isinstance(cell, str) else "" if cell is None else cell for cell in cells]
+    csv.writer(line, lineterminator="").writerow(written)
     typer.echo(line.getvalue())
 
 
@@ -105,14 +105,14 @@ class Commands(TyperGroup):
         return found
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was asked for."""
+        """Run the command that was typed."""
         try:
             with _warnings_as_lines():
                 return super().invoke(ctx)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
             if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
-                said = in_options(str(error)) or "no memory is left"
-                text = " ".join([*said.split(), *getattr(error, "__notes__", [])])
+                message = in_options(str(error)) or "no memory is left"
+                text = " ".join([*message.split(), *getattr(error, "__notes__", [])])
                 _warn(f"[bold red]Error:[/] [red]{shown(text)}[/]")
             raise typer.Exit(1) from error
         except KeyboardInterrupt:
@@ -138,7 +138,7 @@ def _warnings_as_lines() -> Iterator[None]:
 
 
 def _warn(text: str) -> None:
-    with suppress(OSError):  # there is nobody to tell
+    with suppress(OSError):  # nobody reads it
         Console(stderr=True, highlight=False, soft_wrap=True).print(text)
 
 
@@ -187,7 +187,7 @@ def verdict(prediction: Prediction) -> str:
     felt = f" ({', '.join((f'novelty {prediction.novelty:.1f}', *prediction.unusual))})"
     if prediction.known is False:
         return f"[bold yellow]never felt this[/]; nearest is {name}{felt}"
-    doubt = "" if prediction.known else ", if it was ever felt: too few touches to tell"
+    doubt = "" if prediction.known else ", if it was ever felt: too few touches to know"
     return f"[bold green]{name}[/] with {percent(prediction.probability)}{felt}{doubt}"
 
 

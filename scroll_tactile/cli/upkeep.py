@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from scroll_tactile.cli.everyday import MemoryFolder
+from scroll_tactile.cli.options import MemoryFolder
 from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say, say_json, shown
 from scroll_tactile.errors import ScrollTactileError
 from store import Store, StoreError, repair_store
@@ -53,10 +53,10 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 
     The exit code is 1 where something is damaged.
     """
-    from scroll_tactile.pipelines.checking import check_memory_apart
+    from scroll_tactile.pipelines.checking import check_in_process
 
     with progress_bar() as progress:
-        problems = check_memory_apart(folder, progress=progress)
+        problems = check_in_process(folder, progress=progress)
     damaged = [problem for problem in problems if problem.kind != "leftover"]
     if as_json:
         found = [{"path": str(problem.path), "what": problem.what, "kind": problem.kind} for problem in problems]
@@ -215,7 +215,7 @@ def pack(
         bool, typer.Option(help="With each touch's readings, so that it can be retracted where the file is merged.")
     ] = True,
     readings: Annotated[bool, typer.Option(help="With anything that shows a touch as it was read.")] = True,
-    source: Annotated[str | None, typer.Option(help="What is said of touches that say no source.")] = None,
+    source: Annotated[str | None, typer.Option(help="The source of touches that name none.")] = None,
 ) -> None:
     """Write a memory as one file that travels, and that merge takes."""
     with opened_for_upkeep(folder, mode="read") as learner:

@@ -19,7 +19,7 @@ from store.layout import CURRENT_FILE, holds_store
 __all__ = ["expand", "fetched", "is_memory"]
 
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
-PACKED = (".part",)  # what is looked for in a remote folder: usual names of packed memories
+PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ def is_memory(address: str, patience: float | None = None) -> bool:
     remote = is_remote(address)
     try:
         return _answered(partial(_is_remote_memory, address), patience) if remote else _is_local_memory(Path(address))
-    except Exception as error:  # each file system has errors of its own; reading it tells what is wrong
+    except Exception as error:  # each file system has errors of its own; reading it raises what is wrong
         if remote and isinstance(error, TimeoutError):
             raise
         return False

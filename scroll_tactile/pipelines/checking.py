@@ -22,7 +22,7 @@ from store import check_store as check_checksums
 from store.exceptions import reported
 from store.files import store_folder, tree_size
 
-__all__ = ["check_memory_apart"]
+__all__ = ["check_in_process"]
 
 # Address space beyond what the process has when it begins: arrays are stored compressed, some a hundredfold.
 SPARE_BYTES = 2**30
@@ -36,7 +36,7 @@ REFUSALS = {
 }
 
 
-def check_memory_apart(
+def check_in_process(
     path: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
 ) -> list[Problem]:
     """All that is wrong with the memory in folder `path`, as `store.check_store`; nothing for a sound one.
@@ -50,10 +50,6 @@ def check_memory_apart(
     folder = store_folder(path)
     with reported(folder, "measuring the memory"):
         seconds = SPARE_SECONDS + tree_size(folder) / BYTES_A_SECOND
-    # Not from the working directory: it may be the folder that came from elsewhere.
-    imports = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path if entry)
-    environment = os.environ | {"PYTHONPATH": imports, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-    command = [sys.executable, "-P", "-m", __name__, str(folder)]
     problems: list[Problem] = []
     doing, ended, expired = "begun", False, Event()
 
@@ -61,21 +57,19 @@ def check_memory_apart(
         expired.set()
         process.kill()
 
-    with subprocess.Popen(
-        command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
+    with _begun(folder) as process:
         timer = Timer(seconds, end)
         timer.start()
         try:
-            for kind, told in _told(process):
+            for kind, content in _reports(process):
                 if kind == "progress":
-                    doing = "verified {1} of {2} {0}".format(*told)
+                    doing = "verified {1} of {2} {0}".format(*content)
                     if progress is not None:
-                        progress(*told)
+                        progress(*content)
                 elif kind == "problem":
-                    problems.append(Problem(Path(told[0]), told[1], told[2]))
+                    problems.append(Problem(Path(content[0]), content[1], content[2]))
                 elif kind == "refused":
-                    raise REFUSALS.get(told[0], StoreError)(told[1])
+                    raise REFUSALS.get(content[0], StoreError)(content[1])
                 ended = kind == "end"
             process.wait()
         except BaseException:
@@ -90,11 +84,21 @@ def check_memory_apart(
     return problems
 
 
-def _told(process: subprocess.Popen[str]) -> Iterator[tuple[str, Any]]:
+def _begun(folder: Path) -> subprocess.Popen[str]:
+    """The process that checks a folder, and prints what it finds."""
+    # Not from the working directory: it may be the folder that came from elsewhere.
+    imports = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path if entry)
+    environment = os.environ | {"PYTHONPATH": imports, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    nowhere = subprocess.DEVNULL
+    command = [sys.executable, "-P", "-m", __name__, str(folder)]
+    return subprocess.Popen(command, env=environment, stdin=nowhere, stdout=subprocess.PIPE, stderr=nowhere, text=True)
+
+
+def _reports(process: subprocess.Popen[str]) -> Iterator[tuple[str, Any]]:
     for line in process.stdout or ():
         with suppress(ValueError):  # the last line of a process that died may be a half of one
-            kind, told = json.loads(line)
-            yield kind, told
+            kind, content = json.loads(line)
+            yield kind, content
 
 
 def _death(code: int) -> str:
@@ -105,8 +109,8 @@ def _death(code: int) -> str:
     return f"died by signal {-code}"
 
 
-def _tell(kind: str, told: object) -> None:
-    print(json.dumps([kind, told]), flush=True)
+def _report(kind: str, content: object) -> None:
+    print(json.dumps([kind, content]), flush=True)
 
 
 def _limit(folder: Path) -> None:
@@ -128,22 +132,22 @@ def _check(folder: Path) -> None:
 
     _limit(folder)
     try:
-        problems = check_checksums(folder, progress=lambda *step: _tell("progress", step))
+        problems = check_checksums(folder, progress=lambda *step: _report("progress", step))
         for problem in problems:
-            _tell("problem", (str(problem.path), problem.what, problem.kind))
+            _report("problem", (str(problem.path), problem.what, problem.kind))
         # Of rows that are not as they were written there is nothing more to say.
         if all(problem.kind == "leftover" for problem in problems):
             for what in check_memory(folder):
-                _tell("problem", (str(folder), what, "lost"))
+                _report("problem", (str(folder), what, "lost"))
     except StoreError as error:
-        _tell("refused", (type(error).__name__, str(error)))
+        _report("refused", (type(error).__name__, str(error)))
     except MemoryError:
         what = f"to check {folder} takes more memory than its size explains: it is not as it was written"
-        _tell("problem", (str(folder), what, "lost"))
+        _report("problem", (str(folder), what, "lost"))
     except Exception as error:
         what = f"the check itself failed in {folder} ({type(error).__name__}: {error})"
-        _tell("problem", (str(folder), what, "lost"))
-    _tell("end", None)
+        _report("problem", (str(folder), what, "lost"))
+    _report("end", None)
 
 
 if __name__ == "__main__":

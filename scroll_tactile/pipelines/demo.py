@@ -1,8 +1,17 @@
-"""The demonstration: simulated materials, unknown first and then learned. Nothing in it is a result."""
+"""The demonstration: simulated materials, unknown first and then learned. Nothing in it is a result.
+
+At its end a process that learns is killed, and its memory opened again. That process is this module, as `python -m
+scroll_tactile.pipelines.demo MEMORY SENSOR SEED`: it prints the number of each touch once durable, and never ends.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,22 +21,26 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import Stream
 from scroll_tactile.simulation.scene import Scene
 
-__all__ = ["Demo", "Half", "Outcome"]
+__all__ = ["Demo", "Half", "Outcome", "Unplugged", "pull_the_plug"]
+
+FEATURES = 64
+ACKNOWLEDGED = 5  # touches, before the process is killed
 
 
 @dataclass(frozen=True)
 class Half:
-    """What was said when half of the materials were learned.
+    """The answers when half of the materials were learned.
 
-    right: share of right answers to touches of these, held out. unknown, asked: how many touches of the other half were
+    right: share of right answers to touches of these, held out. unknown, tested: how many touches of the others were
     called unknown, of how many. material, nearest, novelty, known: the answer to the first of those.
     """
 
     right: float
     unknown: int
-    asked: int
+    tested: int
     material: str
     nearest: str
     novelty: float
@@ -38,7 +51,7 @@ class Half:
 class Outcome:
     """How a demonstration ended.
 
-    half: what was said half-way. answers: to the held-out touches of all materials. first: of which as many are of the
+    half: the answers half-way. answers: to the held-out touches of all materials. first: of which as many are of the
     first half. short: answers to 0.3 s of one touch of each. observed: how many touches this run observed; a resumed
     one fewer. digest: of the memory.
     """
@@ -120,11 +133,11 @@ class Demo:
 
     def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
         right = evaluate(learner, self._held_out(learned)).accuracy
-        asked = evaluate(learner, self._held_out(others))
-        unknown = sum(answer.known is False for answer in asked.predictions)
-        first = asked.predictions[0]
+        answers = evaluate(learner, self._held_out(others))
+        unknown = sum(answer.known is False for answer in answers.predictions)
+        first = answers.predictions[0]
         nearest = str(first.material)
-        return Half(right, unknown, len(asked.truth), asked.truth[0], nearest, first.novelty, first.known)
+        return Half(right, unknown, len(answers.truth), answers.truth[0], nearest, first.novelty, first.known)
 
     def _held_out(self, names: Sequence[str]) -> list[Labelled]:
         return [touch for name in names for touch in self._touches(name, self.touches, self.held_out)]
@@ -134,3 +147,55 @@ class Demo:
 
     def _extra(self, name: str) -> Any:
         return self.scene.touch(name, self.touches + self.held_out)
+
+
+@dataclass(frozen=True)
+class Unplugged:
+    """What became of a memory whose process was killed.
+
+    acknowledged: how many touches the process had reported as learned. found: how many the memory has. same: whether it
+    is, to the bit, the memory of as many touches that nothing interrupted.
+    """
+
+    acknowledged: int
+    found: int
+    same: bool
+
+
+def pull_the_plug(sensor: Sensor, seed: int) -> Unplugged:
+    """Kill a process of its own while it learns, and open what it leaves behind."""
+    with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
+        place = Path(folder) / "memory"
+        words = [sys.executable, "-m", __name__, str(place), sensor.model_dump_json(), str(seed)]
+        acknowledged = 0
+        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+            try:
+                assert process.stdout is not None
+                for _ in itertools.islice(process.stdout, ACKNOWLEDGED):
+                    acknowledged += 1
+            finally:
+                process.kill()
+        with TactileLearner.open(place, mode="read") as left:
+            found, digest = sum(left.materials.values()), left.digest()
+    with TactileLearner(sensor=sensor, embedding=Kernels(dimension=FEATURES)) as undisturbed:
+        for name, stream in itertools.islice(_touches(sensor, seed), found):
+            undisturbed.observe(name, stream)
+        return Unplugged(acknowledged, found, undisturbed.digest() == digest)
+
+
+def _touches(sensor: Sensor, seed: int) -> Iterator[tuple[str, Stream]]:
+    """A touch of each simulated material, round after round."""
+    scene = Scene(sensor, seed)
+    return ((name, scene.touch(name, i)) for i in itertools.count() for name in scene.materials)
+
+
+def _learn_until_killed(place: str, sensor: str, seed: str) -> None:
+    whose = Sensor.model_validate_json(sensor)
+    with TactileLearner.open(place, sensor=whose, embedding=Kernels(dimension=FEATURES)) as learner:
+        for name, stream in _touches(whose, int(seed)):
+            print(learner.observe(name, stream).sequence, flush=True)
+
+
+if __name__ == "__main__":
+    with suppress(KeyboardInterrupt):
+        _learn_until_killed(*sys.argv[1:])

@@ -35,12 +35,12 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.rows import SOURCE
 from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.pipelines.addresses import expand, fetched
-from scroll_tactile.pipelines.engines import Engine, engine, require_workers
-from scroll_tactile.pipelines.jobs import Made, Making, hush, learn_job
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.runfile import alone_in
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches, said_of
-from scroll_tactile.pipelines.steps import NOTES, Step, Steps
+from scroll_tactile.pipelines.workers.engines import Engine, engine, require_workers
+from scroll_tactile.pipelines.workers.jobs import Made, Making, hush, learn_job
+from scroll_tactile.pipelines.workers.steps import NOTES, Step, Steps
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from store import DamageError, Head, NotAStoreError, StoreError, StoreFullError, VersionError

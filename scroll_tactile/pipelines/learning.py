@@ -54,7 +54,7 @@ def learn_sources(
     *,
     every: bool = False,
 ) -> Learned:
-    """Observe the touches in sources, each once: a pass that was cut short is gone on with by the same call.
+    """Observe the touches in sources, each once: a pass that was cut short is continued by the same call.
 
     At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
     has under another name is refused. every: learn also what came before, under any name: whoever merges it decides.
@@ -159,7 +159,7 @@ class Evaluation:
     """Answers to touches whose material is known.
 
     answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory.
-    seen: touches that the memory had learned, under any name; left out, or answered where that was asked for.
+    seen: touches that the memory had learned, under any name; left out, or answered with `with_learned`.
     """
 
     answered: tuple[Answered, ...]
@@ -168,34 +168,34 @@ class Evaluation:
     seen: int = 0
 
     @property
-    def familiar(self) -> list[Answered]:
+    def of_learned(self) -> list[Answered]:
         """Touches of materials that the memory has: accuracy, confusions and calibration are theirs."""
         return [each for each in self.answered if each.touch.material in self.learned]
 
     @property
-    def strange(self) -> list[Answered]:
+    def of_others(self) -> list[Answered]:
         """Touches of materials that it never learned, which it should call unknown."""
         return [each for each in self.answered if each.touch.material not in self.learned]
 
     @property
     def answers(self) -> Answers:
-        """Of the familiar ones."""
+        """Those to touches of materials that the memory has."""
         return Answers(
-            [str(each.touch.material) for each in self.familiar], [each.prediction for each in self.familiar]
+            [str(each.touch.material) for each in self.of_learned], [each.prediction for each in self.of_learned]
         )
 
     @property
     def wrong(self) -> list[Answered]:
-        """Touches taken for another material: the familiar ones, and strange ones that it called known."""
+        """Touches taken for another material: of materials that the memory has, and of others that it called known."""
         mistaken = (each for each in self.answered if each.prediction.material != each.touch.material)
         return [each for each in mistaken if each.touch.material in self.learned or each.prediction.known is not False]
 
     @property
     def calibration_error(self) -> float | None:
-        """Expected calibration error of the familiar ones, see `metrics`; None without any."""
-        familiar, truth = self.familiar, self.answers
+        """Expected calibration error of touches of materials that the memory has, see `metrics`; None without any."""
+        learned, truth = self.of_learned, self.answers
         right = [name == predicted for name, predicted in zip(truth.truth, truth.predicted, strict=True)]
-        return calibration_error([each.prediction.probability for each in familiar], right) if familiar else None
+        return calibration_error([each.prediction.probability for each in learned], right) if learned else None
 
 
 def evaluate_sources(
@@ -206,9 +206,9 @@ def evaluate_sources(
     *,
     with_learned: bool = False,
 ) -> Evaluation:
-    """Answer every touch in sources with what the memory knows, settled, and keep what it should have said.
+    """Answer every touch in sources with what the memory knows, settled, and keep the right answers.
 
-    with_learned: also those that the memory learned, of which it says what it was told.
+    with_learned: also those that the memory learned, of which it knows the answer.
     """
     learner.settle()
     answered: list[Answered] = []

@@ -124,7 +124,7 @@ def _locked(folder: Path, destination: Path) -> int | None:
     """The folder, made and locked; None where that cannot be. Raises LockedError."""
     descriptor = None
     for _ in range(TRIES):
-        with suppress(OSError):  # what is wrong with it is said where notes are written
+        with suppress(OSError):  # what is wrong with it is raised where notes are written
             folder.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(folder, os.O_RDONLY)
         if descriptor is None or flock is None:

@@ -18,8 +18,8 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import ContactDetector
 from scroll_tactile.live.pressing import FOLLOWED, PressDetector
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
-from scroll_tactile.recordings.columns import require_columns
 from scroll_tactile.recordings.locations import is_remote
+from scroll_tactile.recordings.recording import require_columns
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 from scroll_tactile.signals.stream import Stream, fewest_readings

@@ -25,7 +25,7 @@ _BYTES = 1 << 24  # … unless they would hold more than this
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a file; see `read`."""
+    """What is requested of a file; see `read`."""
 
     topic: str | None = None
     field: str | None = None
@@ -99,11 +99,11 @@ class Contents:
 class Source(ABC):
     """A file that was opened for reading; `notes`, `names` and `marks` fill up as blocks are read.
 
-    path, address: where it is on this machine, and as it was asked for. request: what is asked of it.
+    path, address: where it is on this machine, and as it was given. request: what is requested of it.
     topic: the topic that is read; None where the format has none.
     notes: what went wrong without losing everything, as sentences. cut_off: whether the file ends before its end.
     names: what each episode is called, by its number.
-    marks: what a topic of labels said when: seconds by the clock "log", and a text.
+    marks: the texts of a topic of labels, each with its time in seconds by the clock "log".
     continuous: whether time goes on from one episode to the next, and does not begin anew.
     budget: what reading it may still cost.
     topics, labels: whether the format has topics, and something that labels.

@@ -14,7 +14,17 @@ from pathlib import Path
 
 from scroll_tactile.errors import RecordingError
 
-__all__ = ["LARGEST", "RATIO", "SPARE", "Budget", "read_text", "require_file", "require_inside", "stored_bytes"]
+__all__ = [
+    "LARGEST",
+    "RATIO",
+    "SPARE",
+    "Budget",
+    "on_disk",
+    "read_text",
+    "require_file",
+    "require_inside",
+    "stored_bytes",
+]
 
 SPARE, RATIO = 1 << 28, 256
 """Bytes that any recording may become in memory, and how many more for each byte on the disk."""
@@ -76,7 +86,11 @@ def stored_bytes(path: Path) -> int:
     """The bytes that a file has on the disk, holes left out; raises RecordingError for what is no file."""
     about = path.stat()
     _require_regular(about, path)
-    # Some file systems tell of no blocks.
+    return on_disk(about)
+
+
+def on_disk(about: os.stat_result) -> int:
+    """The bytes of a file without its holes; its length on a file system that counts no blocks."""
     return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 

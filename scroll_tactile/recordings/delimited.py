@@ -217,9 +217,9 @@ class Delimited(Source):
         return len(numbers) >= 3 or "" in (first[0].strip(),) or any("." in cell for cell in below)
 
     def _time_column(self) -> int | None:
-        asked = self.request.clock
-        if asked is not None:
-            return self._column(asked)
+        clock = self.request.clock
+        if clock is not None:
+            return self._column(clock)
         if not self.header and not self.comment:
             return None
         found = [i for i, name in enumerate(self.columns) if _TIME.fullmatch(name)]

@@ -3,6 +3,8 @@
 A path is names joined by dots. `[2]` takes an element, `[*]` all of them, `[4:23]` some; `{x,y,z}` takes several fields
 of one message, in this order. Values come out message by message: x, y, z of the first taxel, then of the second. Names
 are compared as written, then without regard to case, since ROS 2 writes in lower case what ROS 1 does not.
+
+A file of arrays has no messages: there a field is an array's name, or the end of it, with an index behind (`matched`).
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from __future__ import annotations
 import array
 import difflib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,7 +20,10 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError
 
-__all__ = ["FieldPath", "fields_of", "nearest", "select"]
+__all__ = ["CLOCK_KEYS", "FieldPath", "fields_of", "matched", "nearest", "select"]
+
+CLOCK_KEYS = ("timestamp", "timestamps", "time", "times")
+"""What an array of times is called, seconds."""
 
 _Collect = Callable[[Any, list[Any]], None]
 _Step = str | int | slice | list["list[_Step]"]
@@ -86,6 +91,25 @@ class FieldPath:
             )
         kind = "text" if isinstance(message, str | bytes | np.str_) else f"a {type(message).__name__}"
         raise FieldError(f"field {self.text!r} leads to {kind}, {str(value)!r:.40}; expected numbers")
+
+
+def matched(field: str, keys: Collection[str], source: str) -> tuple[str, str]:
+    """The key that a field names, and the index behind it.
+
+    Raises FieldError where no key is called so, naming the nearest, or the end of several is.
+    """
+    if field in keys:
+        return field, ""
+    written = re.fullmatch(r"\s*(.*?)\s*((?:\[[^\]]*\])?)\s*", field, re.DOTALL)
+    name, rest = written.groups() if written else (field, "")
+    if name in keys:
+        return name, rest
+    ends = [key for key in keys if re.split(r"[/.]", key)[-1] == name or key.endswith(f"/{name}")]
+    if len(ends) == 1:
+        return ends[0], rest
+    if ends:
+        raise FieldError(f"{source}: field {field!r} may be any of {', '.join(ends)}: name it in full")
+    raise FieldError(f"{source} has no field {field!r}{nearest(name, list(keys))}")
 
 
 def select(array: npt.NDArray[Any], rest: str, text: str) -> npt.NDArray[Any]:
@@ -251,7 +275,7 @@ def _actual(message: Any, name: str) -> str:
     if isinstance(message, _ARRAYS):
         raise FieldError(f"an array of {len(message)} stands before {name!r}: write [0] or [*] between them")
     if not names:
-        raise FieldError(f"{name!r} is asked of a {type(message).__name__}, which has no fields")
+        raise FieldError(f"{name!r} is wanted of a {type(message).__name__}, which has no fields")
     raise FieldError(f"the message has no {name!r}{nearest(name, names)}")
 
 
@@ -272,7 +296,7 @@ def _several(paths: list[_Collect], rest: _Collect) -> _Collect:
 def _element(step: int | slice, rest: _Collect) -> _Collect:
     def collect(message: Any, found: list[Any]) -> None:
         if not isinstance(message, _ARRAYS):
-            raise FieldError(f"{_shown(step)} is asked of a {type(message).__name__}, which is no array")
+            raise FieldError(f"{_shown(step)} is wanted of a {type(message).__name__}, which is no array")
         if isinstance(step, slice) and (rest is not _append or _messages(message)):
             for value in message[step]:
                 rest(value, found)
@@ -280,7 +304,7 @@ def _element(step: int | slice, rest: _Collect) -> _Collect:
         try:
             value = message[step]
         except IndexError:
-            raise FieldError(f"{_shown(step)} is asked of an array of {len(message)}") from None
+            raise FieldError(f"{_shown(step)} is wanted of an array of {len(message)}") from None
         rest(value, found)
 
     return collect

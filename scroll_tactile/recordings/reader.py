@@ -12,12 +12,11 @@ import numpy as np
 
 from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
+from scroll_tactile.recordings.assembly import assemble, choose
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.bounds import require_file
-from scroll_tactile.recordings.clocks import choose
-from scroll_tactile.recordings.columns import only_columns
 from scroll_tactile.recordings.locations import local
-from scroll_tactile.recordings.recording import Recording, assemble, resampled
+from scroll_tactile.recordings.recording import Recording, only_columns, resampled
 
 __all__ = ["describe", "find", "iterate", "read"]
 
@@ -140,7 +139,7 @@ def find(path: _Address) -> list[Path]:
 
 
 def _found(place: Path, depth: int) -> list[Path]:
-    from scroll_tactile.recordings import rosbag
+    from scroll_tactile.recordings.ros import rosbag
 
     bags_alone = place.is_dir() and not (place / "metadata.yaml").exists() and rosbag.is_rosbag(place)
     if _kind(place) is not None and not bags_alone:
@@ -181,7 +180,9 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
+    from scroll_tactile.recordings import delimited
+    from scroll_tactile.recordings.arrays import arraystores, lerobot, zarrfile
+    from scroll_tactile.recordings.ros import rosbag
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
@@ -245,11 +246,11 @@ def _recording(block: Block, source: Source, clock: str | None, columns: str | N
     return recording if columns is None else only_columns(recording, columns)
 
 
-def _clock(block: Block, asked: str | None) -> str | None:
-    # Arrays and columns call their clock by the name of what was asked for, or by their only one.
-    if asked is not None and asked not in block.clocks and len(block.clocks) == 1 and "log" not in block.clocks:
+def _clock(block: Block, requested: str | None) -> str | None:
+    # Arrays and columns call their clock by the name that was requested, or by their only one.
+    if requested is not None and requested not in block.clocks and len(block.clocks) == 1 and "log" not in block.clocks:
         return next(iter(block.clocks))
-    return choose(block.clocks, asked)
+    return choose(block.clocks, requested)
 
 
 def _require(recording: Recording, name: str | None) -> None:

@@ -1,24 +1,40 @@
-"""A recording: readings with their times, the episodes in them, and a report of what a file had."""
+"""A recording: readings with their times, the episodes in them, and a report; resampled, or of some columns alone."""
 
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import ChannelCountError, InputError
-from scroll_tactile.recordings.blocks import Block, Source
-from scroll_tactile.recordings.clocks import lost
+from scroll_tactile.errors import ChannelCountError, FieldError, InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
-__all__ = ["Episode", "Gap", "Recording", "Report", "assemble", "resampled"]
+__all__ = [
+    "Episode",
+    "Gap",
+    "Recording",
+    "Report",
+    "longest_step",
+    "only_columns",
+    "places",
+    "require_columns",
+    "resampled",
+]
 
 _GAP = 0.1  # seconds without a reading that make a gap …
 _STEPS = 5  # … and as many steps, for sensors that are slower than 50 Hz
+
+_PART = re.compile(r"(\d{1,9})|(\d{1,9})?:(\d{1,9})?", re.ASCII)
+
+
+def longest_step(step: float) -> float:
+    """Seconds between two readings from which on there is a gap, where the median step is `step` seconds."""
+    return max(_GAP, _STEPS * step)
 
 
 @dataclass(frozen=True)
@@ -50,7 +66,7 @@ class Report:
     None where nothing counts. repeated: readings with the count, or the time, of the one before.
     backward: how often time goes back inside an episode.
     unset: stamps of zero in a header, whose clock is then not used.
-    cut_off: whether the file ends before its end. resampled: the rate in Hz that was asked for, and how.
+    cut_off: whether the file ends before its end. resampled: the requested rate in Hz, and how.
     notes: further sentences.
     """
 
@@ -125,93 +141,6 @@ class Recording:
         return validate(self.readings.reshape(len(self), *sensor.shape), sensor)
 
 
-def assemble(
-    block: Block, clock: str | None, source: Source
-) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], tuple[Episode, ...], Report]:
-    """Readings, times by this clock, episodes and the report, from one block."""
-    order = _order(block)
-    readings = block.readings if order is None else block.readings[order]
-    clocks = {name: times if order is None else times[order] for name, times in block.clocks.items()}
-    counters = {name: counts if order is None else counts[order] for name, counts in block.counters.items()}
-    numbers = block.episodes if order is None or block.episodes is None else block.episodes[order]
-    episodes = _spans(clocks["log"], source.marks) if source.marks else _runs(numbers, source.names)
-    begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
-    borders = np.array(begins, np.int64)
-    times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
-    unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
-    return readings, times, episodes, _report(times, clock, counters, borders, unset)
-
-
-def _order(block: Block) -> npt.NDArray[np.int64] | None:
-    """How to sort readings by the time they were logged, as all players do; None where they are."""
-    logged = block.clocks.get("log")
-    if logged is None or not (np.diff(logged) < 0).any():
-        return None
-    return np.argsort(logged, kind="stable")
-
-
-def _runs(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
-    if numbers is None or not len(numbers):
-        return ()
-    borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
-    return tuple(Episode(begin, end, names.get(int(numbers[begin]))) for begin, end in itertools.pairwise(borders))
-
-
-def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> tuple[Episode, ...]:
-    """A label holds from its message to the next; an empty one ends it, and the same again goes on with it."""
-    kept: list[tuple[float, str]] = []
-    for seconds, text in sorted(marks, key=lambda mark: mark[0]):
-        if not kept or kept[-1][1] != text.strip():
-            kept.append((seconds, text.strip()))
-    begins = np.searchsorted(logged, [seconds for seconds, _ in kept])
-    ends = [*begins[1:].tolist(), len(logged)]
-    spans = zip(begins.tolist(), ends, kept, strict=True)
-    return tuple(Episode(begin, end, text) for begin, end, (_, text) in spans if text and end > begin)
-
-
-def _report(
-    times: npt.NDArray[np.float64],
-    clock: str | None,
-    counters: dict[str, npt.NDArray[np.int64]],
-    borders: npt.NDArray[np.int64],
-    unset: int,
-) -> Report:
-    inside = np.ones(max(len(times) - 1, 0), bool)
-    inside[borders[borders > 0] - 1] = False
-    found = _lost(counters, borders)
-    report = Report(len(times), clock, lost=None if found is None else found[0], unset=unset)
-    repeated = 0 if found is None else found[1]
-    steps = np.diff(times)
-    if not (np.isfinite(steps) & inside).any():
-        return replace(report, repeated=repeated)
-    steps[~inside] = np.nan
-    forward = steps[steps > 0]
-    middle = float(np.median(forward)) if len(forward) else 0.0
-    long = steps > max(_GAP, _STEPS * middle)
-    usual = forward[forward <= min(max(_GAP, _STEPS * middle), 2 * middle)]
-    return replace(
-        report,
-        rate=1 / middle if middle > 0 else None,
-        jitter=float(usual.std()) if len(usual) else None,
-        gaps=tuple(Gap(int(i) + 1, float(steps[i])) for i in np.flatnonzero(long)),
-        repeated=repeated or int(np.count_nonzero(steps == 0)),
-        backward=int(np.count_nonzero(steps < 0)),
-    )
-
-
-def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int, int] | None:
-    """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
-    single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
-    for name in ("message", "sequence"):
-        if name not in counters or len(counters[name]) < 2 or 2 * single[name] < len(counters[name]) - 1:
-            continue  # what seldom goes on by one is no counter
-        if name == "sequence" and single["all"] > single[name]:
-            continue  # it counts all topics, so that nobody knows whose messages are lost
-        found = [lost(part) for part in np.split(counters[name], borders)]
-        return sum(gone for gone, _ in found), sum(again for _, again in found)
-    return None
-
-
 def resampled(recording: Recording, rate: float) -> Recording:
     """The recording at a steady `rate` in Hz: linear in time between readings, NaN inside gaps.
 
@@ -266,6 +195,50 @@ def _line(
     before, steps = after - 1, np.diff(times)
     share = np.clip((grid - times[before]) / steps[before], 0, 1)[:, None]
     values = readings[before] * (1 - share) + readings[after] * share
-    long = steps[before] > max(_GAP, _STEPS * float(np.median(steps)))
+    long = steps[before] > longest_step(float(np.median(steps)))
     values[long & (share[:, 0] > 0) & (share[:, 0] < 1)] = np.nan
     return grid, values
+
+
+def require_columns(columns: str) -> list[re.Match[str]]:
+    """The parts of a text that names columns. Raises FieldError for one that does not."""
+    parts = [_PART.fullmatch(part.strip()) for part in columns.split(",")]
+    found = [part for part in parts if part is not None]
+    if len(found) < len(parts):
+        raise FieldError(f"expected columns such as 25:44 or 0,3,5:9, counted from 0; came {columns!r:.80}")
+    return found
+
+
+def places(columns: str, width: int) -> list[int]:
+    """The columns that a text names, of `width`: counted from 0, a range without its end, as Python has it.
+
+    Raises FieldError for a text that is none, and for columns that are not there.
+
+    >>> places("0,3,5:9", 10)
+    [0, 3, 5, 6, 7, 8]
+    """
+    found: list[int] = []
+    for part in require_columns(columns):
+        one, low, high = part.groups()
+        begin, end = (int(one), int(one) + 1) if one else (int(low or 0), width if high is None else int(high))
+        if begin >= end or end > width:
+            raise FieldError(
+                f"columns {part[0]} are not there: expected places from 0 to {width - 1}, a range without its end; "
+                f"0:{width} are all"
+            )
+        found += range(begin, end)
+    return found
+
+
+def only_columns(recording: Recording, columns: str) -> Recording:
+    """A recording of these of its columns, those of times, labels and an index not counted.
+
+    Raises FieldError for a recording of pictures, and as `places` does.
+    """
+    if recording.readings.ndim != 2:
+        raise FieldError(f"{recording.source} has pictures, which have no columns; came columns={columns!r:.80}")
+    try:
+        chosen = places(columns, recording.readings.shape[1])
+    except FieldError as error:
+        raise FieldError(f"{recording.source}: {error}") from None
+    return replace(recording, readings=recording.readings[:, chosen])

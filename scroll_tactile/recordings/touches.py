@@ -68,7 +68,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
         that its episode is called. Without it intervals and episodes name their own, and the whole recording has no
         name but that of all its episodes, where they have the same.
 
-    Raises InputError for a recording without episodes, without the label asked for or with an empty one, for intervals
+    Raises InputError for a recording without episodes, without the requested label or with an empty one, for intervals
     of which none is of this file or which lie outside it, and for spans that a function gives outside the recording.
     """
     if isinstance(cut, str):
@@ -158,8 +158,8 @@ def _of_intervals(recording: Recording, intervals: Sequence[Interval]) -> tuple[
 
 def _same(file: str, source: str) -> bool:
     """Whether a file in a table is this one: its path ends alike, part by part; a suffix may be left out."""
-    asked, place = PurePosixPath(file.replace("\\", "/")), _place(source)
-    parts = [part for part in asked.parts if part not in (".", "..")]
+    given, place = PurePosixPath(file.replace("\\", "/")), _place(source)
+    parts = [part for part in given.parts if part not in (".", "..")]
     ending = place.parts[-len(parts) :]
     alike = tuple(parts[:-1]) == ending[:-1] and bool(parts)
     return alike and parts[-1] in (place.name, place.stem)

@@ -29,7 +29,7 @@ ROW = 15.0  # units a row of names
 LETTER = 7.0  # a letter's width, about
 RIGHT = WIDTH - 15.0
 FIRST_DATE = 1e8  # seconds since 1970: less are counted from some other moment
-COLUMNS = 256  # places along a time axis that are told apart
+COLUMNS = 256  # places along a time axis that are distinguished
 
 
 def dated(seconds: float) -> str:
@@ -48,7 +48,7 @@ def timeline(rows: Sequence[tuple[str, Sequence[float], Sequence[float]]], begin
         top = ROW * i + 2
         drawing.text(LEFT - 6, top + 11, clipped_name(name), anchor="end", title=name)
         drawing.line([(LEFT, top + ROW / 2), (RIGHT, top + ROW / 2)], "grid")
-        for times, kind in ((kept, "tick"), (retracted, "tick gone")):
+        for times, kind in ((kept, "tick"), (retracted, "tick retracted")):
             places = sorted({round(axis(time) * COLUMNS / WIDTH) * WIDTH / COLUMNS for time in times})
             drawing.ticks(places, top + 2, ROW - 4, kind)
     of_day = begin > FIRST_DATE
@@ -155,9 +155,9 @@ def reliability(bins: Sequence[Bin], confidences: Sequence[float]) -> str:
     return drawing.svg()
 
 
-def shares(rows: Sequence[tuple[str, float, str]], usual: float | None, label: str) -> str:
-    """Bars of shares from 0 to 1. rows: name, share, what shows over it; usual: where a line stands."""
-    most = max([share for _, share, _ in rows] + [usual or 0.0, 0.1])
+def shares(rows: Sequence[tuple[str, float, str]], expected: float | None, label: str) -> str:
+    """Bars of shares from 0 to 1. rows: name, share, what shows over it; expected: where a line stands."""
+    most = max([share for _, share, _ in rows] + [expected or 0.0, 0.1])
     drawing = Drawing(ROW * len(rows) + 34, label)
     axis, bottom = Axis(0, most, LEFT, RIGHT - 30), ROW * len(rows) + 4
     drawing.across(axis, 4, bottom, label, "{:.0%}", 4)
@@ -166,8 +166,8 @@ def shares(rows: Sequence[tuple[str, float, str]], usual: float | None, label: s
         drawing.text(LEFT - 6, y + 11, clipped_name(name), anchor="end", title=name)
         drawing.box(LEFT, y + 2, max(axis(share) - LEFT, 0.8), ROW - 4, "fill", title=title)
         drawing.text(axis(share) + 4, y + 10.5, f"{share:.0%}", "tiny")
-    if usual is not None:
-        drawing.line([(axis(usual), 2), (axis(usual), bottom)], "ideal")
+    if expected is not None:
+        drawing.line([(axis(expected), 2), (axis(expected), bottom)], "ideal")
     return drawing.svg()
 
 

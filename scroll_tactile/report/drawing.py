@@ -24,7 +24,7 @@ LEFT = 92.0  # of it, for names
 TINY = 1e-300
 ROOM = LEFT - 8.0  # for a name
 
-# Cividis by nine of its colours: as even for eyes that tell few colours apart (Nuñez, Anderton and Renslow 2018).
+# Cividis by nine of its colours: as even for eyes that distinguish few colours (Nuñez, Anderton and Renslow 2018).
 COLOURS = ((0, 32, 76), (0, 52, 110), (54, 70, 108), (87, 93, 109), (112, 113, 115), (138, 134, 120), (171, 159, 112), (214, 189, 84), (255, 233, 69))  # fmt: skip  # noqa: E501
 
 ByteArray = npt.NDArray[np.uint8]

@@ -86,7 +86,7 @@ class MemoryFacts:
 
     @cached_property
     def held_out(self) -> list[HeldOutTouch]:
-        """What is said of touches that were left out."""
+        """The answers to held-out touches."""
         return [] if self.model is None else held_out_touches(self.model, self.learner.settings.false_alarms)
 
     @cached_property

@@ -26,7 +26,7 @@ BINS = 10
 
 
 def separations(learner: TactileLearner, model: Model) -> tuple[list[str], FloatArray]:
-    """How far materials feel apart: names, and the log-odds that a typical touch of one has over another, (C, C).
+    """The separation of materials: names, and the log-odds that a typical touch of one has over another, (C, C).
 
     Half the squared Mahalanobis distance of their means, of each scale that judges whole touches, as far as the
     calibration believes it. Materials that were never touched long enough are left out. None are there before a
@@ -150,6 +150,6 @@ def bins_of(held_out: Sequence[HeldOutTouch]) -> list[Bin]:
 def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
     """Material, its left-out touches that were called unknown, and all of them; the largest share first."""
     tested = Counter(touch.material for touch in held_out)
-    strange = Counter(touch.material for touch in held_out if not touch.known)
-    found = [(name, strange[name], count) for name, count in tested.items()]
+    unknown_touches = Counter(touch.material for touch in held_out if not touch.known)
+    found = [(name, unknown_touches[name], count) for name, count in tested.items()]
     return sorted(found, key=lambda row: (-row[1] / row[2], row[0]))

@@ -14,13 +14,13 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.report.judging import ROWS, alike, growing_answers, mixed_up, trusted
+from scroll_tactile.report.judgement import ROWS, alike, growing_answers, mixed_up, trusted
 from scroll_tactile.report.page import Card, State, cards, figure, page, table
 from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
 
 __all__ = ["memory_page"]
 
-FEW = 30  # touches left out: with fewer, nothing said of them is certain
+FEW = 30  # touches left out: with fewer, no figure of them is certain
 FEW_TOUCHES = 3  # of a material
 RIGHT, POOR = 0.95, 0.8  # shares: what is fine, and what is bad
 BARS = 60
@@ -132,14 +132,14 @@ def _trusts(facts: MemoryFacts) -> Card:
 
 
 def _soon(facts: MemoryFacts) -> Card:
-    said, heading = facts.soon, "It decides"
-    if said is None:
+    measured, heading = facts.soon, "It decides"
+    if measured is None:
         return "none", heading, "not known", "Too few touches are kept to measure it."
-    wrong = said.wrong[-1] / said.decided[-1] if said.decided[-1] else 0.0
-    more = f"{said.decided[-1]:.0%} are decided within {said.seconds[-1]:.3g} s, {wrong:.0%} of these wrongly."
-    if said.median is None:
+    wrong = measured.wrong[-1] / measured.decided[-1] if measured.decided[-1] else 0.0
+    more = f"{measured.decided[-1]:.0%} are decided within {measured.seconds[-1]:.3g} s, {wrong:.0%} of these wrongly."
+    if measured.median is None:
         return "look", heading, "not before the end", more
-    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {said.median:.2g} s", more
+    return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {measured.median:.2g} s", more
 
 
 def _state(right: float) -> State:
@@ -154,10 +154,10 @@ def _known(facts: MemoryFacts) -> str:
     """Materials, and when they were observed."""
     if not facts.counts:
         return facts.lacks("What it knows", "no touch was observed yet.")
-    names, apart = facts.near
+    names, separation = facts.near
     nearest: dict[str, tuple[str, float]] = {}
     if len(names) > 1:
-        far = apart + np.diag(np.full(len(names), np.inf))
+        far = separation + np.diag(np.full(len(names), np.inf))
         nearest = {name: (names[int(row.argmin())], float(row.min())) for name, row in zip(names, far, strict=True)}
     first: dict[str, float] = {}
     for row in facts.journal:
@@ -186,8 +186,8 @@ def _over_time(facts: MemoryFacts) -> str:
         return facts.lacks("Touches over time", why)
     times = [row.time for row in facts.journal if math.isfinite(row.time)] or [0.0]
     begin, end = min(times), max(times)
-    gone = sum(row.state == "retracted" for row in facts.journal)
-    also = f" {gone} of them were retracted: dashed." if gone else ""
+    retracted = sum(row.state == "retracted" for row in facts.journal)
+    also = f" {retracted} of them were retracted: dashed." if retracted else ""
     if len(facts.counts) <= ROWS:
         rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
         for row in facts.journal:

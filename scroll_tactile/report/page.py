@@ -33,7 +33,7 @@ Card = tuple[State, str, str, str]
 
 SIGNS = {"good": ("✓", "fine"), "look": ("!", "look at it"), "bad": ("✕", "bad"), "none": ("–", "not measured")}
 
-# The palette is Okabe and Ito's (2008), which the colour-blind tell apart; lighter on dark.
+# The palette is Okabe and Ito's (2008), which the colour-blind distinguish; lighter on dark.
 STYLE = """
 :root{color-scheme:light dark;--paper:#fcfcfa;--ink:#1c2126;--soft:#5b6570;--line:#dfe2e4;--card:#fff;
 --blue:#0067a8;--red:#c04a00;--green:#00795a;--band:#eef2f5}
@@ -61,7 +61,8 @@ figure{margin:.8rem 0;max-width:34rem;break-inside:avoid}figcaption{font-size:.8
 svg text{font-size:11px;fill:var(--ink);unicode-bidi:isolate}svg .small{font-size:10px;fill:var(--soft)}
 svg .tiny{font-size:8.5px;fill:var(--soft)}svg .strong{fill:var(--card);font-weight:600}
 svg path{fill:none;stroke-width:1.4}.grid{stroke:var(--line)}svg .grid{stroke-width:.7}.tick{stroke:var(--blue)}
-.gone{stroke:var(--red);stroke-dasharray:2 2}.branch{stroke:var(--blue)}.fill{fill:var(--blue)}.wrong{fill:var(--red)}
+.retracted{stroke:var(--red);stroke-dasharray:2 2}.branch{stroke:var(--blue)}
+.fill{fill:var(--blue)}.wrong{fill:var(--red)}
 .none{fill:var(--band)}.point{fill:var(--blue)}.whisker{stroke:var(--blue)}
 .ideal{stroke:var(--soft);stroke-dasharray:4 3}.own{stroke:var(--blue)}svg .own{stroke-width:2.2}
 .rival{stroke:var(--red);stroke-dasharray:6 3}.other{stroke:var(--soft);stroke-opacity:.5}
@@ -104,7 +105,7 @@ def page(title: str, under: str, summary: str, sections: Sequence[tuple[str, str
 
 
 def name_of(text: object) -> str:
-    """A name, set apart from the text around it, in which direction it may be read."""
+    """A name, isolated from the text around it, in which direction it may be read."""
     return f"<bdi>{shown(text)}</bdi>"
 
 

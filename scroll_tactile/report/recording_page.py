@@ -58,7 +58,7 @@ def recording_page(path: str | PathLike[str], *, intervals: Sequence[Interval] |
 
 
 def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, str]:
-    """The recording, of what was asked for or of the first field there is; and what to say of that choice."""
+    """The recording, of the requested field or of the first there is; and a sentence on that choice."""
     try:
         return read(path, **chosen), ""
     except FieldError:
@@ -110,7 +110,7 @@ def _clock(recording: Recording) -> Card:
 def _losses(recording: Recording) -> Card:
     report = recording.report
     counted = (
-        "No counter tells whether readings were lost." if report.lost is None else "By the counter in its messages."
+        "No counter shows whether readings were lost." if report.lost is None else "By the counter in its messages."
     )
     if report.lost is None and not report.repeated and not report.unset:
         return "none", "What was lost", "not counted", counted
@@ -188,9 +188,9 @@ def _time(recording: Recording) -> str:
     if not len(steps):
         return note("Not shown: its readings have no times. Give --clock, or --rate to count them.")
     longest = float(np.quantile(steps, 0.999)) * 1e3
-    usual = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
-    high = float(usual.max()) * 1.1 if len(usual) and usual.max() > 0 else 1.0
-    counts, _ = np.histogram(usual, bins=60, range=(0, high))
+    regular = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
+    high = float(regular.max()) * 1.1 if len(regular) and regular.max() > 0 else 1.0
+    counts, _ = np.histogram(regular, bins=60, range=(0, high))
     drawn = histogram(counts.tolist(), 0, high, "ms from a reading to the next", "readings")
     caption = (
         "How long it takes from one reading to the next: one narrow peak is a steady clock, two are lost readings."
@@ -201,9 +201,9 @@ def _time(recording: Recording) -> str:
     gaps = table(["before reading", "after (s)", "lasts (s)"], rows[:MOST_ROWS], "gaps") if rows else ""
     more = note(f"{len(rows) - MOST_ROWS} shorter gaps are left out.") if len(rows) > MOST_ROWS else ""
     first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > FIRST_DATE else ""
-    said = "".join(note(text) for text in recording.report.notes)
+    notes = "".join(note(text) for text in recording.report.notes)
     return (
-        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + said
+        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + notes
     )
 
 

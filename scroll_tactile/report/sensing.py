@@ -39,7 +39,7 @@ def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) ->
     if sensor.camera:
         return "none", "Channels", "a camera", "Its pixels are not looked at one by one."
     if not kept:
-        return "none", "Channels", "not known", "No readings are kept that could tell."
+        return "none", "Channels", "not known", "No readings are kept that could show it."
     return card_of(_channels(sensor, kept, ordered), f"{len(kept)} kept touches")
 
 

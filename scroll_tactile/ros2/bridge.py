@@ -14,7 +14,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
-from scroll_tactile.recordings.rosbag import picture
+from scroll_tactile.recordings.ros.rosbag import picture
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.ranges import all_clipped
 
@@ -98,7 +98,7 @@ class Bridge:
             self._refuse(error)
             return self.state
         self.stamp = stamp
-        self._tell(state)
+        self._publish(state)
         return state
 
     def learn(self, material: str) -> str:
@@ -128,14 +128,14 @@ class Bridge:
 
     def begin(self) -> str:
         """A touch begins. Raises InputError in a session that finds contacts itself."""
-        self._tell(self.session.begin())
+        self._publish(self.session.begin())
         return "a touch begins with the next reading"
 
     def end(self) -> str:
         """The touch is over. Raises InputError in a session that finds contacts itself."""
         touching = self.state.contact
         state = self.session.end()
-        self._tell(state)
+        self._publish(state)
         if not state.touches:
             return "the touch was too short to be one" if touching else "no touch was under way"
         touch = state.touches[-1]
@@ -182,7 +182,7 @@ class Bridge:
             self._warned.add(type(error))
             self._warn(f"{error}. Further messages like it are left out and counted, without a word")
 
-    def _tell(self, now: LiveState) -> None:
+    def _publish(self, now: LiveState) -> None:
         """Answer what is new."""
         before, self.state = self.state, now
         for touch in now.touches:
@@ -197,17 +197,17 @@ class Bridge:
             self._answer(self._now("brief", now))
 
     def _now(self, event: str, now: LiveState) -> Answer:
-        said = {} if now.prediction is None else _said(now.prediction)
+        answer = {} if now.prediction is None else _answer_of(now.prediction)
         here = {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
-        return {"event": event, "stamp": self.stamp, **here, **said}
+        return {"event": event, "stamp": self.stamp, **here, **answer}
 
     def _ended(self, touch: LiveTouch) -> Answer:
         over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
         over |= {"touches": 1 + len(touch.earlier)}
-        return {"event": "ended", "stamp": self.stamp, **over, **_said(touch.prediction)}
+        return {"event": "ended", "stamp": self.stamp, **over, **_answer_of(touch.prediction)}
 
 
-def _said(prediction: Prediction) -> dict[str, Any]:
+def _answer_of(prediction: Prediction) -> dict[str, Any]:
     return prediction.as_json() | {
         "unusual": prediction.unusual,
         "candidates": prediction.candidates(),

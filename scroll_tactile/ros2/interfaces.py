@@ -1,4 +1,4 @@
-"""ROS 2's interfaces by name: rclpy, messages and services, imported when they are asked for."""
+"""ROS 2's interfaces by name: rclpy, messages and services, imported when first used."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def interface(name: str) -> Any:
 def kind_of(topic: str, topics: Mapping[str, Sequence[str]]) -> str | None:
     """The type of a topic among those there are, by name; None where it is not there yet.
 
-    Raises InputError where it is sent in several types: one of them has to be asked for.
+    Raises InputError where it is sent in several types: one of them has to be named.
     """
     kinds = topics.get(topic, ())
     if len(kinds) > 1:

@@ -49,7 +49,7 @@ class TactileNode:
         ros2 param set /scroll_tactile material silk
         ros2 service call /scroll_tactile/learn std_srvs/srv/Trigger
 
-    A wrong name, a full disk or a missing touch reaches whoever called, which a topic of names could not tell.
+    A wrong name, a full disk or a missing touch reaches whoever called, which a topic of names could not report.
 
     Raises MissingLibraryError where a package of ROS is missing, InputError for a type that is none, and what `Bridge`
     raises. A field that the first message does not have raises FieldError from the node's executor.
@@ -78,17 +78,9 @@ class TactileNode:
         self._diagnostics = _Diagnostics(node)
         if not node.has_parameter("material"):
             node.declare_parameter("material", "")
-        bridge = self.bridge
-        calls: dict[str, Callable[[], str]] = {
-            "learn": lambda: bridge.learn(self._material()),
-            "forget": lambda: bridge.forget(self._material()),
-            "begin": bridge.begin,
-            "end": bridge.end,
-            "again": bridge.again,
-        }
-        for name, call in calls.items():
+        for name, call in self._calls().items():
             node.create_service(trigger, f"~/{name}", _service(call))
-        self._heard = self._said = time.monotonic()
+        self._received = self._reported = time.monotonic()
         self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
         self.subscription: Any = None
         if message is not None:
@@ -97,9 +89,20 @@ class TactileNode:
             self._looking = node.create_timer(LOOKED, self._look)
         node.create_timer(1.0, self._each_second)
 
+    def _calls(self) -> dict[str, Callable[[], str]]:
+        """What each service calls."""
+        bridge = self.bridge
+        return {
+            "learn": lambda: bridge.learn(self._material()),
+            "forget": lambda: bridge.forget(self._material()),
+            "begin": bridge.begin,
+            "end": bridge.end,
+            "again": bridge.again,
+        }
+
     def receive(self, message: Any, about: Mapping[str, Any]) -> None:
         """Take a message; about: what ROS says of it."""
-        self._heard = time.monotonic()
+        self._received = time.monotonic()
         published = about.get("source_timestamp") or about.get("received_timestamp") or time.time_ns()
         self._count(about)
         try:
@@ -134,8 +137,8 @@ class TactileNode:
             durability=DurabilityPolicy.VOLATILE,
         )
         # Humble does not say when a message was published; later distributions do.
-        told = hasattr(Subscription, "CallbackType")
-        receive = self.receive if told else lambda message: self.receive(message, {})
+        dated = hasattr(Subscription, "CallbackType")
+        receive = self.receive if dated else lambda message: self.receive(message, {})
         self.subscription = self.node.create_subscription(message, self.topic, receive, profile)
         self._log.info(f"reading {self.bridge.field.text} of {self.topic}, {self.kind}")
 
@@ -162,9 +165,9 @@ class TactileNode:
 
     def _each_second(self) -> None:
         now = time.monotonic()
-        silent = now - self._heard
-        if silent > MISSED and now - self._said > MISSED:
-            self._said = now
+        silent = now - self._received
+        if silent > MISSED and now - self._reported > MISSED:
+            self._reported = now
             self._log.warning(self._absent(silent))
         self._diagnostics.publish(self.bridge, silent > SILENT)
 

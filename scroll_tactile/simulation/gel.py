@@ -21,7 +21,7 @@ from scroll_tactile.signals.stream import Stream, validate
 __all__ = ["SMALL", "Gel"]
 
 SMALL: Sensor = GELSIGHT.model_copy(update={"channels": 60 * 80 * 3, "layout": (60, 80, 3), "duration": 0.2})
-"""A camera of 60 × 80 pixels, for quick tests; a touch of the usual duration is five frames."""
+"""A camera of 60 × 80 pixels, for quick tests; a touch of its sensor's duration is five frames."""
 
 MATERIALS = ("burlap", "cord", "gravel", "leather", "mesh", "tile")
 
@@ -65,7 +65,7 @@ class Gel:
         """Press on a material: a stream that depends on the arguments and the seed alone.
 
         repetition: which touch of the material this is, 0 or more. frames: how many, the first of the gel at rest; as
-        many as in the sensor's usual duration where none is given. force: 0 for no contact; varied around 1 where
+        many as in the sensor's duration where none is given. force: 0 for no contact; varied around 1 where
         none is given.
 
         Raises UnknownMaterialError, and InputError for quantities that cannot be.
@@ -80,8 +80,8 @@ class Gel:
             )
         index = MATERIALS.index(material)
         random = np.random.default_rng([_TOUCH, self.seed, index, repetition])
-        usual = math.exp(random.normal(0, 0.15))
-        pressure = np.arange(count) / max(1, count - 1) * (usual if force is None else force)
+        mean = math.exp(random.normal(0, 0.15))
+        pressure = np.arange(count) / max(1, count - 1) * (mean if force is None else force)
         slopes = _pressed(self.seed, index, _grid(self.sensor.shape), random)
         shares = np.stack([_lit(slopes, float(force)) for force in pressure])
         shares += _NOISE * random.standard_normal(shares.shape)

@@ -55,12 +55,12 @@ MATERIALS = (
 _Floats = npt.NDArray[np.float64]
 
 _PAD = 14.0  # mm across
-_SPEED, _FORCE = 40.0, 1.0  # mm/s and N of a usual touch
+_SPEED, _FORCE = 40.0, 1.0  # mm/s and N of a mean touch
 _WAVES = 4
 _NOISE = 0.006  # of the range: white noise, and a touch's own offset
 _RISE = 0.04  # of the range: a rise of the pressure that a taxel of events reports
 _NARROW = _PAD / 8  # mm: the contact under which most taxels of events stay quiet
-_LIGHT = 0.1  # of a usual contact
+_LIGHT = 0.1  # of a mean contact
 _WANDER = 0.02  # of the range in a second's square root: a random walk of the offset, each channel's own
 # First word of every seed: a texture, a pad and a touch must never draw the same numbers.
 _TEXTURE, _PADS, _TOUCH = 1, 2, 3
@@ -72,7 +72,7 @@ class _Texture:
 
     wavelengths: of its waves, in mm; amplitudes: theirs, as a share of the sensor's range.
     roughness: amplitude of its irregular relief, as a share of the range.
-    firmness: mean reading at the usual force, as a share of the range.
+    firmness: mean reading at the mean force, as a share of the range.
     onset: seconds until the contact has settled: soft materials take longer.
     stick: how much the speed wavers within a touch.
     """
@@ -160,7 +160,7 @@ class Scene:
         """Slide over a material: a stream that depends on the arguments and the scene's seed alone.
 
         repetition: which touch of the material this is, 0 or more.
-        seconds: its length; the sensor's usual duration where none is given.
+        seconds: its length; the sensor's duration where none is given.
         speed: in mm/s; force: in N. Where none is given they vary from touch to touch around 40 mm/s and 1 N.
 
         Raises UnknownMaterialError, StreamTooShortError, and InputError for quantities that cannot be.
@@ -237,10 +237,10 @@ def _slide(
 ) -> _Floats:
     """Pressures as shares of the range, shape (T, n). width: of the contact, a standard deviation in mm."""
     # Drawn even where they are given, so that a touch at another speed is otherwise the same touch.
-    usual_speed = _SPEED * math.exp(random.normal(0, 0.025))
-    usual_force = _FORCE * math.exp(random.normal(0, 0.06))
-    speed = usual_speed if speed is None else speed
-    force = usual_force if force is None else force
+    mean_speed = _SPEED * math.exp(random.normal(0, 0.025))
+    mean_force = _FORCE * math.exp(random.normal(0, 0.06))
+    speed = mean_speed if speed is None else speed
+    force = mean_force if force is None else force
     middle = random.normal(0, 0.5, 2)
     rhythm, turn = random.uniform(0.5, 1.5), random.uniform(0, 2 * math.pi)
 

@@ -74,18 +74,9 @@ def shift_of(
     random = np.random.default_rng([4, seed])
     low, high = (np.broadcast_to(limit, sensor.shape).astype(np.float64) for limit in sensor.limits)
     count = round(seconds * sensor.rate)
-    parts, places, at = [], [], 0
-    for material, readings in touches:
-        rest = round(random.uniform(*rests) * sensor.rate)
-        if at + rest + len(readings) > count:
-            break
-        parts += [level + noise(random, rest), np.asarray(readings, dtype=np.float64)]
-        places.append((material, at + rest, at + rest + len(readings)))
-        at += rest + len(readings)
+    values, places = _laid_out(touches, rests, sensor.rate, lambda steps: level + noise(random, steps), count, random)
     if not places:
         raise InputError(f"expected {seconds:g} s to hold a rest and a touch; they hold none")
-    parts.append(level + noise(random, count - at))
-    values = np.concatenate(parts)
     turns, phases = random.uniform(0.5, 2.0, len(level)), random.uniform(0, 2 * np.pi, len(level))
     values += drift * (high - low) * np.sin(2 * np.pi * turns * np.arange(count)[:, None] / count + phases)
     if np.any(step):
@@ -101,6 +92,30 @@ def shift_of(
     stamped = times + random.uniform(-jitter, jitter, count) / sensor.rate
     truth = [Truth(name, *when) for (name, *_), *when in zip(places, begins.tolist(), ends.tolist(), strict=True)]
     return Shift(sensor, values[kept], stamped[kept], truth)
+
+
+def _laid_out(
+    touches: Iterable[tuple[str, npt.NDArray[np.floating]]],
+    rests: tuple[float, float],
+    rate: float,
+    at_rest: Callable[[int], Floats],
+    count: int,
+    random: np.random.Generator,
+) -> tuple[Floats, list[tuple[str, int, int]]]:
+    """`count` readings of touches with rests between them; and of each touch its material, begin and end.
+
+    rests: the shortest and the longest, in seconds. at_rest: makes so many readings.
+    """
+    parts, places, at = list[Floats](), [], 0
+    for material, readings in touches:
+        rest = round(random.uniform(*rests) * rate)
+        if at + rest + len(readings) > count:
+            break
+        parts += [at_rest(rest), np.asarray(readings, dtype=np.float64)]
+        places.append((material, at + rest, at + rest + len(readings)))
+        at += rest + len(readings)
+    parts.append(at_rest(count - at))
+    return np.concatenate(parts), places
 
 
 def simulated_shift(scene: Scene, materials: Sequence[str], *, seconds: float, seed: int = 0) -> Shift:

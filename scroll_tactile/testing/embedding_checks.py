@@ -199,7 +199,7 @@ def _require_same(
         raise _broken(
             embedding,
             f"{when}, {_described(image)} gave other bytes ({differing} of {first.size} features differ). Threads, "
-            "batches, dropout and state that is kept between calls are the usual reasons",
+            "batches, dropout and state that is kept between calls are the common reasons",
         )
 
 

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,12 +26,18 @@ from store import Store, StoreError
 OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
 
 
-@pytest.fixture
-def path(tmp_path):
-    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("upkeep") / "m"
+    with TactileLearner.open(folder, **SETTINGS) as learner:
         for name, touch in OBSERVED:
             learner.observe(name, stream(touch))
-    return tmp_path / "m"
+    return folder
+
+
+@pytest.fixture
+def path(whole, tmp_path):
+    return Path(shutil.copytree(whole, tmp_path / "m"))
 
 
 def words(result):
@@ -51,7 +58,6 @@ def damage(path):
 class TestCheckAndRepair:
     def test_a_sound_memory(self, path):
         assert "sound: every checksum holds" in words(run("memory", "check", path))
-        assert json.loads(run("memory", "check", path, "--json").output) == {"sound": True, "problems": []}
         assert "nothing was damaged; rows 1 to 12 verify" in words(run("memory", "repair", path))
 
     def test_damage_is_named_and_mended(self, path):
@@ -67,7 +73,7 @@ class TestCheckAndRepair:
         repaired = words(run("memory", "repair", path))
         assert "lost:" in repaired
         assert "damaged journal was put aside" in repaired
-        assert run("memory", "check", path).exit_code == 0
+        assert json.loads(run("memory", "check", path, "--json").output)["sound"] is True
         with TactileLearner.open(path, **SETTINGS) as learner:
             # The checkpoint holds what the row had; readings, and so exemplars, are in rows alone.
             require_same(learner, OBSERVED, exemplars=False)
@@ -187,7 +193,6 @@ class TestBackup:
             writer.stdout.close()
             writer.wait()
         assert f"with rows 1 to {last}; every checksum holds" in said
-        assert words(run("memory", "check", tmp_path / "copy")).startswith("sound: every checksum holds")
 
     def test_what_is_there_stays(self, path, tmp_path):
         (tmp_path / "copy").mkdir()

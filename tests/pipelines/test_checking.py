@@ -10,7 +10,7 @@ from touches import OBSERVED, SETTINGS, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.pipelines import checking
-from scroll_tactile.pipelines.checking import check_memory_apart
+from scroll_tactile.pipelines.checking import check_in_process
 from store import NotAStoreError, Store, check_store
 
 
@@ -26,17 +26,17 @@ def test_a_row_that_verifies_and_that_no_touch_could_have_made_is_found(path):
     with Store.open(path) as store:
         store.append("observe", "wool", bytes(32), attributes={"columns": 10**9})
     assert check_store(path) == []
-    (problem,) = check_memory_apart(path)
+    (problem,) = check_in_process(path)
     assert (problem.path, problem.kind) == (path, "lost")
     assert "row 13" in problem.what
 
 
 def test_it_finds_what_the_check_here_finds_and_says_how_far_it_is(path):
     told = []
-    assert check_memory_apart(path, progress=lambda *step: told.append(step)) == []
+    assert check_in_process(path, progress=lambda *step: told.append(step)) == []
     assert {what for what, _, _ in told} >= {"checkpoints"}
     next((path / "checkpoints").glob("*/sums-*/zarr.json")).write_text("{}")
-    found = check_memory_apart(str(path))
+    found = check_in_process(str(path))
     assert [(problem.path, problem.kind) for problem in found] == [
         (problem.path, problem.kind) for problem in check_store(path)
     ]
@@ -45,7 +45,7 @@ def test_it_finds_what_the_check_here_finds_and_says_how_far_it_is(path):
 def test_what_is_no_memory_is_refused_as_by_the_check_here(tmp_path):
     for place in (tmp_path / "none", "a\0b", tmp_path / "naïve\n"):
         with pytest.raises(NotAStoreError):
-            check_memory_apart(place)
+            check_in_process(place)
 
 
 DEATHS = {
@@ -71,8 +71,9 @@ def test_a_check_that_dies_is_damage(path, tmp_path, monkeypatch, death):
         "store.survey.Survey.problems = problems\n"
     )
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    monkeypatch.setattr(checking, "SPARE_SECONDS", 10.0)
-    (problem,) = check_memory_apart(path)
+    if death == "a hang":  # the others end by themselves, however long a busy machine takes to start them
+        monkeypatch.setattr(checking, "SPARE_SECONDS", 10.0)
+    (problem,) = check_in_process(path)
     assert problem.kind == "lost"
     assert re.search(said, problem.what)
 
@@ -81,5 +82,5 @@ def test_nothing_is_imported_from_where_the_caller_happens_to_be(path, tmp_path,
     (tmp_path / "json.py").write_text("import pathlib; pathlib.Path('ran').touch()")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", ["", *sys.path])
-    assert check_memory_apart(path) == []
+    assert check_in_process(path) == []
     assert not os.path.lexists(tmp_path / "ran")

@@ -16,10 +16,11 @@ from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.pipelines import engines, fleet, jobs, steps
+from scroll_tactile.pipelines import fleet
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import SourceOptions
+from scroll_tactile.pipelines.workers import engines, jobs, steps
 from store import StoreFullError
 
 BY_FOLDER = SourceOptions(by="folder")

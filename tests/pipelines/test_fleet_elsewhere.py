@@ -172,7 +172,7 @@ class TestRefused:
     @CLUSTER
     @pytest.mark.filterwarnings("ignore")
     def test_a_scheduler_that_is_not_there(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("scroll_tactile.cli.fleet.SECONDS", 1)
+        monkeypatch.setattr("scroll_tactile.cli.bulk.SECONDS", 1)
         touch_files(tmp_path / "in", TOUCHES[:1])
         with socket.create_server(("127.0.0.1", 0)) as taken:
             port = taken.getsockname()[1]

@@ -17,10 +17,11 @@ from touches import SETTINGS, stream
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.pipelines import engines, fleet, runfile, steps
+from scroll_tactile.pipelines import fleet, runfile
 from scroll_tactile.pipelines.fleet import learn
-from scroll_tactile.pipelines.jobs import Made
 from scroll_tactile.pipelines.sources import Refused
+from scroll_tactile.pipelines.workers import engines, steps
+from scroll_tactile.pipelines.workers.jobs import Made
 from store import DamageError, LockedError, StoreFullError
 
 __all__ = ["full", "learned"]  # fixtures

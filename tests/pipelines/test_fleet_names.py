@@ -11,9 +11,10 @@ from touches import SETTINGS, SmallSample, require_same, stream
 import scroll_tactile.memory.state
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
-from scroll_tactile.pipelines import learning, steps
+from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.sources import find_sources
+from scroll_tactile.pipelines.workers import steps
 from store import StoreFullError
 
 __all__ = ["full"]  # a fixture

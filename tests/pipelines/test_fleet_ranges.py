@@ -11,8 +11,9 @@ from touches import PAD, SETTINGS
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import RangeWarning
-from scroll_tactile.pipelines import learning, steps
+from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.sources import find_sources
+from scroll_tactile.pipelines.workers import steps
 from store import StoreFullError
 
 __all__ = ["full"]  # a fixture

@@ -290,7 +290,7 @@ class TestEvaluate:
 
         monkeypatch.setattr(TactileLearner, "predict", predict)
         done = evaluate_sources(learner, sources_of(data / "a", data / "b", data / "new"), FOLDERS, with_learned=True)
-        assert (len(done.familiar), len(done.strange)) == (4, 2)
+        assert (len(done.of_learned), len(done.of_others)) == (4, 2)
         assert done.answers.accuracy == 0.75
         assert done.answers.confusions() == [("b", "a", 1)]
         assert done.calibration_error == pytest.approx((0.1 + 0.8 + 0.3 + 0) / 4)
@@ -313,7 +313,7 @@ class TestEvaluate:
 
     def test_nothing_familiar_has_no_calibration_error(self, data, learner):
         done = evaluate_sources(learner, sources_of(data), FOLDERS)
-        assert done.calibration_error is None and not done.familiar and len(done.strange) == 6
+        assert done.calibration_error is None and not done.of_learned and len(done.of_others) == 6
         assert done.wrong == []
 
 

@@ -8,10 +8,9 @@ import pytest
 from scroll_tactile import sensors
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
-from scroll_tactile.pipelines.demo import Demo
+from scroll_tactile.pipelines.demo import Demo, pull_the_plug
 from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
-from scroll_tactile.pipelines.unplugged import pull_the_plug
 from scroll_tactile.simulation.scene import Scene
 
 
@@ -105,7 +104,7 @@ class TestDemo:
 
     def test_what_is_new_is_shown(self) -> None:
         outcome = Demo(sensors.BIOTAC, materials=8, touches=5, held_out=2, features=64).run()
-        assert (outcome.half.asked, outcome.first) == (8, 8)
+        assert (outcome.half.tested, outcome.first) == (8, 8)
         assert outcome.half.unknown >= 6 and outcome.half.right == 1.0 and outcome.still_right == 1.0
         outcome.answers.predictions[:2] = outcome.answers.predictions[-2:]  # what was said to the last, to the first
         assert outcome.still_right == 0.75  # forgetting would be seen

@@ -7,7 +7,7 @@ import pytest
 from scroll_tactile import sensors
 from scroll_tactile.errors import ChannelCountError, FieldError
 from scroll_tactile.recordings import iterate, read
-from scroll_tactile.recordings.columns import places
+from scroll_tactile.recordings.recording import places
 
 ROWS = np.arange(6 * 44, dtype=np.float64).reshape(6, 44)
 

@@ -3,7 +3,6 @@
 import logging
 import os
 import shutil
-import subprocess
 import sys
 import tracemalloc
 import zlib
@@ -14,12 +13,15 @@ import h5py
 import numpy as np
 import pytest
 import zarr
+from faults.parquet_attacks import PARQUETS
 from faults.recording_attacks import ATTACKS, RAN, SECRET
-from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, ros
+from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, lerobot, ros
 from numcodecs import Blosc
 
-from scroll_tactile.errors import FieldError, RecordingError
-from scroll_tactile.recordings import bounds, describe, find, iterate, read, zarrfile
+from scroll_tactile.errors import FieldError, MissingLibraryError, RecordingError
+from scroll_tactile.recordings import bounds, describe, find, iterate, read
+from scroll_tactile.recordings.arrays import zarrfile
+from scroll_tactile.recordings.ros import decoding
 
 # How they are refused, where that says more than that they are.
 SAID = {
@@ -41,16 +43,15 @@ SAID = {
     "R7 yaml: aliases": "has aliases, which no recorder writes",
     "R7 bag: a part elsewhere": "leads out of its recording",
     "R7 lerobot: names by width": "expected chunk_index and file_index",
-    "R7 lerobot: a page behind its column": "ends at 4072, its column at 92",
-    "R7 lerobot: a page of too few": "a column of 1 values has 0 in its pages",
-    "R7 lerobot: many row groups": "a list of 1000000 values of kind 12",
-    "R7 lerobot: texts for numbers": "holds string; expected numbers",
 }
+ENDLESS = ("R7 mcap: equal messages", "R7 mcap: equal messages of nobody")
 
 
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning", "ignore::UserWarning")
-@pytest.mark.parametrize("name", ATTACKS)
-def test_what_was_made_to_harm_is_refused(tmp_path, name):
+@pytest.mark.parametrize("name", [name for name in ATTACKS if name.removeprefix("R7 lerobot: ") not in PARQUETS])
+def test_what_was_made_to_harm_is_refused(tmp_path, monkeypatch, name):
+    if name in ENDLESS:  # `faults/recorded.py` has them with the bound as it is
+        monkeypatch.setattr(bounds, "SPARE_STEPS", 1 << 16)
     (tmp_path / "in").mkdir()
     (tmp_path / "elsewhere").mkdir()
     secret = tmp_path / "elsewhere" / "secret"
@@ -276,8 +277,9 @@ class TestBounds:
             file.truncate(1 << 30)
         assert bounds.stored_bytes(path) < 1 << 20
 
-    def test_an_hour_of_a_sensor_at_rest_is_read(self, tmp_path):
-        """19 channels of zeros at 100 Hz, compressed; and an array of 10^6 rows in one chunk."""
+    def test_a_long_recording_of_a_sensor_at_rest_is_read(self, tmp_path, monkeypatch):
+        """19 channels of zeros at 100 Hz, compressed, beyond what any file may cost; and 10^6 rows in one chunk."""
+        monkeypatch.setattr(bounds, "SPARE_STEPS", 1 << 16)
         store = bags.typestore(2)
         kind = "std_msgs/msg/Float32MultiArray"
         one = bytes(store.serialize_cdr(bags.array(store, np.zeros(19)), kind))
@@ -287,9 +289,9 @@ class TestBounds:
         writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with writer:
             connection = writer.add_connection("/skin", kind, typestore=store)
-            for i in range(60_000):
+            for i in range(15_000):
                 writer.write(connection, 10**18 + i * 10**7 + i * i % 4999, one)
-        assert len(read(tmp_path / "b", **SKIN)) == 60_000
+        assert len(read(tmp_path / "b", **SKIN)) == 15_000
         array = zarr.create_array(
             tmp_path / "a.zarr", shape=(10**6, 19), chunks=(10**6, 19), dtype="f4", zarr_format=2, compressors=Blosc()
         )
@@ -332,31 +334,36 @@ class TestBounds:
 
 
 @pytest.mark.parametrize(
-    ("form", "compress", "lacks", "named"),
+    ("name", "lacks", "named", "extra"),
     [
-        ("mcap", "STORAGE ZSTD", "backports", "a file compressed by zstd needs backports.zstd"),
-        ("bag", "lz4", "lz4", "a file compressed by lz4 needs lz4"),
-        ("mcap", "", "rosbags", "a ROS recording needs rosbags"),
-        ("db3", "", "rosbags", "a ROS recording needs rosbags"),
+        ("mcap STORAGE ZSTD", "backports", "a file compressed by zstd needs backports.zstd", "ros"),
+        ("bag lz4", "lz4", "a file compressed by lz4 needs lz4", "ros"),
+        ("mcap", "rosbags", "a ROS recording needs rosbags", "ros"),
+        ("db3", "rosbags", "a ROS recording needs rosbags", "ros"),
+        ("lerobot", "pyarrow", "a LeRobot data set needs pyarrow", "lerobot"),
+        ("hdf5", "h5py", "an HDF5 file needs h5py", "hdf5"),
     ],
 )
-def test_a_whole_file_is_not_called_damaged_where_a_library_is_missing(tmp_path, form, compress, lacks, named):
-    path = ros(tmp_path, form, compress)
-    path = path if path.is_file() else next(path.glob(f"*.{form}"))
-    code = f"""
-import sys
-sys.modules |= dict.fromkeys(({lacks!r}, {lacks + ".zstd"!r}, {lacks + ".frame"!r}, 'compression'))
-from scroll_tactile.recordings import describe, read
-from scroll_tactile.errors import MissingLibraryError
-for look in (lambda: read({str(path)!r}, topic='/skin', field='data'), lambda: describe({str(path)!r})):
-    try:
-        look()
-    except MissingLibraryError as error:
-        assert {named!r} in str(error) and 'damaged' not in str(error), error
+def test_a_library_that_is_not_installed_is_named_and_no_file_called_damaged(
+    tmp_path, monkeypatch, name, lacks, named, extra
+):
+    if extra == "ros":
+        form, _, compress = name.partition(" ")
+        path = ros(tmp_path, form, compress)
+        path = path if path.is_file() else next(path.glob(f"*.{form}"))
     else:
-        raise AssertionError('read without it')
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
+        path = lerobot(tmp_path / "set") if name == "lerobot" else hdf5(tmp_path)
+    for module in [module for module in sys.modules if module.startswith(f"{lacks}.")]:
+        monkeypatch.delitem(sys.modules, module)
+    for module in (lacks, "compression"):
+        monkeypatch.setitem(sys.modules, module, None)
+    decoding._reader.cache_clear()
+    for look in (lambda: read(path, field="data", topic="/skin" if extra == "ros" else None), lambda: describe(path)):
+        with pytest.raises(MissingLibraryError, match=named) as raised:
+            look()
+        assert "damaged" not in str(raised.value)
+        if lacks != "backports":  # which is installed, as anybody sees who looks, and only hidden here
+            assert f"[{extra}]" in str(raised.value) and " -m pip install " in str(raised.value)
 
 
 def test_deflate_makes_at_most_as_many_bytes_as_is_reckoned_with():

@@ -252,7 +252,7 @@ def test_a_file_that_was_cut_off_gives_what_comes_before(tmp_path, store1, store
 
 
 def test_a_damaged_chunk_is_left_out_and_said(tmp_path, store2):
-    _, messages = floats(store2, 30_000)
+    _, messages = floats(store2, 12_000)
     path = next(
         bags.write(tmp_path / "b", store2, {"/skin": messages}, form="mcap", compress="STORAGE ZSTD").glob("*.mcap")
     )
@@ -261,7 +261,7 @@ def test_a_damaged_chunk_is_left_out_and_said(tmp_path, store2):
     whole[first] ^= 1
     path.write_bytes(whole)
     recording = read(path, topic="/skin", field="data")
-    assert 0 < len(recording) < 30_000
+    assert 0 < len(recording) < 12_000
     assert "damaged chunk" in str(recording.report)
 
 
@@ -291,7 +291,7 @@ def test_a_wrong_topic_or_field_names_what_there_is(tmp_path, store2):
         ({"topic": "/skin", "field": "dta"}, r"no 'dta'; nearest is 'data' \(of layout, data\)"),
         ({"topic": "/name", "field": "data"}, "leads to text, 'felt'"),
         ({"topic": "/rh/tactile", "field": "tactiles"}, "leads to a message, not to numbers; inside it are pac0"),
-        ({"topic": "/rh/tactile", "field": "tactiles[7].electrodes"}, r"\[7\] is asked of an array of 5"),
+        ({"topic": "/rh/tactile", "field": "tactiles[7].electrodes"}, r"\[7\] is wanted of an array of 5"),
         ({"topic": "/rh/tactile", "field": "tactiles.electrodes"}, r"write \[0\] or \[\*\]"),
         ({"topic": "/skin"}, r"read\('.*', topic='/skin', field='data'\)"),
         ({}, r"/skin  data  \[19\], 5 readings, 100 Hz(?s:.*)/rh/tactile  tactiles\[0\].electrodes  \[19\]"),

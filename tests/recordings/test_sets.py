@@ -2,8 +2,6 @@
 
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -234,32 +232,3 @@ def test_addresses_of_file_systems(tmp_path):
     ]:
         with pytest.raises(InputError, match=message):
             read(address)
-
-
-@pytest.mark.parametrize(
-    ("library", "extra", "name"),
-    [("rosbags", "ros", "b.mcap"), ("pyarrow", "lerobot", "set"), ("h5py", "hdf5", "demo.h5")],
-)
-def test_a_library_that_is_not_installed_is_named_with_its_line(tmp_path, library, extra, name):
-    import bags
-
-    robomimic(tmp_path / "demo.h5")
-    lerobot(tmp_path / "set")
-    store = bags.typestore(2)
-    message = bags.array(store, np.zeros(3))
-    next(bags.write(tmp_path / "b", store, {"/s": [(1.0, message)]}, form="mcap").glob("*.mcap")).rename(
-        tmp_path / "b.mcap"
-    )
-    code = f"""
-import sys
-sys.modules[{library!r}] = None
-from scroll_tactile.recordings import read
-from scroll_tactile.errors import MissingLibraryError
-try:
-    read({str(tmp_path / name)!r}, field='data')
-except MissingLibraryError as error:
-    assert "[{extra}]" in str(error) and " -m pip install " in str(error), error
-else:
-    raise AssertionError('read without it')
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)

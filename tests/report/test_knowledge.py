@@ -1,5 +1,7 @@
 """What a page says is measured: touches left out, separations, calibration, and faults of channels."""
 
+import functools
+
 import numpy as np
 import pytest
 from touches import PAD, SMALL, fed
@@ -21,6 +23,7 @@ SCENE = Scene(sensor=SENSOR)
 NAMES = SCENE.materials[:4]
 
 
+@functools.cache  # a memory that two tests compare with is made once
 def taught(leave=None, repetitions=6):
     learner = TactileLearner(sensor=SENSOR, embedding=Kernels(dimension=64))
     for i in range(repetitions):
@@ -38,15 +41,15 @@ def learner():
 def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
     held_out = {touch.key: touch for touch in held_out_touches(learner.model(), 0.05)}
     assert len(held_out) == 24
-    for name, i in [(NAMES[0], 0), (NAMES[1], 3), (NAMES[3], 5)]:
+    for name, i in [(NAMES[1], 3), (NAMES[2], 1)]:
         touch = SCENE.touch(name, i, seconds=1.0)
         answer = taught(leave=(name, i)).predict(touch)
-        said = held_out[touch.key]
-        assert said.material == name
-        assert said.answer == answer.material
+        judged = held_out[touch.key]
+        assert judged.material == name
+        assert judged.answer == answer.material
         # The calibration is that of all, and not of all others.
-        assert said.confidence == pytest.approx(answer.probability, abs=0.05)
-        assert said.probability.sum() == pytest.approx(1)
+        assert judged.confidence == pytest.approx(answer.probability, abs=0.05)
+        assert judged.probability.sum() == pytest.approx(1)
 
 
 def grown(learner, touches, rule=None):
@@ -95,15 +98,15 @@ def test_a_few_touches_of_different_materials_are_chosen(learner):
 def test_how_soon_answers_come_is_counted(learner):
     model = learner.model()
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
-    said = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, together=0.0, strange=0.0), 0.05)
-    assert said.decided == (1.0,) * len(said.seconds)
-    assert said.median == said.seconds[0]
-    assert len(set(said.wrong)) == 1
-    assert said.wrong[0] >= 1 - said.right[0] - 1e-9
+    counted = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, together=0.0, strange=0.0), 0.05)
+    assert counted.decided == (1.0,) * len(counted.seconds)
+    assert counted.median == counted.seconds[0]
+    assert len(set(counted.wrong)) == 1
+    assert counted.wrong[0] >= 1 - counted.right[0] - 1e-9
     never = soon(model, extractor, DecisionRule((1,), 0.0, sure=1.1, together=1.1, strange=1e9), 0.05)
-    assert never.decided == never.wrong == (0.0,) * len(said.seconds)
+    assert never.decided == never.wrong == (0.0,) * len(counted.seconds)
     assert never.median is None
-    assert never.right == said.right
+    assert never.right == counted.right
 
 
 def test_separations_are_the_log_odds_between_means(learner):

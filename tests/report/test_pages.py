@@ -37,6 +37,12 @@ def learner(tmp_path_factory):
     made.close()
 
 
+@pytest.fixture(scope="module")
+def html(learner):
+    """The page of that memory."""
+    return memory_page(learner)
+
+
 class Checked(HTMLParser):
     """Every element that opens closes, and none is of a kind that runs or fetches anything."""
 
@@ -74,8 +80,8 @@ def words(html):
 @pytest.mark.parametrize(
     ("width", "look"), [(320, "light"), (390, "light"), (390, "dark"), (1280, "light"), (1280, "dark"), (640, "print")]
 )
-def test_a_page_fits_every_width_and_asks_for_nothing(browser, learner, tmp_path, width, look):
-    save(memory_page(learner), tmp_path / "page.html")
+def test_a_page_fits_every_width_and_asks_for_nothing(browser, html, tmp_path, width, look):
+    save(html, tmp_path / "page.html")
     browser.show(tmp_path / "page.html", width, dark=look == "dark", media="print" if look == "print" else "screen")
     assert browser.evaluate("document.documentElement.scrollWidth") <= width
     assert browser.asked_for == [(tmp_path / "page.html").as_uri()]
@@ -91,8 +97,8 @@ def test_a_page_fits_every_width_and_asks_for_nothing(browser, learner, tmp_path
     assert shade < 120 if look == "dark" else shade > 700
 
 
-def test_a_page_is_read_without_a_script_and_prints(browser, learner, tmp_path):
-    save(memory_page(learner), tmp_path / "page.html")
+def test_a_page_is_read_without_a_script_and_prints(browser, html, tmp_path):
+    save(html, tmp_path / "page.html")
     browser.ask("Emulation.setScriptExecutionDisabled", value=True)
     browser.show(tmp_path / "page.html")
     browser.ask("Emulation.setScriptExecutionDisabled", value=False)
@@ -128,8 +134,7 @@ def test_odd_names_are_shown_and_not_run(browser, tmp_path):
     assert browser.said == []
 
 
-def test_what_a_page_says_of_a_memory(learner):
-    html = memory_page(learner)
+def test_what_a_page_says_of_a_memory(learner, html):
     text = words(html)
     assert "5 materials, 59 touches" in text
     assert "1 of them were retracted" in text

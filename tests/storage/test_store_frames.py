@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numcodecs import blosc
 
-from scroll_tactile.recordings.blosc import decompress_blosc
+from scroll_tactile.recordings.arrays.blosc import decompress_blosc
 from store.frames import compress, decompress, decompress_zstd
 
 ITEMS = st.sampled_from([1, 2, 4, 8])

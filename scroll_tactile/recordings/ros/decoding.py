@@ -14,10 +14,10 @@ import numpy as np
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.libraries import missing
-from scroll_tactile.recordings.bagfiles import Channel
 from scroll_tactile.recordings.blocks import Request
 from scroll_tactile.recordings.bounds import Budget
 from scroll_tactile.recordings.paths import fields_of
+from scroll_tactile.recordings.ros.bagfiles import Channel
 
 __all__ = ["MessageTypes"]
 

@@ -1,4 +1,4 @@
-"""Which clock to believe: the device's, a header's that is not zero, when a message was sent, when it was logged."""
+"""The clocks and counters of messages: the device's, a header's, when a message was sent, when it was logged."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import FieldError, InputError
-from scroll_tactile.recordings.bagfiles import Message
+from scroll_tactile.errors import FieldError
 from scroll_tactile.recordings.paths import FieldPath, fields_of
+from scroll_tactile.recordings.ros.bagfiles import Message
 
-__all__ = ["CLOCKS", "Stamps", "choose", "lost"]
+__all__ = ["CLOCKS", "Stamps"]
 
 CLOCKS = ("device", "header", "publish", "log")
 """The clocks of a message, the one to prefer first."""
@@ -154,45 +154,3 @@ def _unit(text: str, values: list[Any], times: _Times, log: _Times) -> float:
     if span <= 0 or logged <= 0:
         return 1.0
     return float(10.0 ** (-3 * np.clip(np.round(np.log10(span / logged) / 3), 0, 3)))
-
-
-def choose(clocks: dict[str, _Times], asked: str | None) -> str | None:
-    """The name of the clock to use: the one asked for, or the first that runs; None where there is none.
-
-    Raises InputError for a clock that the recording does not have.
-    """
-    if asked is not None:
-        if asked not in clocks:
-            raise InputError(
-                f"expected a clock of this recording, {', '.join(clocks) or 'it has none'}; came {asked!r}"
-            )
-        return asked
-    for name, times in clocks.items():
-        if name not in {"device", "header"}:
-            return name
-        if len(times) and np.isfinite(times).all() and _runs(name, times):
-            return name
-    return None
-
-
-def _runs(name: str, times: _Times) -> bool:
-    if len(times) == 1 or name == "header":
-        return bool((times != 0).all())  # a header that nobody filled in is zero
-    return bool(np.ptp(times) > 0)  # a device's clock may begin at zero
-
-
-def lost(counts: npt.NDArray[np.int64]) -> tuple[int, int]:
-    """How many readings a counter says were lost, and how many came again.
-
-    A counter of 8, 16 or 32 bits wraps; one that goes back anywhere else has begun anew.
-    """
-    steps = np.diff(counts)
-    for bits in (8, 16, 32):
-        wraps = (
-            (steps < 0)
-            & (counts[:-1] >= 2**bits - 2**bits // 8)
-            & (counts[:-1] < 2**bits)
-            & (counts[1:] < 2**bits // 8)
-        )
-        steps[wraps] += 2**bits
-    return int((steps[steps > 1] - 1).sum()), int(np.count_nonzero(steps == 0))

@@ -13,7 +13,7 @@ from multiprocessing.connection import wait as wait_for
 from typing import Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.pipelines.jobs import LearnJob, Made, learn_job
+from scroll_tactile.pipelines.workers.jobs import LearnJob, Made, learn_job
 
 __all__ = ["Engine", "Processes", "engine", "require_workers"]
 

@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import RecordingError
-from scroll_tactile.recordings.blosc import decompress_blosc
+from scroll_tactile.recordings.arrays.blosc import decompress_blosc
+from scroll_tactile.recordings.arrays.groupfiles import DEEPEST, DESCRIPTION, GroupFiles, opened
 from scroll_tactile.recordings.bounds import LARGEST, Budget
-from scroll_tactile.recordings.groupfiles import DEEPEST, DESCRIPTION, GroupFiles, opened
 
 __all__ = ["ZarrArray", "is_zarr", "open_zarr"]
 

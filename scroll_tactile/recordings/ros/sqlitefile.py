@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile.errors import RecordingError
-from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, zstd
 from scroll_tactile.recordings.bounds import LARGEST, Budget
+from scroll_tactile.recordings.ros.bagfiles import Channel, Message, Scan, zstd
 
 __all__ = ["scan_db3"]
 

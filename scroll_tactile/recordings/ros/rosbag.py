@@ -17,14 +17,14 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
 from scroll_tactile.recordings import presets
-from scroll_tactile.recordings.bagfiles import Channel, Message, Scan, inflated, scan_bag
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import Budget, read_text, require_inside, stored_bytes
-from scroll_tactile.recordings.clocks import Stamps
-from scroll_tactile.recordings.decoding import MessageTypes
-from scroll_tactile.recordings.mcapfile import scan_mcap
 from scroll_tactile.recordings.paths import FieldPath, fields_of, nearest
-from scroll_tactile.recordings.sqlitefile import scan_db3
+from scroll_tactile.recordings.ros.bagfiles import Channel, Message, Scan, inflated, scan_bag
+from scroll_tactile.recordings.ros.decoding import MessageTypes
+from scroll_tactile.recordings.ros.mcapfile import scan_mcap
+from scroll_tactile.recordings.ros.sqlitefile import scan_db3
+from scroll_tactile.recordings.ros.stamps import Stamps
 
 __all__ = ["SUFFIXES", "RosBag", "is_rosbag", "picture"]
 
@@ -224,6 +224,24 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         for file in there:
             require_inside(path, file)
         return there, False
+    about = _listing(path, listed)
+    names = [str(name) for name in about["relative_file_paths"]]
+    if any("\\" in name or Path(name).name in ("", "..") for name in names):
+        raise RecordingError(f"{listed} lists what are no names of files: {names!r:.200}")
+    files = [path / Path(name).name for name in names]
+    absent = [file.name for file in files if not file.exists()]
+    if absent:
+        raise RecordingError(
+            f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
+            f"{', '.join(p.name for p in there) or 'none'}, one by one"
+        )
+    for file in files:
+        require_inside(path, file)
+    return files, str(about.get("compression_mode", "")).lower() == "message"
+
+
+def _listing(path: Path, listed: Path) -> Any:
+    """The part of a metadata.yaml that lists files; raises RecordingError where reading it would take for ever."""
     try:
         from ruamel.yaml import YAML, AliasEvent  # comes with rosbags
         from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
@@ -243,20 +261,7 @@ def _files(path: Path) -> tuple[list[Path], bool]:
         if depth > _DEEPEST:  # each level makes all that follows slower
             raise RecordingError(f"{listed} has more than {_DEEPEST} lists within each other")
     about = YAML(typ="safe").load(lists)
-    about = about if len(parts) == 2 else about["rosbag2_bagfile_information"]
-    names = [str(name) for name in about["relative_file_paths"]]
-    if any("\\" in name or Path(name).name in ("", "..") for name in names):
-        raise RecordingError(f"{listed} lists what are no names of files: {names!r:.200}")
-    files = [path / Path(name).name for name in names]
-    absent = [file.name for file in files if not file.exists()]
-    if absent:
-        raise RecordingError(
-            f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
-            f"{', '.join(p.name for p in there) or 'none'}, one by one"
-        )
-    for file in files:
-        require_inside(path, file)
-    return files, str(about.get("compression_mode", "")).lower() == "message"
+    return about if len(parts) == 2 else about["rosbag2_bagfile_information"]
 
 
 def _natural(name: str) -> list[Any]:
@@ -323,7 +328,7 @@ def _decompressed(data: bytes) -> npt.NDArray[np.uint8]:
         from PIL import Image
     except ImportError as error:
         raise missing("Pillow", "gelsight", "a topic of compressed pictures", cause=error) from error
-    # Of what sensors send; other formats start other programs, or are decoded by what was not made for strangers.
+    # What sensors send: decoders of other formats start programs, or were not made for files from elsewhere.
     with Image.open(BytesIO(data), formats=("JPEG", "PNG")) as picture:
         if picture.width * picture.height > _PIXELS:
             raise RecordingError(f"a picture of {picture.width} × {picture.height} pixels; expected at most {_PIXELS}")

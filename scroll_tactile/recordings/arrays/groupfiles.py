@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile.errors import RecordingError
-from scroll_tactile.recordings.bounds import Budget, stored_bytes
+from scroll_tactile.recordings.bounds import Budget, on_disk, stored_bytes
 
 __all__ = ["DEEPEST", "DESCRIPTION", "GroupFiles", "opened"]
 
@@ -87,7 +87,7 @@ class _Folder(GroupFiles):
             what = "link" if stat.S_ISLNK(about.st_mode) else "FIFO, a device or another kind of entry than expected"
             raise RecordingError(f"{key} of {self.address} is a {what}; a Zarr group is made of files and folders")
         if stat.S_ISREG(about.st_mode):
-            self.budget.add(min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size))
+            self.budget.add(on_disk(about))
         return True
 
     def read(self, key: str, most: int) -> bytes:

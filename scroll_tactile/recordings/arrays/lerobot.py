@@ -14,11 +14,10 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.arrays.parquetpages import LONGEST_LIST, require_bounded_pages
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
-from scroll_tactile.recordings.keys import matched
-from scroll_tactile.recordings.parquetpages import LONGEST_LIST, require_bounded_pages
-from scroll_tactile.recordings.paths import select
+from scroll_tactile.recordings.paths import matched, select
 
 __all__ = ["LeRobot", "is_lerobot"]
 
@@ -94,8 +93,8 @@ class LeRobot(Source):
     def _opened(self, path: Path, columns: list[str] | None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
 
-        The budget is charged for what their pages claim, before pyarrow is asked. pyarrow itself is not asked for what
-        the footer says of columns: where that is damaged, its answer is to end the process.
+        The budget is charged for what their pages claim, before pyarrow opens it. What the footer holds
+        about columns is not read by pyarrow: where that is damaged, pyarrow ends the process.
         """
         require_inside(self.path, path)
         self.budget.add(stored_bytes(path))

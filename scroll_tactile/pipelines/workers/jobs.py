@@ -53,7 +53,7 @@ class Making:
         options: SourceOptions,
         patience: float | None,
     ) -> Making:
-        """As a memory that is held was made; as is said of a new one. Raises InputError."""
+        """That of a memory that is held; or of a new one, by the arguments. Raises InputError."""
         if held is not None:
             sensor, embedding, kept = held.sensor, held.embedding, held.settings
             return cls(sensor, embedding, held.augmentation, kept.exemplars, kept.kept_touches, options, patience)

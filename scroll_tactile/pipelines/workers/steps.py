@@ -13,9 +13,9 @@ from pathlib import Path
 
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.addresses import is_memory
-from scroll_tactile.pipelines.jobs import LearnJob, Made, Making
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.pipelines.sources import Refused
+from scroll_tactile.pipelines.workers.jobs import LearnJob, Made, Making
 from store.files import remove_tree
 
 __all__ = ["NOTES", "Step", "Steps"]

@@ -15,11 +15,10 @@ import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.arrays.zarrfile import open_zarr
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, SPARE, Budget, stored_bytes
-from scroll_tactile.recordings.keys import CLOCK_KEYS, matched
-from scroll_tactile.recordings.paths import select
-from scroll_tactile.recordings.zarrfile import open_zarr
+from scroll_tactile.recordings.paths import CLOCK_KEYS, matched, select
 
 __all__ = ["Hdf5", "Npy", "ZarrBuffer"]
 
@@ -90,7 +89,11 @@ class _Arrays(Source):
 
     def _rows(self, array: Any, begin: int, end: int) -> Any:
         """These rows of an array; raises RecordingError where a recording of this size cannot hold them."""
-        return np.asarray(array[begin:end])
+        self._charge(array, begin, end)
+        return array[begin:end]
+
+    def _charge(self, array: Any, begin: int, end: int) -> None:
+        self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
 
 
 class Npy(_Arrays):
@@ -109,17 +112,13 @@ class Npy(_Arrays):
             raise FieldError(f"{self.address} holds no clock; came {self.request.clock!r}: give rate= in its place")
         yield from self._slices(array, None, "", self.field(), None)
 
-    def _rows(self, array: Any, begin: int, end: int) -> Any:
-        self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
-        return array[begin:end]
-
     def _array(self) -> _NpyArray:
         self.budget = Budget(self.address, stored_bytes(self.path))
         return _NpyArray(self.path, self.address)
 
 
 class _NpyArray:
-    """The array of a `.npy`, of which rows are read when they are asked for.
+    """The array of a `.npy`, of which rows are read by a slice.
 
     It is not mapped: a file that another program cuts off meanwhile would end this one, and holes would take memory
     where the disk is memory.
@@ -187,11 +186,10 @@ class Hdf5(_Arrays):
                     self._require_own(item)
                 yield from self._slices(part, times, key, rest, number if number >= 0 else None)
 
-    def _rows(self, array: Any, begin: int, end: int) -> Any:
-        self.budget.take((end - begin) * math.prod(array.shape[1:]) * array.dtype.itemsize)
+    def _charge(self, array: Any, begin: int, end: int) -> None:
+        super()._charge(array, begin, end)
         if array.compression == "gzip":
             self._measure(array, begin, end)
-        return array[begin:end]
 
     def _measure(self, array: Any, begin: int, end: int) -> None:
         """Raises RecordingError for a chunk that deflate would make longer than a chunk is: HDF5 takes all that comes.
@@ -289,6 +287,9 @@ class ZarrBuffer(_Arrays):
                 block.episodes = np.searchsorted(ends, index, side="right").astype(np.int64)
             done += len(block.readings)
             yield block
+
+    def _charge(self, array: Any, begin: int, end: int) -> None:
+        pass  # it charges for its chunks as it reads them
 
     def _ends(self, array: Any, count: int) -> Any:
         if array.why or array.ndim != 1 or array.dtype.kind not in "iu" or array.shape[0] > count + _EPISODES:

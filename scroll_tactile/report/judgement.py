@@ -21,12 +21,12 @@ PAIRS = 30
 
 def alike(facts: MemoryFacts) -> tuple[str, list[str]]:
     """Who is near whom, and the order of materials that brings near ones together; empty where there are many."""
-    names, apart = facts.near
+    names, separation = facts.near
     if len(names) < 2:
         many = len(facts.counts) > MOST_NEAR
         why = f"there are more than {MOST_NEAR} materials." if many else "it takes two materials, touched long enough."
         return facts.lacks("Who is near whom", why), []
-    pairs = table(["material", "feels like", "separation"], _nearest(names, apart), "nearest pairs")
+    pairs = table(["material", "feels like", "separation"], _nearest(names, separation), "nearest pairs")
     found = f"<div><h3>Nearest pairs</h3>{pairs}</div>"
     words = (
         "Separation is the log-odds that a typical touch of one has over the other. Of touches that scatter as a bell "
@@ -34,22 +34,22 @@ def alike(facts: MemoryFacts) -> tuple[str, list[str]]:
     )
     if len(names) > ROWS:
         return note(words) + found, []
-    drawn, order = tree(names, _joins(apart))
+    drawn, order = tree(names, _joins(separation))
     caption = f"Materials that join further to the left feel more alike (average linkage). {words}"
     return side_by_side(figure(drawn, caption), found), order
 
 
-def _joins(apart: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _joins(separation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     from scipy.cluster.hierarchy import linkage
     from scipy.spatial.distance import squareform
 
-    return np.asarray(linkage(squareform(apart, checks=False), "average"))
+    return np.asarray(linkage(squareform(separation, checks=False), "average"))
 
 
-def _nearest(names: list[str], apart: npt.NDArray[np.float64]) -> list[list[object]]:
+def _nearest(names: list[str], separation: npt.NDArray[np.float64]) -> list[list[object]]:
     first, second = np.triu_indices(len(names), 1)
-    order = np.argsort(apart[first, second], kind="stable")[:PAIRS]
-    return [[names[i], names[j], float(apart[i, j])] for i, j in zip(first[order], second[order], strict=True)]
+    order = np.argsort(separation[first, second], kind="stable")[:PAIRS]
+    return [[names[i], names[j], float(separation[i, j])] for i, j in zip(first[order], second[order], strict=True)]
 
 
 def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
@@ -107,19 +107,19 @@ def trusted(facts: MemoryFacts) -> str:
     verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
     caption = (
         "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
-        f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is usual of perfect answers. "
+        f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is the mean of perfect answers. "
         "Upright lines are 95% intervals."
     )
     drawn = reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out])
-    strange = unknown_by(facts.held_out)
+    unknown_touches = unknown_by(facts.held_out)
     words = (
         f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} are meant to be. A "
         "material far above that varies more than it was shown to: teach more of it."
     )
-    if len(strange) <= ROWS:
-        bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in strange]
+    if len(unknown_touches) <= ROWS:
+        bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in unknown_touches]
         return side_by_side(figure(drawn, caption), figure(shares(bars, alarms, "called unknown, left out"), words))
-    rows = [[name, unknown, count] for name, unknown, count in strange if unknown]
+    rows = [[name, unknown, count] for name, unknown, count in unknown_touches if unknown]
     listed = table(["material", "called unknown", "of"], rows, "touches called unknown")
     return side_by_side(figure(drawn, caption), f"<div>{note(words)}{listed if rows else ''}</div>")
 
@@ -138,15 +138,15 @@ def growing_answers(facts: MemoryFacts) -> str:
 
 
 def _soon(facts: MemoryFacts) -> str:
-    said = facts.soon
-    if said is None:
+    measured = facts.soon
+    if measured is None:
         return facts.lacks("How soon answers come", "too few touches are kept to measure it.")
-    lines = {"right": said.right, "decided": said.decided, "decided and wrong": said.wrong}
+    lines = {"right": measured.right, "decided": measured.decided, "decided and wrong": measured.wrong}
     caption = (
-        f"Of {said.count} touches left out, after each time: the share whose likeliest material is the true one, the "
-        "share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
+        f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, "
+        "the share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
     )
-    return figure(over_time(said.seconds, lines), caption)
+    return figure(over_time(measured.seconds, lines), caption)
 
 
 def _grown(touch: Growing) -> str:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from scroll_tactile.errors import InputError, RecordingError
-from scroll_tactile.recordings.bagfiles import DAMAGE, Channel, CutOff, Message, Scan, decompress, take
 from scroll_tactile.recordings.bounds import LARGEST
+from scroll_tactile.recordings.ros.bagfiles import DAMAGE, Channel, CutOff, Message, Scan, decompress, take
 
 __all__ = ["scan_mcap"]
 

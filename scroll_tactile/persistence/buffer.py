@@ -28,7 +28,7 @@ def ranked_exemplars(memory: Memory, store: Store | None) -> dict[str, list[Exem
     def mean(material: str, scale: Scale) -> npt.NDArray[np.int64]:
         return mean_code(statistics.sums(scale, [material])[0], int(statistics.counts(scale, [material])[0]))
 
-    return rank(exemplar_candidates(memory, store), memory.capacity, mean)
+    return rank(exemplar_candidates(memory, store), memory.recipe.exemplars, mean)
 
 
 def exemplar_candidates(memory: Memory, store: Store | None) -> list[Exemplar]:

@@ -35,7 +35,6 @@ def pack_memory(
     if not readings:
         identity |= {"exemplars": 0, "kept_touches": 0}
         packed.kept = packed.exemplars = None
-        packed.capacity = 0
     with reported(path, "packing a memory"):
         path.parent.mkdir(parents=True, exist_ok=True)
         # What a failing disk does not let go of says nothing of what was packed.

@@ -1,5 +1,7 @@
 """A memory: what a journal row holds, and what comes back from a store."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -96,7 +98,10 @@ def touch(seed):
 
 
 def filled(seeds):
-    memory = Memory(DIMENSION, READING)
+    made_with = SimpleNamespace(
+        plan=READING, embedding=SimpleNamespace(dimension=DIMENSION), exemplars=0, kept_touches=0
+    )
+    memory = Memory(made_with)
     for i, seed in enumerate(seeds, start=1):
         memory.add(*touch(seed), i, None, None)
     return memory

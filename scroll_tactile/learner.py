@@ -5,32 +5,26 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
-from scroll_tactile.memory.descriptions import Description, checked
-from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.errors import DescriptionError, RangeWarning
 from scroll_tactile.memory.tuned import TuneReport
-from scroll_tactile.persistence.buffer import ranked_exemplars
+from scroll_tactile.persistence.keeper import MemoryKeeper
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
-from scroll_tactile.persistence.observations import observations
-from scroll_tactile.persistence.packing import pack_memory
 from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import Readings
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.reembedding import reembedding
+from scroll_tactile.prediction.reembedding import embed_again
 from scroll_tactile.recipe import Recipe, RecipeRequest
-from scroll_tactile.results import Compacted, Composition, Merged, Observation, Prediction, Receipt
+from scroll_tactile.results import Composition, Merged, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.settings import Settings, names_of, require_name, require_source, require_text
+from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream
@@ -43,10 +37,8 @@ __all__ = ["TactileLearner"]
 
 logger = logging.getLogger(__name__)
 
-Progress = Callable[[str, int, int], object]
 
-
-class TactileLearner:
+class TactileLearner(MemoryKeeper):
     """A memory of how materials feel: exact, durable where it has a path, and honest about what it never observed.
 
     >>> from scroll_tactile import TactileLearner, sensors
@@ -114,20 +106,9 @@ class TactileLearner:
     def _ledger(self) -> Ledger:
         return self._predictor.ledger
 
-    @contextmanager
-    def _locked(self) -> Iterator[Ledger]:
-        """The ledger, and its lock: the one that is there when the lock is had, for `reembed` puts another in place."""
-        while True:
-            ledger = self._ledger
-            with ledger.lock:
-                if ledger is self._ledger:
-                    yield ledger
-                    return
-
     def __getstate__(self) -> dict[str, Any]:
-        with self._locked():
-            name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
-            return {"of": name, "memory": self._predictor.snapshot()}
+        name = self._snapshot_of or ("a memory without a path" if self.path is None else str(self.path))
+        return {"of": name, "memory": self._predictor.snapshot()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self._set_up(Predictor.of_snapshot(state["memory"]), state["of"])
@@ -166,23 +147,6 @@ class TactileLearner:
     def plan(self) -> WindowPlan:
         """Which windows of a touch are read, and which of them judge."""
         return self._recipe.plan
-
-    @property
-    def path(self) -> Path | None:
-        """The folder of the memory; None where it is in memory only."""
-        return None if self._ledger.store is None else self._ledger.store.path
-
-    @property
-    def memory(self) -> Memory:
-        """What it has learned: statistics, sample, exemplars, descriptions and f*. Read it; never change it."""
-        with self._locked() as ledger:
-            return ledger.memory
-
-    @property
-    def materials(self) -> dict[str, int]:
-        """Material → number of observations, in alphabetical order."""
-        with self._locked() as ledger:
-            return ledger.memory.statistics.materials
 
     def stream(self, readings: Readings) -> Stream:
         """What `observe` makes of readings before it learns them: sound, and of a camera's the frames in contact.
@@ -223,81 +187,7 @@ class TactileLearner:
         stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream; StoreError.
         """
         touch = self._predictor.extractor.stream(stream)
-        with self._locked() as ledger:
-            return ledger.contents().names(touch.key)
-
-    def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
-        """Say what a material is made of, before or after it is touched; durable when this returns.
-
-        constituents: name → share by mass, from 0 to 1, summing to one; a mass that is not named is absent. For
-        attributes that are no masses: True or False; one that is not named is unknown. None for a name: unknown, and
-        nothing is learned of that constituent from this material. None for all: removes the description.
-
-        A later description replaces an earlier one as a whole; the same one again changes nothing. Statistics and
-        `digest` stay as they are. `forget` removes the description too, `retract` does not.
-
-        Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, or names
-        that cannot be used (nothing was changed); StoreError.
-        """
-        material = require_name(material)
-        self._ledger.describe(material, None if constituents is None else checked(material, constituents))
-
-    @property
-    def descriptions(self) -> dict[str, Description]:
-        """Material → its description, in alphabetical order, whether it was observed or not."""
-        with self._locked() as ledger:
-            described = ledger.memory.descriptions
-            return {name: dict(description) for name, description in sorted(described.items())}
-
-    @contextmanager
-    def batch(self) -> Iterator[None]:
-        """Make what is observed, retracted or forgotten in the block durable together, when it ends.
-
-        For many touches: it waits for the disk once. If the process dies in the block, none of it is kept; after an
-        exception, what came before it is. Other threads wait for its end, and it allows no fine-tuning, merging,
-        compacting or closing. In a memory without a path it does nothing.
-
-        Raises StoreError where the batch could not be made durable: the memory is then as it was before it.
-        """
-        with self._ledger.batch():
-            yield
-
-    def retract(self, receipt: Receipt | int) -> None:
-        """Take one observation out again, by its receipt or its sequence; durable when this returns.
-
-        Statistics, exemplars and readouts are then, to the bit, those of a memory that never had it; an f* that was
-        made from it is gone. Its features stay in the journal, unused, until `compact`.
-
-        Raises ObservationError (nothing was changed) for one that is not there, was retracted before or was
-        compacted, or for a receipt of another memory; InputError in a memory without a path; StoreError.
-        """
-        self._ledger.retract(receipt)
-
-    def relabel(self, receipt: Receipt | int, material: str) -> int:
-        """Give an observation another name: retract it and observe its readings under the new one, durable as one.
-
-        Returns its new sequence; it keeps its time and source. A description stays with the name that it was given to.
-
-        Raises what `retract` raises (nothing was changed), also MaterialError for a name that is none; InputError where
-        it has that name already, and in a batch.
-        """
-        return self._ledger.relabel(receipt, require_name(material))
-
-    def forget(self, material: str | None = None, *, source: str | None = None) -> int:
-        """Retract all observations of a material, or from a source, as `retract` does one; returns how many.
-
-        A forgotten material loses its description, too. source: a file, as `observations` names it, or a folder or
-        address that files lie in, such as a robot's day.
-
-        Raises UnknownMaterialError for a material never observed, and ObservationError (nothing was changed) where some
-        of them were compacted, or a source has none; InputError for both or neither, and in a memory without a path;
-        StoreError.
-        """
-        if (material is None) == (source is None):
-            raise InputError("say what is to be forgotten: a material, or a source")
-        if material is not None:
-            require_text(material)
-        return self._ledger.forget(material, None if source is None else require_source(source))
+        return self._ledger.names(touch.key)
 
     def merge(
         self,
@@ -305,7 +195,7 @@ class TactileLearner:
         *,
         shared: Literal["once", "twice"],
         descriptions: Choice = "same",
-        progress: Progress | None = None,
+        progress: Callable[[str, int, int], object] | None = None,
     ) -> Merged:
         """Add everything that another memory observed; durable, as a whole, when this returns.
 
@@ -323,47 +213,9 @@ class TactileLearner:
         rules = MergeRules(once=shared == "once", descriptions=descriptions)
         return self._ledger.merge(path, rules, progress or _silent)[0]
 
-    def backup(self, destination: str | os.PathLike[str], *, progress: Progress | None = None) -> None:
-        """Copy the memory to a new folder, also while it is in use: whole, as it was at one moment, or not at all.
-
-        Raises InputError in a memory without a path; StoreError where something is there already, or it cannot be
-        written or verified.
-        """
-        require_arguments({"destination": destination}, {"progress": progress})
-        self._ledger.require_store("be copied").backup(destination, progress=progress)
-
-    def pack(
-        self, path: str | os.PathLike[str], *, rows: bool = True, readings: bool = True, source: str | None = None
-    ) -> None:
-        """Write the memory as one file that travels, and that `merge` takes; whole and durable, or not there at all.
-
-        It holds what was learned: sums, sampled touches, kept touches and descriptions, and of each observation its
-        name, content hash, time and source. f* and retracted observations stay behind.
-        rows: also each observation's readings, or codes where the memory has no readings, so that it can be retracted
-        where the file is merged, and counted once where it is there already. They are left out of a memory of which any
-        were compacted. Without them come the readings of the exemplars. readings: False leaves out all that shows a
-        touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with
-        exemplars=0 and kept_touches=0. source: what is said of observations that have none.
-
-        Raises InputError in a memory without a path, and for a source that is none; StoreError.
-        """
-        require_arguments({"path": path})
-        said = None if source is None else require_source(source)
-        with self._locked() as ledger:
-            store = ledger.require_store("be packed")
-            pack_memory(store, ledger.memory, Path(path), rows=rows, readings=readings, source=said)
-
-    def compact(self, *, keep: int = 0) -> Compacted:
-        """Give up the features and readings of old observations, for space; what was learned from them stays.
-
-        keep: how many of the newest observations can still be retracted afterwards, by `retract` and `forget`; the
-        older ones cannot any more. What was retracted before is gone from the disk, too.
-
-        Raises InputError for a keep below 0, in a batch, and in a memory without a path; StoreError.
-        """
-        return self._ledger.compact(keep)
-
-    def reembed(self, embedding: Embedding | None = None, *, progress: Progress | None = None) -> Path:
+    def reembed(
+        self, embedding: Embedding | None = None, *, progress: Callable[[str, int, int], object] | None = None
+    ) -> Path:
         """Carry the memory over to another embedding, from the readings in its journal; durable when this returns.
 
         embedding: None for its own as it is now, with the packages and on the machine at hand. progress: called with
@@ -378,30 +230,8 @@ class TactileLearner:
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.
         """
         require_arguments({}, {"embedding": embedding, "progress": progress})
-        with self._locked() as ledger:  # not in the midst of another thread's batch
-            store = ledger.require_store("be embedded again")
-            ledger.require_writing()
-        carried = reembedding(store, embedding)
-        try:
-            carried.copy(progress or _silent)
-            with self._locked() as ledger:
-                ledger.require_writing()
-                carried.copy(progress or _silent)
-                self.close()
-                before = carried.put_in_place()
-                own = self.settings.model_copy(update={"exemplars": None, "kept_touches": None})
-                other = Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, None, own))
-                self._predictor.replaced, self._predictor = True, other
-        finally:
-            carried.close()
+        before, self._predictor = embed_again(self._predictor, embedding, progress or _silent)
         return before
-
-    def refresh(self) -> bool:
-        """In a memory opened to read, take in what was committed since; whether there was anything.
-
-        Raises StoreError; what was known before stays then.
-        """
-        return self._ledger.refresh()
 
     def predict(self, *streams: Readings, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
         """Classify a stream among the materials observed; the memory stays as it is, and the answer is of one state.
@@ -480,39 +310,13 @@ class TactileLearner:
         """The readouts and calibrations of the memory as it is now, as after `settle`; later touches are not in it."""
         return self._predictor.fitted()
 
-    def digest(self) -> str:
-        """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
-        with self._locked() as ledger:
-            return ledger.memory.statistics.digest()
-
-    def observations(self) -> list[Observation]:
-        """Every observation in the journal, in order, and its state; none in a memory without a path.
-
-        Raises StoreError.
-        """
-        with self._locked() as ledger:
-            return [] if ledger.store is None else observations(ledger.store)
-
-    @property
-    def exemplars(self) -> dict[str, list[bytes]]:
-        """Material → content hashes of its exemplars, in rank order; materials in alphabetical order."""
-        return {name: [exemplar.key for exemplar in ranked] for name, ranked in self.ranked_exemplars().items()}
-
-    def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
-        """Material → its exemplars with their readings (T, n) in the sensor's unit, in rank order.
-
-        Raises StoreError; CompactedError in a memory opened to read that was compacted since: `refresh` it first.
-        """
-        with self._locked() as ledger:
-            return ranked_exemplars(ledger.memory, ledger.store)
-
     def fine_tune(
         self,
         *,
         epochs: int | None = None,
         seed: int = 0,
         device: str = "cpu",
-        progress: Progress | None = None,
+        progress: Callable[[str, int, int], object] | None = None,
     ) -> TuneReport:
         """Make f* from f by training on the exemplars; durable when this returns.
 
@@ -532,12 +336,6 @@ class TactileLearner:
         how: dict[str, Any] = {"epochs": epochs, "seed": seed, "device": device}
         return fine_tune_memory(self._predictor, **how, progress=progress or _silent)
 
-    def tuned_digest(self) -> str | None:
-        """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
-        with self._locked() as ledger:
-            tuned = ledger.memory.tuned
-            return None if tuned is None else tuned.digest()
-
     def close(self) -> None:
         """Write a checkpoint, so that opening replays nothing, and release the files; a second call does nothing.
 
@@ -547,8 +345,7 @@ class TactileLearner:
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """
-        with self._locked():
-            self._predictor.close()
+        self._predictor.close()
 
     def __enter__(self) -> Self:
         return self

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,8 @@ from store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedE
 __all__ = ["OpenMemory"]
 
 logger = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer")
 
 Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
 """Arrays and attributes."""
@@ -80,6 +82,11 @@ class OpenMemory:
             self._changed()
         return self._memory
 
+    def read(self, what: Callable[[Memory, Store | None], Answer]) -> Answer:
+        """What is read of the memory and its journal, while nobody changes them."""
+        with self.lock:
+            return what(self.memory, self.store)
+
     def contents(self) -> Contents | StoredContents:
         """Which touches the memory has, by their content; whoever calls holds the lock.
 
@@ -94,6 +101,11 @@ class OpenMemory:
                 "before the memory is closed, or observe with again=True"
             )
         return self._contents
+
+    def names(self, key: bytes) -> list[str]:
+        """The names of a touch with this content hash; raises as `contents`."""
+        with self.lock:
+            return self.contents().names(key)
 
     def copied_contents(self) -> Contents | None:
         """All that `contents` has, to be changed apart; None where nobody knows."""

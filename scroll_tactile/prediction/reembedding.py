@@ -9,14 +9,15 @@ from pathlib import Path
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.persistence.reembed import Reembedding
+from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.recipe import Recipe, default_kept_touches
+from scroll_tactile.recipe import Recipe, RecipeRequest, default_kept_touches
 from scroll_tactile.settings import Settings
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.validation.gate import MemoryStore, finish_interrupted
 from store import Store
 
-__all__ = ["reembed_memory", "reembedding"]
+__all__ = ["embed_again", "reembed_memory"]
 
 
 def reembed_memory(
@@ -28,7 +29,7 @@ def reembed_memory(
     """As `TactileLearner.reembed`, with the memory in a folder, also where its own embedding is not at hand."""
     finish_interrupted(Path(path))
     with MemoryStore.open(path) as store:
-        carried = reembedding(store, embedding)
+        carried = _reembedding(store, embedding)
         try:
             carried.copy(progress or (lambda what, done, of: None))
             return carried.put_in_place()
@@ -36,7 +37,31 @@ def reembed_memory(
             carried.close()
 
 
-def reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
+def embed_again(
+    predictor: Predictor, embedding: Embedding | None, progress: Callable[[str, int, int], object]
+) -> tuple[Path, Predictor]:
+    """As `TactileLearner.reembed`; also what answers from the memory that took the place of the other."""
+    ledger = predictor.ledger
+    with ledger.lock:  # not in the midst of another thread's batch
+        store = ledger.require_store("be embedded again")
+        ledger.require_writing()
+    carried = _reembedding(store, embedding)
+    try:
+        carried.copy(progress)
+        with ledger.lock:
+            ledger.require_writing()
+            carried.copy(progress)
+            predictor.close()
+            before = carried.put_in_place()
+            predictor.replaced = True
+            kept = {"exemplars": None, "kept_touches": None}  # those of the new one
+            settings = predictor.recipe.settings.model_copy(update=kept)
+            return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, None, settings))
+    finally:
+        carried.close()
+
+
+def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     """What carries the memory in a store over to another embedding; None: to its own, made again."""
     made = Identity.read(store)
     chosen = made.own_embedding(store.path) if embedding is None else embedding

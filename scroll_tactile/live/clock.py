@@ -31,7 +31,7 @@ GAP = 0.1  # seconds
 FEWEST_LOST = 5  # periods in a gap, of a slow sensor
 WITHIN = 0.75  # periods
 FOLLOWED = 0.02  # of how far a stamp lies off, in the next one's place
-UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+CLOCK_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
 class ClockPart:
@@ -92,14 +92,14 @@ class Clock:
             if unit and unit == before:
                 raise InputError(
                     f"expected times in seconds; those that came differ by {stamp - last:.6g} from reading to reading, "
-                    f"and the sensor has {self._rate:g} readings a second. They look like {UNITS[unit]}: "
+                    f"and the sensor has {self._rate:g} readings a second. They look like {CLOCK_UNITS[unit]}: "
                     f"divide them by {unit:.0e}"
                 )
             last, before = stamp, unit
         self._unit = before
 
     def _unit_of(self, step: float) -> float:
-        return next((unit for unit in UNITS if 0.2 * unit < step * self._rate < 5 * unit), 0.0)
+        return next((unit for unit in CLOCK_UNITS if 0.2 * unit < step * self._rate < 5 * unit), 0.0)
 
     def places(self, rows: Rows, seconds: list[float]) -> Iterator[ClockPart]:
         """The readings, shape (k, …), in their places."""

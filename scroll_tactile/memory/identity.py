@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -29,16 +29,16 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.windows import COMPETING, ScaleKind
 from scroll_tactile.statistics.grid import BITS
-from store import DamageError
+from store import DamageError, Store
 
-__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identified", "Identity"]
-MOST_FEATURES = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
+__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identity"]
+LARGEST_DIMENSION = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
 MOST_STREAMS = 2**31
-MOST_VALUES = 2**31  # of a sensor at once, or in one channel of a touch
+WIDEST = 2**31  # of a sensor at once, or in one channel of a touch
 
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 _Streams = Annotated[int, Field(ge=0, le=MOST_STREAMS)]
-_Width = Annotated[int, Field(ge=1, le=MOST_VALUES)]
+_Width = Annotated[int, Field(ge=1, le=WIDEST)]
 
 
 class _Kept(BaseModel):
@@ -51,7 +51,7 @@ class EmbeddingIdentity(_Kept):
     """What a memory knows of its embedding; configuration: what makes it again, None for a user's own embedding."""
 
     name: _Text
-    dimension: Annotated[int, Field(ge=1, le=MOST_FEATURES)]
+    dimension: Annotated[int, Field(ge=1, le=LARGEST_DIMENSION)]
     bound: Annotated[FiniteFloat, Field(gt=0)]
     fingerprint: _Text
     configuration: dict[str, Any] | None
@@ -83,18 +83,6 @@ class EmbeddingIdentity(_Kept):
         return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
 
 
-class Identified(Protocol):
-    """What says what it was made with: a store, or a partial of one."""
-
-    @property
-    def path(self) -> Path:
-        """Where it is."""
-
-    @property
-    def identity(self) -> Mapping[str, Any]:
-        """What it was made with, as JSON."""
-
-
 class Grid(_Kept):
     """The grid of codes, and the widths of windows; frames: whether they are a camera's frames."""
 
@@ -121,8 +109,8 @@ class Identity(_Kept):
 
     @model_validator(mode="after")
     def _of_a_sensor_that_can_be(self) -> Self:
-        if max(self.sensor.channels, self.sensor.readings) > MOST_VALUES:
-            raise ValueError(f"expected a sensor of at most {MOST_VALUES} channels, and readings in a touch")
+        if max(self.sensor.channels, self.sensor.readings) > WIDEST:
+            raise ValueError(f"expected a sensor of at most {WIDEST} channels, and readings in a touch")
         return self
 
     @classmethod
@@ -148,7 +136,7 @@ class Identity(_Kept):
             raise InputError(f"no memory can be made with {_first(error)}") from None
 
     @classmethod
-    def read(cls, store: Identified) -> Self:
+    def read(cls, store: Store) -> Self:
         """The identity that a store was made with.
 
         Raises MismatchError for a store that holds no memory of touch, DamageError for one that is none.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,7 +14,7 @@ from scroll_tactile.matching.likelihood import LevelArray, levels_of
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
-from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
+from scroll_tactile.memory.touch_rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.recipe import Recipe
 from scroll_tactile.sensors import Sensor
@@ -25,10 +23,11 @@ from scroll_tactile.statistics.statistics import SECOND, Statistics
 from store import Head, Record
 from store.records import LateArray
 
-__all__ = ["LATE_ROWS", "LATE_SECOND", "KeptTouches", "Memory", "give_back_scratch"]
+__all__ = ["LATE_ROWS", "LATE_SECOND", "KeptTouches", "Memory"]
 
 LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
+Chosen = tuple["TouchSample", "KeptTouches | None", "ExemplarSample | None"]
 
 
 class KeptTouches(Sample[LevelArray]):
@@ -240,6 +239,22 @@ class Memory:
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes)
 
+    @property
+    def chosen(self) -> Chosen:
+        """What was chosen among the observations: sample, kept touches and exemplars."""
+        return self.sample, self.kept, self.exemplars
+
+    @chosen.setter
+    def chosen(self, chosen: Chosen) -> None:
+        self.sample, self.kept, self.exemplars = chosen
+        self.stale = False
+
+    def take_sums(self, memory: Memory, later: Memory, last_sequence: int) -> None:
+        """Take the sums of a memory without those of the rows behind one; `chosen` is of the rows up to it already."""
+        self.statistics = memory.statistics - later.statistics
+        self.compacted, self.sequence, self.tuned = memory.compacted, last_sequence, None
+        self.retracted = set(memory.retracted)
+
     def note_compaction(self, last: int) -> None:
         """Have a compaction checkpoint stand for rows up to one: what was retracted of them is out of it for good."""
         self.compacted = last
@@ -284,10 +299,9 @@ class Memory:
         excluded = sorted(row for row in self.retracted | self.excluded if row <= compacted)
         arrays["retracted"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         if self.exemplars is not None:
-            own, attributes["exemplars"] = (
-                self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
-            )
-            arrays |= own
+            held = self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
+            arrays |= held[0]
+            attributes["exemplars"] = held[1]
         if self.tuned is not None:
             own, attributes["tuned"] = self.tuned.to_arrays()
             arrays |= own
@@ -329,20 +343,11 @@ class Memory:
     def take_tuned(self, arrays: Arrays, attributes: Any) -> None:
         """Take the tuned model of a checkpoint, if it has another one."""
         if "tuned" in attributes:
-            tuned, self.tuned_last_sequence = (
-                Tuned.from_arrays(arrays, attributes["tuned"]),
-                attributes["tuned_last_sequence"],
-            )
+            self.tuned_last_sequence = attributes["tuned_last_sequence"]
+            tuned = Tuned.from_arrays(arrays, attributes["tuned"])
             if self.tuned is None or self.tuned.digest() != tuned.digest():
                 self.tuned = tuned
 
 
 def _sample_of(rows: LateArray, arrays: Arrays, materials: Sequence[str], copies: Sequence[int]) -> TouchSample:
     return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, materials, copies)
-
-
-def give_back_scratch() -> None:
-    """Return freed memory to the system where the C library can: fitting and saving leave 40 MB of it."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)

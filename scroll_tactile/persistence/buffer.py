@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.rows import OBSERVE, only_readings
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import OBSERVE, only_readings
 from scroll_tactile.persistence.replaying import require_compaction
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code

@@ -11,8 +11,8 @@ from typing import Any, cast
 
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.validation.gate import MemoryStore
 from store import Checkpoint, DamageError, Head, Store

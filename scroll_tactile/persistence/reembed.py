@@ -18,7 +18,8 @@ from pathlib import Path
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.rows import (
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import (
     DESCRIBE,
     OBSERVE,
     RETRACT,
@@ -28,7 +29,6 @@ from scroll_tactile.memory.rows import (
     pack_readings,
     unpack_readings,
 )
-from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.replaying import load, refill, replay
 from scroll_tactile.recipe import Recipe
 from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted, require_counted
@@ -39,8 +39,8 @@ from store.lock import WriterLock
 
 __all__ = ["Reembedding"]
 
-BATCH = 64  # rows that wait for the disk together
-SNAPSHOT_EVERY = 256  # rows, after which a run that goes on does not embed them again
+ROWS_TOGETHER = 64  # rows that wait for the disk together
+CARRIED_EVERY = 256  # rows, after which a run that goes on does not embed them again
 
 
 class Reembedding:
@@ -77,10 +77,10 @@ class Reembedding:
         memory, draft = self._memory, self._draft
         while draft.last < self._source.last:
             with draft.batch():
-                for record in islice(self._source.records(after=memory.sequence), BATCH):
+                for record in islice(self._source.records(after=memory.sequence), ROWS_TOGETHER):
                     self._carry(record)
             refill(memory, draft)
-            if memory.sequence - memory.saved >= SNAPSHOT_EVERY:
+            if memory.sequence - memory.saved >= CARRIED_EVERY:
                 self._snapshot()
             progress("embedding", draft.last, self._source.last)
 

@@ -30,7 +30,7 @@ from scroll_tactile.errors import (
     RangeWarning,
     ScrollTactileError,
 )
-from scroll_tactile.memory.rows import SOURCE
+from scroll_tactile.memory.touch_rows import SOURCE
 from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.pipelines.addresses import expand, fetched
 from scroll_tactile.pipelines.destination import Destination, FleetReport

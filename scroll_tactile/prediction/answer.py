@@ -18,11 +18,11 @@ from scroll_tactile.errors import EmbeddingMismatchError, InputError
 from scroll_tactile.matching.conformal import Typicality
 from scroll_tactile.memory.descriptions import require_constituents
 from scroll_tactile.memory.identity import FingerprintCheck
-from scroll_tactile.memory.rows import Codes
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.buffer import exemplar_candidates
-from scroll_tactile.persistence.contents import Contents
+from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.replaying import load
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
@@ -73,7 +73,7 @@ class Predictor:
     @classmethod
     def new(cls, recipe: Recipe) -> Self:
         """Of an empty memory without a path. Raises InputError for an embedding that does not read the sensor."""
-        return cls(recipe, _extractor(recipe), Ledger(partial(Memory, recipe), contents=Contents()))
+        return cls(recipe, _extractor(recipe), Ledger(partial(Memory, recipe), contents=ListedContents()))
 
     @classmethod
     def open(

@@ -13,7 +13,7 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.identity import FingerprintCheck
-from scroll_tactile.memory.rows import Codes
+from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
@@ -137,13 +137,13 @@ class FeatureExtractor:
 
     def verified(self) -> FeatureExtractor:
         """This extractor, whose embedding is the memory's. Raises EmbeddingMismatchError."""
-        if self._check is not None and self._check.pending:
-            self._check.require(self._embedding)
+        if self.check is not None:
+            self.check.require(self._embedding)
         return self
 
     def verifying(self) -> AbstractContextManager[None]:
         """As `verified`, beside what the block does, at the end of which it raises."""
-        return nullcontext() if self._check is None else self._check.beside(self._embedding, own=self._own)
+        return nullcontext() if self.check is None else self.check.beside(self._embedding, own=self._own)
 
     def stream(self, readings: Readings) -> Stream:
         """The sound stream of some readings; of a camera's, the frames in contact.

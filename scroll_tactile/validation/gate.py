@@ -1,7 +1,7 @@
 """The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
-gate takes every row and checkpoint for what it must be (see `row_checks`, `checkpoint_checks`), and raises DamageError
+gate takes every row and checkpoint for what it must be (see `expected`, `checkpoint_checks`), and raises DamageError
 with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
 under another name is, and it fits.
 """
@@ -23,12 +23,11 @@ from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
-from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.validation.checkpoint_checks import CheckpointChecks
-from scroll_tactile.validation.expected import Unexpected
-from scroll_tactile.validation.row_checks import RowChecks
+from scroll_tactile.validation.expected import RowChecks, Unexpected
 from store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
 from store.exceptions import reported
 from store.files import file_size, is_there, sync_folder

@@ -43,6 +43,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 import scroll_tactile.learner
+import scroll_tactile.prediction.answer
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
 import scroll_tactile.prediction.fitting
@@ -153,7 +154,7 @@ LOCAL = threading.local()
 @contextmanager
 def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
     """While it lasts each answer is asked for twice of the model that gives it, which must stay as it is."""
-    own = scroll_tactile.learner.answer
+    own = scroll_tactile.prediction.answer.answer
 
     def answer(model: Any, *rest: Any) -> Prediction:
         before, said = learned_by(model), own(model, *rest)
@@ -165,7 +166,7 @@ def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
         LOCAL.learned = before
         return said
 
-    with patch.object(scroll_tactile.learner, "answer", answer):
+    with patch.object(scroll_tactile.prediction.answer, "answer", answer):
         yield
 
 

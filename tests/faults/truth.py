@@ -15,8 +15,8 @@ import numpy.typing as npt
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.match import KeptTouch
-from scroll_tactile.memory.rows import DESCRIBE, OBSERVE, RETRACT, unspanned
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import DESCRIBE, OBSERVE, RETRACT, unspanned
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 

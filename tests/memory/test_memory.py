@@ -10,8 +10,8 @@ from hypothesis.extra import numpy as arrays_of
 
 from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import CapacityError, MismatchError
-from scroll_tactile.memory.rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan, extent
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.statistics.sample import stage_rows

@@ -318,7 +318,7 @@ def test_closed_pickled_copied_and_dropped_while_a_fit_runs(fitting):
     fresh = bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
     for snapshot in (pickle.loads(pickle.dumps(fitting)), copy.deepcopy(fitting)):
         assert bits(snapshot) == fresh
-    job = fitting._current._fit
+    job = fitting._predictor.current._fit
     fitting.close()
     assert job.future.done()
     for _ in range(3):

@@ -127,7 +127,7 @@ def test_rows_behind_the_checkpoint_are_taken_in(path, fits, change):
     with opened(path) as reader:
         assert reader.digest() == wanted
         said, numbers = bits(reader), reader.memory.statistics
-        model = reader._current.present(reader._ledger)
+        model = reader._predictor.current.present(reader._ledger)
         assert model.names == list(numbers.materials)
         for scale, readout in model.readouts.items():
             assert readout.counts.sum() == numbers.counts(scale, numbers.names(scale)).sum()

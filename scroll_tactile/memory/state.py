@@ -115,11 +115,8 @@ class Memory:
         self.tuned_last_sequence = 0
         self.retracted: set[int] = set()
         self.excluded: set[int] = set()
-        self.compacted = 0
         self.checkpoint: int | None = None
-        self.saved = 0
-        self.sequence = 0
-        self.retractions = 0
+        self.sequence = self.compacted = self.saved = self.retractions = 0
         self.descriptions: dict[str, Description] = {}
         self.stale = False
 

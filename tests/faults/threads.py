@@ -43,9 +43,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 
 import scroll_tactile.learner
-import scroll_tactile.prediction.answer
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
+import scroll_tactile.prediction.answer
 import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.model

@@ -16,7 +16,7 @@ from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.pipelines import destination, engines, fleet, jobs, steps
+from scroll_tactile.pipelines import destination, engines, jobs, steps
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import SourceOptions

@@ -13,8 +13,8 @@ from scroll_tactile.errors import InputError, MaterialError, UnknownMaterialErro
 __all__ = [
     "LONGEST_NAME",
     "LONGEST_SOURCE",
-    "FrozenModel",
     "Settings",
+    "ValidatedFields",
     "candidates_of",
     "names_of",
     "require_name",
@@ -26,7 +26,7 @@ LONGEST_NAME = 200  # characters
 LONGEST_SOURCE = 1000
 
 
-class FrozenModel(BaseModel):
+class ValidatedFields(BaseModel):
     """Fields that are validated once and never change; raises InputError for what does not fit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -38,7 +38,7 @@ class FrozenModel(BaseModel):
             raise InputError(_described(error, type(self))) from None
 
 
-class Settings(FrozenModel):
+class Settings(ValidatedFields):
     """How a learner reads its memory; all but `kept_touches` and `exemplars` can differ at every opening.
 
     readout: "lda" or "ridge" (the paper's); both are computed from the same statistics.

@@ -47,7 +47,8 @@ def _described(name: str, item: Any) -> Iterator[str]:
             yield f"    {name}{_signature(item)}\n"
         yield _text(item)
         if not issubclass(item, BaseException):
-            for own, member in sorted(vars(item).items()):
+            bases = [base for base in reversed(item.__mro__) if base.__module__.startswith(("scroll_tactile", "store"))]
+            for own, member in sorted({own: member for base in bases for own, member in vars(base).items()}.items()):
                 if not own.startswith("_"):
                     yield from _member(name, own, member)
     elif inspect.isroutine(item):

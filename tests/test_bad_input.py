@@ -194,7 +194,7 @@ def test_anything_of_the_right_shape_is_answered_or_refused(learner, data):
 
 def test_a_touch_of_hours_is_refused_before_it_is_kept(tmp_path, monkeypatch):
     pad = Sensor(name="pad", channels=1, rate=100.0, low=0.0, high=1.0, unit="", duration=1.0)
-    monkeypatch.setattr("scroll_tactile.memory.rows.MOST_BYTES", 4 * 200)
+    monkeypatch.setattr("scroll_tactile.memory.touch_rows.MOST_BYTES", 4 * 200)
     with TactileLearner.open(tmp_path / "m", sensor=pad) as learner:
         with pytest.raises(StreamError, match="at most 200 readings of sensor 'pad', 256 MiB; came 201"):
             learner.observe("felt", np.zeros((201, 1)))

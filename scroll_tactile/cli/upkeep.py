@@ -35,13 +35,14 @@ def reembed(
 
     Interrupted, start it again to go on.
     """
-    from scroll_tactile.memory.identity import Identity, usual_embedding
-    from scroll_tactile.persistence.reembed import finish_interrupted
+    from scroll_tactile.memory.identity import Identity
     from scroll_tactile.prediction.reembedding import reembed_memory
+    from scroll_tactile.recipe import default_embedding
+    from scroll_tactile.validation.gate import finish_interrupted
 
     finish_interrupted(folder)
     with Store.open(folder, mode="read") as store:
-        chosen = usual_embedding(Identity.read(store).sensor) if default else None
+        chosen = default_embedding(Identity.read(store).sensor) if default else None
     with progress_bar() as progress:
         before = reembed_memory(folder, chosen, progress=progress)
     say(f"the memory before is in {shown(before)}: remove it once the new one is as you want it")

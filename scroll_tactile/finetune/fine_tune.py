@@ -11,9 +11,11 @@ already.
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +36,8 @@ from scroll_tactile.finetune.training import (
 from scroll_tactile.libraries import optional
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
+from scroll_tactile.persistence.buffer import ranked_exemplars
+from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.statistics.statistics import Statistics
@@ -41,7 +45,7 @@ from scroll_tactile.statistics.statistics import Statistics
 with optional("torch", "torch", "a fine-tune"):
     import torch
 
-__all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune"]
+__all__ = ["EPOCHS", "WHOLE_NETWORK_FROM", "fine_tune", "fine_tune_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -104,6 +108,23 @@ def fine_tune(
     tuned = Tuned(names, heads, final.bias * temperature, final.network, chosen, kept)
     report = TuneReport(kept, reason, chosen, len(samples), best, scores, time.perf_counter() - begun, tuned.digest())
     return replace(tuned, report=Tuned.described(report)), report
+
+
+def fine_tune_memory(
+    predictor: Predictor, *, epochs: int | None, seed: int, device: str, progress: Progress
+) -> TuneReport:
+    """Fine-tune on a memory's exemplars, and keep what came of it; raises as `TactileLearner.fine_tune`."""
+    extractor, ledger = predictor.extractor.verified(), predictor.ledger
+    with ledger.lock:
+        ledger.require_writing()
+        memory = ledger.memory
+        model, ranked = predictor.fitted(), ranked_exemplars(memory, ledger.store)
+        last_sequence, retractions = memory.sequence, memory.retractions
+        statistics = copy.deepcopy(memory.statistics)
+    how: dict[str, Any] = {"epochs": epochs, "seed": seed, "device": device, "progress": progress}
+    tuned, report = fine_tune(predictor.recipe.embedding, model, statistics, ranked, extractor, **how)
+    ledger.keep_tuned(tuned, memory, last_sequence, retractions)
+    return report
 
 
 def _require_settings(

@@ -16,8 +16,9 @@ from scroll_tactile.embeddings.runtimes import steady
 from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.libraries import optional
-from scroll_tactile.memory.rows import Codes
+from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.prediction.answer import LogitsReader, Predictor
 from scroll_tactile.signals.windows import WindowPlan
 
 with optional("torch", "torch", "a fine-tune"):
@@ -25,7 +26,7 @@ with optional("torch", "torch", "a fine-tune"):
     from torch import nn
     from torch.nn import functional
 
-__all__ = ["Backbone", "TouchFeatures", "TrainingSample", "TunedReader", "adapted"]
+__all__ = ["Backbone", "TouchFeatures", "TrainingSample", "TunedReader", "adapted", "reader_of"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -242,3 +243,13 @@ class TunedReader:
             for scale, head in self.tuned.heads.items():
                 logits += means[scale][0].numpy() @ head
         return dict(zip(self.tuned.names, logits.tolist(), strict=True))
+
+
+def reader_of(predictor: Predictor) -> LogitsReader | None:
+    """What reads with the tuned model of a memory, made once; None where the memory has none that answers."""
+    tuned = predictor.ledger.memory.tuned
+    if tuned is None or not tuned.kept:
+        return None
+    if predictor.tuned_reader is None or predictor.tuned_reader.tuned is not tuned:
+        predictor.tuned_reader = TunedReader(predictor.recipe.embedding, predictor.recipe.plan, tuned)
+    return predictor.tuned_reader

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.answers import LiveReport
 
-__all__ = ["GAP", "Clock", "Part"]
+__all__ = ["GAP", "Clock", "ClockPart"]
 
 Rows = npt.NDArray[Any]
 
@@ -31,10 +31,10 @@ GAP = 0.1  # seconds
 FEWEST_LOST = 5  # periods in a gap, of a slow sensor
 WITHIN = 0.75  # periods
 FOLLOWED = 0.02  # of how far a stamp lies off, in the next one's place
-UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+CLOCK_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
-class Part:
+class ClockPart:
     """Rows at the sensor's rate, shape (k, …), and what came before them.
 
     breaks: "gap" or "time went back", where time began anew before them. time: the stamp of the first row.
@@ -92,35 +92,35 @@ class Clock:
             if unit and unit == before:
                 raise InputError(
                     f"expected times in seconds; those that came differ by {stamp - last:.6g} from reading to reading, "
-                    f"and the sensor has {self._rate:g} readings a second. They look like {UNITS[unit]}: "
+                    f"and the sensor has {self._rate:g} readings a second. They look like {CLOCK_UNITS[unit]}: "
                     f"divide them by {unit:.0e}"
                 )
             last, before = stamp, unit
         self._unit = before
 
     def _unit_of(self, step: float) -> float:
-        return next((unit for unit in UNITS if 0.2 * unit < step * self._rate < 5 * unit), 0.0)
+        return next((unit for unit in CLOCK_UNITS if 0.2 * unit < step * self._rate < 5 * unit), 0.0)
 
-    def places(self, rows: Rows, seconds: list[float]) -> Iterator[Part]:
+    def places(self, rows: Rows, seconds: list[float]) -> Iterator[ClockPart]:
         """The readings, shape (k, …), in their places."""
         first, taken = 0, 0  # rows[first:taken] follow each other and were not yet given
         for i, stamp in enumerate(seconds):
             steps, breaks = self._place(stamp, rows[i])
             if steps != 1 or breaks or taken != i:
                 if taken > first:
-                    yield Part(rows[first:taken], time=seconds[first])
+                    yield ClockPart(rows[first:taken], time=seconds[first])
                 first = i
             if steps:
                 if breaks:
-                    yield Part(rows[i:i], breaks, stamp)
+                    yield ClockPart(rows[i:i], breaks, stamp)
                 elif steps > 1 and self._row is not None:
-                    yield Part(_line(self._row, rows[i], steps), time=stamp - (steps - 1) / self._rate)
+                    yield ClockPart(_line(self._row, rows[i], steps), time=stamp - (steps - 1) / self._rate)
                 self._row = rows[i]
                 taken = i + 1
             else:
                 first = taken = i + 1
         if taken > first:
-            yield Part(rows[first:taken], time=seconds[first])
+            yield ClockPart(rows[first:taken], time=seconds[first])
         if self._row is not None:
             self._row = np.array(self._row)  # and not the caller's
 

@@ -16,7 +16,7 @@ from scroll_tactile.signals.stream import Stream
 __all__ = ["PressDetector"]
 
 TURNS = 2  # frames in turn that differ from those before
-FOLLOWED = 1.0  # seconds: the resting image is a frame of the last
+REST_FOLLOWED = 1.0  # seconds: the resting image is a frame of the last
 
 
 class PressDetector:
@@ -38,7 +38,7 @@ class PressDetector:
         self._sensor = sensor
         self._still: npt.NDArray[np.float32] | None = None if isinstance(rest, str) else rest
         self._follows = isinstance(rest, str)
-        self._every = max(1, round(FOLLOWED * sensor.rate))
+        self._every = max(1, round(REST_FOLLOWED * sensor.rate))
         self.contact = False
         self._turned = self._quiet = 0
 

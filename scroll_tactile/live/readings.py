@@ -1,13 +1,25 @@
-"""The readings of a live session: the last few seconds, and those of the touch under way."""
+"""The readings of a live session: the last few seconds, and those of the touch under way, with its predictions."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Recent", "Rows"]
+from scroll_tactile.errors import StreamError
+from scroll_tactile.live.decision import DecisionRule
+from scroll_tactile.prediction.answer import Predictor, nothing_known
+from scroll_tactile.prediction.current import FrozenModel
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
+from scroll_tactile.results import Prediction
+from scroll_tactile.signals.stream import Stream
+
+__all__ = ["GrowingTouch", "Recent", "TouchRows"]
 
 Array = npt.NDArray[Any]
 
@@ -41,7 +53,7 @@ class Recent:
         return self._ring[np.arange(self._came - wanted, self._came) % count]
 
 
-class Rows:
+class TouchRows:
     """The readings of a touch, up to a limit; those beyond it are counted."""
 
     def __init__(self, first: Array, limit: int) -> None:
@@ -69,3 +81,66 @@ class Rows:
     def first(self, count: int) -> Array:
         """The first so many, to be read."""
         return self._room[: min(count, self.kept)]
+
+
+@dataclass
+class GrowingTouch:
+    """The touch under way, and what is predicted of it with the model of the memory as it was when it began.
+
+    rows: its readings, of a camera behind the resting image. at: when it began. moments: that are to come, in readings;
+    the next is the last of them. before: readings that are no part of it, such as a camera's resting image. earlier:
+    the touches of the same thing before it; encoded: they, as its model reads them.
+    """
+
+    predictor: Predictor
+    extractor: FeatureExtractor
+    scene: Sequence[str] | None
+    rows: TouchRows
+    at: float
+    frozen: FrozenModel
+    rule: DecisionRule
+    moments: list[int]
+    before: int
+    earlier: tuple[Stream, ...] = ()
+    cache: WindowCache = field(default_factory=WindowCache)
+    encoded: list[Encoded] = field(default_factory=list)
+    prediction: Prediction | None = None
+    decided: bool = False
+
+    def predict_in_time(self) -> None:
+        """Predict at the last moment that the touch has come to, if any is new."""
+        moment = 0
+        while self.moments and self.moments[-1] <= self.rows.came:
+            moment = self.moments.pop()
+        if moment:
+            with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
+                self.predict(self.stream(moment))
+        if self.decided:
+            self.moments.clear()
+
+    def stream(self, count: int) -> Stream:
+        """The stream of its first readings. Raises StreamError where they make none."""
+        return self.extractor.stream(self.rows.first(count))
+
+    def predict(self, stream: Stream) -> Prediction:
+        """The prediction for the beginning of it, as `learner.predict` gives it."""
+        model = self.frozen.model
+        candidates = model.names
+        if self.scene is not None:
+            candidates = sorted({name for name in self.scene if name in model.known})
+        if not candidates:
+            seconds = math.fsum({each.key: each.seconds for each in (*self.earlier, stream)}.values())
+            self.prediction = nothing_known(seconds)
+            return self.prediction
+
+        def encoded(each: Stream, cache: WindowCache | None = None) -> Encoded:
+            return self.extractor.encode(
+                each, model.longest, lambda columns: model.scales_for(candidates, columns), cache
+            )
+
+        self.encoded = self.encoded or [encoded(each) for each in self.earlier]
+        current = encoded(stream, self.cache)
+        self.prediction = self.predictor.answer_of(model, self.extractor, candidates, [*self.encoded, current])
+        several = bool(self.earlier)
+        self.decided = self.decided or self.rule.decided(self.prediction, current.columns, several=several)
+        return self.prediction

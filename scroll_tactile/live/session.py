@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Literal, Self
 from weakref import WeakKeyDictionary
@@ -13,68 +12,29 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, canary, capabilities_of
+from scroll_tactile.embeddings.protocol import canary, capabilities_of
 from scroll_tactile.errors import InputError, StreamError
 from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event
 from scroll_tactile.live.pressing import PressDetector
-from scroll_tactile.live.readings import Recent, Rows
-from scroll_tactile.prediction.current import FrozenModel
-from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
+from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows
+from scroll_tactile.prediction.answer import Predictor
+from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.results import Prediction
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.contact import MOST_FRAMES
+from scroll_tactile.signals.contact import MOST_FRAMES, Rest
 from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
 
-__all__ = ["LiveSession", "Memory"]
+__all__ = ["LiveSession"]
 
 Array = npt.NDArray[Any]
 
 REMEMBERED = 2.0  # seconds before a contact is noticed in which it may have begun
 KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
-EARLIER = 7  # touches of one thing before a touch: more hardly say more, and each has its price in every prediction
-
-
-@dataclass(frozen=True)
-class Memory:
-    """What a session needs of a learner, of the memory as it is embedded when the session begins.
-
-    frozen: its model, which stays as it is while it is held. turn: to be held while a model is asked. answer: what a
-    model says, of candidates, of touches of one thing. require_current: raises InputError where the memory was embedded
-    again.
-    """
-
-    sensor: Sensor
-    embedding: Embedding
-    extractor: FeatureExtractor
-    frozen: Callable[[], FrozenModel]
-    turn: Callable[[Model], AbstractContextManager[object]]
-    answer: Callable[[Model, Sequence[str], Sequence[Encoded]], Prediction]
-    require_current: Callable[[], None]
-
-
-@dataclass
-class _Touch:
-    """The touch under way. rows: its readings, of a camera behind the resting image. at: when it began.
-
-    earlier: the touches of the same thing before it; encoded: they, as its model reads them.
-    """
-
-    rows: Rows
-    at: float
-    frozen: FrozenModel
-    rule: DecisionRule
-    cache: WindowCache
-    moments: list[int]  # that are to come, in readings; the next is the last of them
-    before: int  # readings that are no part of it: a camera's resting image
-    earlier: tuple[Stream, ...] = ()
-    encoded: list[Encoded] = field(default_factory=list)
-    prediction: Prediction | None = None
-    decided: bool = False
+MOST_EARLIER = 7  # touches of one thing before a touch: more hardly say more, each has its price in every prediction
 
 
 class LiveSession:
@@ -86,7 +46,7 @@ class LiveSession:
 
     def __init__(
         self,
-        memory: Memory,
+        predictor: Predictor,
         *,
         risk: float,
         contact: Literal["auto", "manual"],
@@ -99,17 +59,17 @@ class LiveSession:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
         if not 0 < risk < 1:
             raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
-        self._memory, self._risk = memory, risk
-        self.sensor = sensor = memory.sensor
-        frozen = memory.frozen()  # until the rule is measured, which takes seconds
+        self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
+        self.sensor = sensor = predictor.recipe.sensor
+        self._rest: Rest = capabilities_of(self._extractor.embedding).rest
+        frozen = predictor.frozen()  # until the rule is measured, which takes seconds
         model = frozen.model
         candidates_of(scene, model.names, model.known)
         self._scene = scene
         self._manual = contact == "manual"
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
-            rest = capabilities_of(memory.embedding).rest
-            found = PressDetector(sensor, rest) if sensor.camera else ContactDetector(sensor, false_contacts)
+            found = PressDetector(sensor, self._rest) if sensor.camera else ContactDetector(sensor, false_contacts)
             self._detector = found
         self.report = LiveReport(learning=not self._manual and not sensor.camera)
         self._clock = Clock(sensor.rate, self.report)
@@ -117,7 +77,7 @@ class LiveSession:
         count = 4 if sensor.camera else max(8, round(REMEMBERED * sensor.rate))
         self._recent = Recent(count if not self._manual else 1, sensor.shape, self._dtype)
         self._since, self._came = 0.0, 0  # a time, and the readings that came from then on
-        self._under_way: _Touch | None = None
+        self._under_way: GrowingTouch | None = None
         self._ended: list[LiveTouch] = []
         self._thing: tuple[Stream, ...] = ()  # the touches of what was touched last
         self._again = False  # whether the next touch is one more of them
@@ -219,7 +179,8 @@ class LiveSession:
     def _require_open(self) -> None:
         if self._closed:
             raise InputError("the live session is closed: begin another with learner.live()")
-        self._memory.require_current()
+        if self._predictor.replaced:
+            raise InputError("the memory was embedded again: close this session, and begin another with learner.live()")
 
     def _require_manual(self, what: str) -> None:
         self._require_open()
@@ -263,7 +224,7 @@ class LiveSession:
         else:
             touch.rows.add(rows)
             if event is None:
-                self._predict_in_time(touch)
+                touch.predict_in_time()
             elif event.kind != "relearned":
                 touch.rows.drop(event.readings)
                 self._end("still" if event.kind == "still" else "released")
@@ -275,24 +236,27 @@ class LiveSession:
     def _begin(self, rows: Array) -> None:
         """A touch began with these readings."""
         self._recent.clear()
-        frozen = self._memory.frozen()
+        frozen = self._predictor.frozen()
         model = frozen.model
         rule = self._rule(model)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame = 0, 1
         if self.sensor.camera:
             frame = model.plan.widths[0]
-            before = int(isinstance(capabilities_of(self._memory.embedding).rest, str))
+            before = int(isinstance(self._rest, str))
         if prefix is not None:
             rows = np.concatenate([prefix, rows]).astype(self._dtype)
-        limit = MOST_FRAMES + before if self.sensor.camera else self._limit(model)
+        limit = MOST_FRAMES + before if self.sensor.camera else max(round(KEPT * self.sensor.rate), 4 * model.longest)
         moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
         at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
         earlier, self._again = self._thing if self._again else (), False
-        self._under_way = _Touch(Rows(rows, limit), at, frozen, rule, WindowCache(), moments, before, earlier)
-        self._predict_in_time(self._under_way)
+        kept = TouchRows(rows, limit)
+        self._under_way = GrowingTouch(
+            self._predictor, self._extractor, self._scene, kept, at, frozen, rule, moments, before, earlier
+        )
+        self._under_way.predict_in_time()
 
-    def _leave(self, touch: _Touch | None) -> None:
+    def _leave(self, touch: GrowingTouch | None) -> None:
         """What seemed a touch was none: the next is of what it would have been of, and that may be nothing known."""
         self._under_way = None
         if touch is not None:
@@ -302,7 +266,7 @@ class LiveSession:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
         if self._risk not in known:
-            with self._memory.turn(model):
+            with self._predictor.turn(model):
                 known[self._risk] = decision_rule(model, self._risk)
         return known[self._risk]
 
@@ -311,52 +275,11 @@ class LiveSession:
         low, high = self.sensor.limits
         image, cache = canary(self.sensor.channels, max(2, *rule.moments, model.longest)), WindowCache()
         for moment in [*rule.moments, image.shape[1]]:
-            stream = self._memory.extractor.stream(low + (high - low) * (image[:, : max(2, moment)].T + 1) / 2)
-            encoded = self._memory.extractor.encode(
+            stream = self._extractor.stream(low + (high - low) * (image[:, : max(2, moment)].T + 1) / 2)
+            encoded = self._extractor.encode(
                 stream, model.longest, lambda columns: model.scales_for(model.names, columns), cache
             )
-            self._memory.answer(model, model.names, [encoded])
-
-    def _limit(self, model: Model) -> int:
-        return max(round(KEPT * self.sensor.rate), 4 * model.longest)
-
-    def _predict_in_time(self, touch: _Touch) -> None:
-        """Predict at the last moment that the touch has come to, if any is new."""
-        moment = 0
-        while touch.moments and touch.moments[-1] <= touch.rows.came:
-            moment = touch.moments.pop()
-        if moment:
-            with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
-                self._predict(touch, self._stream(touch, moment))
-        if touch.decided:
-            touch.moments.clear()
-
-    def _stream(self, touch: _Touch, count: int) -> Stream:
-        """The stream of the first readings of a touch. Raises StreamError where they make none."""
-        return self._memory.extractor.stream(touch.rows.first(count))
-
-    def _predict(self, touch: _Touch, stream: Stream) -> Prediction:
-        """The prediction for the beginning of a touch, as `learner.predict` gives it."""
-        model = touch.frozen.model
-        candidates = model.names
-        if self._scene is not None:
-            candidates = sorted({name for name in self._scene if name in model.known})
-        if not candidates:
-            seconds = math.fsum({each.key: each.seconds for each in (*touch.earlier, stream)}.values())
-            touch.prediction = Prediction(None, 0.0, (), float("inf"), False, seconds)
-            return touch.prediction
-
-        def encoded(each: Stream, cache: WindowCache | None = None) -> Encoded:
-            return self._memory.extractor.encode(
-                each, model.longest, lambda columns: model.scales_for(candidates, columns), cache
-            )
-
-        touch.encoded = touch.encoded or [encoded(each) for each in touch.earlier]
-        current = encoded(stream, touch.cache)
-        touch.prediction = self._memory.answer(model, candidates, [*touch.encoded, current])
-        several = bool(touch.earlier)
-        touch.decided = touch.decided or touch.rule.decided(touch.prediction, current.columns, several=several)
-        return touch.prediction
+            self._predictor.answer_of(model, self._extractor, model.names, [encoded])
 
     def _end(self, end: End) -> None:
         """The touch under way, if any, is over."""
@@ -366,15 +289,15 @@ class LiveSession:
         try:
             if touch.rows.kept - touch.before < fewest_readings(self.sensor):
                 raise StreamError
-            stream = self._stream(touch, touch.rows.kept)
+            stream = touch.stream(touch.rows.kept)
         except StreamError:  # nothing that could be observed
             self.report.brief += 1
             self._leave(touch)
             return
         before = touch.prediction if touch.decided else None
-        prediction = self._predict(touch, stream)
+        prediction = touch.predict(stream)
         revised = before if before is not None and _says(before) != _says(prediction) else None
-        self.touch, self._thing = stream, (*touch.earlier, stream)[-EARLIER:]
+        self.touch, self._thing = stream, (*touch.earlier, stream)[-MOST_EARLIER:]
         self.report.touches += 1
         self.report.undecided += not touch.decided
         self.report.revised += revised is not None

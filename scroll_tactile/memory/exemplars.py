@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.memory.rows import Arrays, Codes, Readings, unpack_readings
+from scroll_tactile.memory.touch_rows import Arrays, Codes, Readings, unpack_readings
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
@@ -39,8 +39,8 @@ IntArray = npt.NDArray[np.int64]
 # Kept for each place in the buffer. With 3 the gap to the class mean is at most 1.08 times that of herding from every
 # touch (BioTac and RoboSkin, five folds, 5 to 20 exemplars a material); with 2 it reaches 1.24, with 4 it is 1.06.
 CANDIDATES = 3
-MOST_FEATURES = 2 ** (53 - 2 * BITS)  # of codes: a product of two rows is then exact in float64
-LIMB = 32  # bits
+LARGEST_HERDED = 2 ** (53 - 2 * BITS)  # of codes: a product of two rows is then exact in float64
+LIMB_BITS = 32  # bits
 
 
 def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: IntArray, count: int) -> list[int]:
@@ -71,8 +71,8 @@ def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: IntAr
             free[pick] = False
             chosen.append(order[pick])
             change = 2 * (_exact(rows @ rows[pick]) - towards)
-            more, low = _carried(high, low + (change & (2**LIMB - 1)))
-            high = more + (change >> LIMB)
+            more, low = _carried(high, low + (change & (2**LIMB_BITS - 1)))
+            high = more + (change >> LIMB_BITS)
     return chosen
 
 
@@ -81,17 +81,17 @@ def _exact(values: npt.NDArray[np.float64]) -> IntArray:
 
 
 def _carried(high: IntArray, low: IntArray) -> tuple[IntArray, IntArray]:
-    return high + (low >> LIMB), low & (2**LIMB - 1)
+    return high + (low >> LIMB_BITS), low & (2**LIMB_BITS - 1)
 
 
 def _require_codes(
     candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: npt.NDArray[np.integer], count: int
 ) -> None:
     integers = candidates.dtype.kind in "iu" and mean.dtype.kind in "iu"
-    fits = candidates.ndim == 2 and mean.shape == candidates.shape[1:] and candidates.shape[1] <= MOST_FEATURES
+    fits = candidates.ndim == 2 and mean.shape == candidates.shape[1:] and candidates.shape[1] <= LARGEST_HERDED
     if not integers or not fits or len(set(keys)) != len(candidates) or len(keys) != len(candidates) or count < 0:
         raise InputError(
-            f"expected integer codes of shape (N, d), d at most {MOST_FEATURES}, a mean of shape (d,), N different "
+            f"expected integer codes of shape (N, d), d at most {LARGEST_HERDED}, a mean of shape (d,), N different "
             f"keys and a count of 0 or more; came codes of {candidates.dtype} {candidates.shape}, a mean of "
             f"{mean.dtype} {mean.shape}, {len(keys)} keys of which {len(set(keys))} differ, and {count}"
         )

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
-from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import (
     Capabilities,
     Embedding,
@@ -23,32 +24,21 @@ from scroll_tactile.embeddings.protocol import (
 )
 from scroll_tactile.embeddings.registry import MOST_DEPTH, configuration_of, from_configuration
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
-from scroll_tactile.memory.kept import usual_kept
+from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.windows import COMPETING, ScaleKind
 from scroll_tactile.statistics.grid import BITS
-from store import DamageError
+from store import DamageError, Store
 
-__all__ = [
-    "AbsentEmbedding",
-    "EmbeddingIdentity",
-    "Grid",
-    "Identified",
-    "Identity",
-    "default_kept_touches",
-    "usual_embedding",
-    "usual_exemplars",
-]
-
-USUAL_EXEMPLARS = 400  # streams
-MOST_FEATURES = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
+__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identity"]
+LARGEST_DIMENSION = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
 MOST_STREAMS = 2**31
-MOST_VALUES = 2**31  # of a sensor at once, or in one channel of a touch
+WIDEST = 2**31  # of a sensor at once, or in one channel of a touch
 
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 _Streams = Annotated[int, Field(ge=0, le=MOST_STREAMS)]
-_Width = Annotated[int, Field(ge=1, le=MOST_VALUES)]
+_Width = Annotated[int, Field(ge=1, le=WIDEST)]
 
 
 class _Kept(BaseModel):
@@ -61,7 +51,7 @@ class EmbeddingIdentity(_Kept):
     """What a memory knows of its embedding; configuration: what makes it again, None for a user's own embedding."""
 
     name: _Text
-    dimension: Annotated[int, Field(ge=1, le=MOST_FEATURES)]
+    dimension: Annotated[int, Field(ge=1, le=LARGEST_DIMENSION)]
     bound: Annotated[FiniteFloat, Field(gt=0)]
     fingerprint: _Text
     configuration: dict[str, Any] | None
@@ -93,18 +83,6 @@ class EmbeddingIdentity(_Kept):
         return f"{self.name!r} ({self.dimension} features, fingerprint {self.fingerprint[:12]})"
 
 
-class Identified(Protocol):
-    """What says what it was made with: a store, or a partial of one."""
-
-    @property
-    def path(self) -> Path:
-        """Where it is."""
-
-    @property
-    def identity(self) -> Mapping[str, Any]:
-        """What it was made with, as JSON."""
-
-
 class Grid(_Kept):
     """The grid of codes, and the widths of windows; frames: whether they are a camera's frames."""
 
@@ -131,42 +109,34 @@ class Identity(_Kept):
 
     @model_validator(mode="after")
     def _of_a_sensor_that_can_be(self) -> Self:
-        if max(self.sensor.channels, self.sensor.readings) > MOST_VALUES:
-            raise ValueError(f"expected a sensor of at most {MOST_VALUES} channels, and readings in a touch")
+        if max(self.sensor.channels, self.sensor.readings) > WIDEST:
+            raise ValueError(f"expected a sensor of at most {WIDEST} channels, and readings in a touch")
         return self
 
     @classmethod
-    def of(
-        cls,
-        sensor: Sensor,
-        embedding: Embedding,
-        exemplars: int | None,
-        augmentation: Augmented | None = None,
-        kept_touches: int | None = None,
-    ) -> Self:
+    def of(cls, recipe: Recipe) -> Self:
         """The identity of a new memory.
 
-        exemplars: streams in its buffer, kept_touches: how many; None: the usual numbers, none for a camera. Raises
-        InputError for an embedding that cannot read the sensor, or numbers beyond all bounds, EmbeddingError.
+        Raises InputError for an embedding that cannot read the sensor, or numbers beyond all bounds, EmbeddingError.
         """
-        require_rest(embedding, sensor)
-        plan, made = window_plan(sensor, embedding), EmbeddingIdentity.of(embedding)
+        require_rest(recipe.embedding, recipe.sensor)
+        plan, made = recipe.plan, EmbeddingIdentity.of(recipe.embedding)
         try:
             return cls(
-                sensor=sensor,
+                sensor=recipe.sensor,
                 embedding=made,
                 grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
                 reading=(plan.partial, plan.judged),
                 views=tuple(view.kind for view in plan.views),
-                augmentation=augmentation,
-                exemplars=usual_exemplars(sensor) if exemplars is None else exemplars,
-                kept_touches=default_kept_touches(sensor, embedding) if kept_touches is None else kept_touches,
+                augmentation=recipe.augmentation,
+                exemplars=recipe.exemplars,
+                kept_touches=recipe.kept_touches,
             )
         except ValidationError as error:
             raise InputError(f"no memory can be made with {_first(error)}") from None
 
     @classmethod
-    def read(cls, store: Identified) -> Self:
+    def read(cls, store: Store) -> Self:
         """The identity that a store was made with.
 
         Raises MismatchError for a store that holds no memory of touch, DamageError for one that is none.
@@ -201,15 +171,24 @@ class Identity(_Kept):
             )
         return from_configuration(self.embedding.configuration)
 
-    def require(
-        self,
-        path: Path,
-        sensor: Sensor | None,
-        augmentation: Augmented | None,
-        exemplars: int | None,
-        kept_touches: int | None,
-    ) -> None:
-        """Raise MismatchError for anything, where it is given, that the memory was not made with."""
+    def recipe(self, path: Path, request: RecipeRequest) -> Recipe:
+        """The recipe of the memory at a path, as it was made, for whoever opens it with this request.
+
+        Raises MismatchError for anything there, where it is given, that the memory was not made with.
+        """
+        self._require(path, request)
+        if request.embedding is None:
+            embedding = self.own_embedding(path)
+            self.require_plan(path, embedding)
+        else:
+            embedding = request.embedding
+            self.require_embedding(path, embedding)
+        kept = {"exemplars": self.exemplars, "kept_touches": self.kept_touches}
+        return Recipe(self.sensor, embedding, self.augmentation, request.settings.model_copy(update=kept))
+
+    def _require(self, path: Path, request: RecipeRequest) -> None:
+        sensor, augmentation = request.sensor, request.augmentation
+        exemplars, kept_touches = request.settings.exemplars, request.settings.kept_touches
         if sensor is not None and sensor != self.sensor:
             differing = [
                 f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
@@ -262,6 +241,40 @@ class Identity(_Kept):
         grid = Grid(bits=BITS, scales=plan.widths, frames=plan.frames)
         if self.grid != grid:
             raise MismatchError(f"{path} was made with {self.grid!r}; this version works with {grid!r}")
+
+
+class FingerprintCheck:
+    """Whether an embedding that was made again is the one that a memory was made with; it is compared once.
+
+    pending: whether that is still to be done for the memory's own embedding.
+    """
+
+    def __init__(self, identity: Identity, path: Path) -> None:
+        self._identity, self._path = identity, path
+        self._compared: Embedding | None = None
+        self.pending = True
+
+    def require(self, embedding: Embedding) -> None:
+        """Compare the memory's own embedding. Raises EmbeddingMismatchError."""
+        if self.pending:
+            self._identity.require_embedding(self._path, embedding)
+            self.pending = False
+
+    @contextmanager
+    def beside(self, embedding: Embedding, *, own: bool) -> Iterator[None]:
+        """Compare an embedding beside what the block does: it embeds, too. own: whether it is the memory's own."""
+        if not self.pending or embedding is self._compared:
+            yield
+            return
+        with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
+            compared = beside.submit(self._identity.require_embedding, self._path, embedding)
+            try:
+                yield
+            finally:
+                compared.result()  # of another embedding nothing else that the block raised means anything
+        self._compared = embedding
+        if own:
+            self.pending = False
 
 
 class AbsentEmbedding:
@@ -330,20 +343,3 @@ def _first(error: ValidationError) -> str:
     """The first thing that is wrong: the field, what was expected, and what came."""
     first = error.errors(include_url=False)[0]
     return f"{'.'.join(map(str, first['loc']))}: {first['msg']}; came {first['input']!r:.80}"
-
-
-def usual_embedding(sensor: Sensor) -> Embedding:
-    """The default embedding for a sensor."""
-    from scroll_tactile.embeddings.frames import Frames
-
-    return Frames() if sensor.camera else Kernels()
-
-
-def default_kept_touches(sensor: Sensor, embedding: Embedding) -> int:
-    """The default number of kept touches; none without views, beside which a touch is matched."""
-    return usual_kept(sensor) if window_plan(sensor, embedding).whole else 0
-
-
-def usual_exemplars(sensor: Sensor) -> int:
-    """The default number of streams in the buffer: none for a camera, whose streams are large."""
-    return 0 if sensor.camera else USUAL_EXEMPLARS

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,36 +10,85 @@ from typing import Any, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.matching.likelihood import LevelArray
+from scroll_tactile.matching.likelihood import LevelArray, levels_of
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
-from scroll_tactile.memory.kept import Keeping, KeptTouches
-from scroll_tactile.memory.rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
+from scroll_tactile.memory.touch_rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.signals.windows import WindowPlan
+from scroll_tactile.recipe import Recipe
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
 from store import Head, Record
 from store.records import LateArray
 
-__all__ = ["LATE_ROWS", "LATE_SECOND", "Memory", "give_back_scratch"]
+__all__ = ["LATE_ROWS", "LATE_SECOND", "KeptTouches", "Memory"]
 
 LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
+LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
+Chosen = tuple["TouchSample", "KeptTouches | None", "ExemplarSample | None"]
+
+
+class KeptTouches(Sample[LevelArray]):
+    """Kept touches: a bounded sample of what was observed, as levels, to compare others with (see `matching.matcher`).
+
+    A function of the set of touches observed: at most `capacity` of a sensor's. In a checkpoint these are `kept-keys`
+    (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their materials are the attribute `kept`.
+    """
+
+    def __init__(self, sensor: Sensor, capacity: int) -> None:
+        super().__init__(capacity)
+        self.sensor = sensor
+
+    @property
+    def most_columns(self) -> int:
+        """Of a touch that is kept: twice the usual length."""
+        return max(2, round(LONGEST_KEPT * self.sensor.readings))
+
+    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
+        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most `most_columns`."""
+        return levels_of(readings[: self.most_columns], self.sensor)
+
+    def touches(self) -> list[KeptTouch]:
+        """All of them, by material and key."""
+        return [KeptTouch(material, key, levels) for material, key, levels in self]
+
+    def take(self, material: str, key: bytes, readings: npt.NDArray[np.floating] | None) -> None:
+        """Keep a touch where it belongs in, if its readings are there."""
+        if readings is not None and self.wants(material, key):
+            self.add(material, key, self.levels(readings))
+
+    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
+        """What a store keeps: arrays by name, and the material of each touch."""
+        kept = self.touches()
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept)])
+        return {
+            "kept-keys": np.array([list(touch.key) for touch in kept] or [[]], np.uint8)[: len(kept)],
+            "kept-columns": np.array([touch.levels.shape[1] for touch in kept], dtype=np.int64),
+            "kept-levels": np.diff(levels, prepend=np.uint8(0)),
+        }, [touch.material for touch in kept]
+
+    def fill(self, arrays: Arrays, materials: Sequence[str]) -> None:
+        """Take in what `to_arrays` described."""
+        columns, channels = arrays["kept-columns"], self.sensor.channels
+        parts = np.split(np.cumsum(arrays["kept-levels"], dtype=np.uint8), np.cumsum(columns * channels)[:-1])
+        for i, material in enumerate(materials):
+            self.add(material, arrays["kept-keys"][i].tobytes(), parts[i].reshape(channels, -1))
 
 
 class Memory:
     """Everything that was learned, as far as a number of rows of the journal.
 
-    dimension: d, of the features. plan: which windows of a touch are read. exemplars: streams in the buffer, or 0;
-    kept as `capacity`. encode: readings → the rows of codes that the touch adds, by scale, for rows of the journal that
-    have readings alone; None where all rows have codes. keeping: which touches are kept to match with; None keeps none.
+    recipe: what it is made with; plan: its windows. encode: readings → the rows of codes that the touch adds, by scale,
+    for rows of the journal that have readings alone; None where all rows have codes.
 
     What was learned:
 
     - statistics: exact sums by scale.
     - sample: the touches that readouts are calibrated on.
-    - kept: touches to match with; None without `keeping`.
-    - exemplars: the candidates for the buffer, and where their readings lie; None with a capacity of 0.
+    - kept: touches to match with; None where the recipe keeps none.
+    - exemplars: the candidates for the buffer, and where their readings lie; None where the recipe has no buffer.
     - descriptions: material → what it is made of; the material need not have been observed.
     - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.
     - tuned_last_sequence: the last sequence that the tuned model was trained on.
@@ -57,31 +104,19 @@ class Memory:
     - stale: whether sample, kept touches or exemplars held what was retracted since they were chosen.
     """
 
-    def __init__(
-        self,
-        dimension: int,
-        plan: WindowPlan,
-        exemplars: int = 0,
-        encode: Encode | None = None,
-        keeping: Keeping | None = None,
-    ) -> None:
-        self.plan = plan
-        self.keeping = keeping
-        self.capacity = exemplars
+    def __init__(self, recipe: Recipe, encode: Encode | None = None) -> None:
+        self.recipe, self.plan = recipe, recipe.plan
         self.encode = encode
-        self.statistics = Statistics(dimension, plan.scales)
+        self.statistics = Statistics(recipe.embedding.dimension, self.plan.scales)
         self._sample: TouchSample | Callable[[], TouchSample] = TouchSample()
-        self.kept = KeptTouches(keeping) if keeping is not None and keeping.capacity else None
-        self.exemplars = ExemplarSample(exemplars) if exemplars else None
+        self.kept = KeptTouches(recipe.sensor, recipe.kept_touches) if recipe.kept_touches else None
+        self.exemplars = ExemplarSample(recipe.exemplars) if recipe.exemplars else None
         self.tuned: Tuned | None = None
         self.tuned_last_sequence = 0
         self.retracted: set[int] = set()
         self.excluded: set[int] = set()
-        self.compacted = 0
         self.checkpoint: int | None = None
-        self.saved = 0
-        self.sequence = 0
-        self.retractions = 0
+        self.sequence = self.compacted = self.saved = self.retractions = 0
         self.descriptions: dict[str, Description] = {}
         self.stale = False
 
@@ -174,20 +209,20 @@ class Memory:
         self.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
         read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
         if self.kept is not None:
-            mine, keeping = {(material, key): own for material, key, own in made.kept or ()}, self.kept.made
+            mine, kept = {(material, key): own for material, key, own in made.kept or ()}, self.kept
 
             def levels(material: str, key: bytes, sequence: int) -> LevelArray:
                 if (own := mine.get((material, key))) is not None:
                     return own
-                return keeping.levels(cast(Readings, unpack_readings(record(sequence).arrays)))
+                return kept.levels(cast(Readings, unpack_readings(record(sequence).arrays)))
 
             self.kept.refill(((head.label, head.key, head.sequence) for head in read), levels)
         if self.exemplars is not None:
             self.exemplars.update((head.label, head.key, head.sequence) for head in read)
 
     def empty_like(self) -> Memory:
-        """Another memory of the same making."""
-        return Memory(self.statistics.dimension, self.plan, self.capacity, self.encode, self.keeping)
+        """An empty memory of this recipe."""
+        return Memory(self.recipe, self.encode)
 
     def is_gone(self, sequence: int) -> bool:
         """Whether this observation was retracted, as far as the memory itself knows."""
@@ -200,6 +235,22 @@ class Memory:
 
     def _touch(self, columns: int, codes: Codes) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes)
+
+    @property
+    def chosen(self) -> Chosen:
+        """What was chosen among the observations: sample, kept touches and exemplars."""
+        return self.sample, self.kept, self.exemplars
+
+    @chosen.setter
+    def chosen(self, chosen: Chosen) -> None:
+        self.sample, self.kept, self.exemplars = chosen
+        self.stale = False
+
+    def take_sums(self, memory: Memory, later: Memory, last_sequence: int) -> None:
+        """Take the sums of a memory without those of the rows behind one; `chosen` is of the rows up to it already."""
+        self.statistics = memory.statistics - later.statistics
+        self.compacted, self.sequence, self.tuned = memory.compacted, last_sequence, None
+        self.retracted = set(memory.retracted)
 
     def note_compaction(self, last: int) -> None:
         """Have a compaction checkpoint stand for rows up to one: what was retracted of them is out of it for good."""
@@ -245,10 +296,9 @@ class Memory:
         excluded = sorted(row for row in self.retracted | self.excluded if row <= compacted)
         arrays["retracted"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
         if self.exemplars is not None:
-            own, attributes["exemplars"] = (
-                self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
-            )
-            arrays |= own
+            held = self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
+            arrays |= held[0]
+            attributes["exemplars"] = held[1]
         if self.tuned is not None:
             own, attributes["tuned"] = self.tuned.to_arrays()
             arrays |= own
@@ -281,7 +331,7 @@ class Memory:
         if self.kept is not None:
             self.kept.fill(arrays, attributes["kept"])
         if self.exemplars is not None and "exemplars" in attributes:
-            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.capacity, source)
+            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.recipe.exemplars, source)
         self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("retracted", "excluded"))
         self.descriptions = dict(attributes.get("descriptions", {}))  # a merge brings them as rows
         self.take_tuned(arrays, attributes)
@@ -290,20 +340,11 @@ class Memory:
     def take_tuned(self, arrays: Arrays, attributes: Any) -> None:
         """Take the tuned model of a checkpoint, if it has another one."""
         if "tuned" in attributes:
-            tuned, self.tuned_last_sequence = (
-                Tuned.from_arrays(arrays, attributes["tuned"]),
-                attributes["tuned_last_sequence"],
-            )
+            self.tuned_last_sequence = attributes["tuned_last_sequence"]
+            tuned = Tuned.from_arrays(arrays, attributes["tuned"])
             if self.tuned is None or self.tuned.digest() != tuned.digest():
                 self.tuned = tuned
 
 
 def _sample_of(rows: LateArray, arrays: Arrays, materials: Sequence[str], copies: Sequence[int]) -> TouchSample:
     return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, materials, copies)
-
-
-def give_back_scratch() -> None:
-    """Return freed memory to the system where the C library can: fitting and saving leave 40 MB of it."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)

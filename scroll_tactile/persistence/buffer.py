@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.rows import OBSERVE, only_readings
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import OBSERVE, only_readings
 from scroll_tactile.persistence.replaying import require_compaction
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
@@ -28,7 +28,7 @@ def ranked_exemplars(memory: Memory, store: Store | None) -> dict[str, list[Exem
     def mean(material: str, scale: Scale) -> npt.NDArray[np.int64]:
         return mean_code(statistics.sums(scale, [material])[0], int(statistics.counts(scale, [material])[0]))
 
-    return rank(exemplar_candidates(memory, store), memory.capacity, mean)
+    return rank(exemplar_candidates(memory, store), memory.recipe.exemplars, mean)
 
 
 def exemplar_candidates(memory: Memory, store: Store | None) -> list[Exemplar]:

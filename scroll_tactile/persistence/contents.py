@@ -10,12 +10,12 @@ import logging
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 
-from scroll_tactile.memory.rows import MEMBER, OBSERVE
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE
 from scroll_tactile.signals.ranges import CURE
 from store import DamageError, Head, Store
 
-__all__ = ["Contents", "StoredContents", "refusal"]
+__all__ = ["ListedContents", "StoredContents", "refusal"]
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str |
     return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
 
 
-class Contents:
+class ListedContents:
     """The touches of a memory by their keys. rows: of each its material, its key and its row in the journal."""
 
     def __init__(self, rows: Iterable[tuple[str, bytes, int]] = ()) -> None:
@@ -43,9 +43,9 @@ class Contents:
         for material, key, sequence in rows:
             self.add(material, key, sequence)
 
-    def copy(self) -> Contents:
+    def copy(self) -> ListedContents:
         """The same touches, to be changed apart."""
-        other = Contents()
+        other = ListedContents()
         other._rows = dict(self._rows)
         return other
 
@@ -80,17 +80,17 @@ class StoredContents:
         heads = takewhile(lambda head: head.sequence <= self._memory.sequence, heads)
         return (head for head in heads if head.kind in (OBSERVE, MEMBER) and not self._memory.is_gone(head.sequence))
 
-    def copy(self) -> Contents:
+    def copy(self) -> ListedContents:
         """All of them that are not damaged, to be changed apart."""
         heads = self._active(_sound(self._store))
-        return Contents((head.label, head.key, head.sequence) for head in heads)
+        return ListedContents((head.label, head.key, head.sequence) for head in heads)
 
     def names(self, key: bytes) -> list[str]:
-        """As `Contents.names`."""
+        """As `ListedContents.names`."""
         return list(dict.fromkeys(head.label for head in self._active(self._store.with_key(key))))
 
     def find(self, material: str, key: bytes) -> int | None:
-        """As `Contents.find`."""
+        """As `ListedContents.find`."""
         found = self._active(self._store.with_key(key))
         return min((head.sequence for head in found if head.label == material), default=None)
 

@@ -10,7 +10,8 @@ from typing import Any
 from scroll_tactile.errors import FineTuneError, InputError
 from scroll_tactile.memory.descriptions import Description, describe
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.rows import (
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import (
     DESCRIBE,
     OBSERVE,
     RETRACT,
@@ -21,12 +22,11 @@ from scroll_tactile.memory.rows import (
     require_row,
     spans,
 )
-from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.merge import MergePlan, MergeRules
 from scroll_tactile.persistence.observations import compaction_point, observation_of, observations_from, observations_of
-from scroll_tactile.persistence.open_memory import OpenMemory
+from scroll_tactile.persistence.open_memory import OpenMemory, give_back_scratch
 from scroll_tactile.persistence.replaying import apply_description, refill, replay, until
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
@@ -143,12 +143,12 @@ class Ledger(OpenMemory):
         # opening would have to read them.
         store.compaction()
         memory, sequences = self._memory, spans(record.sequence for record in records)
-        before = memory.sample, memory.kept, memory.exemplars, memory.tuned
+        chosen, tuned = memory.chosen, memory.tuned
 
         def revert() -> None:
             for record in records:
                 memory.put_back(record)
-            memory.sample, memory.kept, memory.exemplars, memory.tuned = before
+            memory.chosen, memory.tuned = chosen, tuned
 
         with self._mutation(revert):
             retracted = [memory.retract(record) for record in records]

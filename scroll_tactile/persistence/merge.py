@@ -11,9 +11,9 @@ from pydantic import BaseModel
 from scroll_tactile.errors import MismatchError, ObservationError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
-from scroll_tactile.memory.rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.persistence.contents import Contents, StoredContents, refusal
+from scroll_tactile.memory.touch_rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, active_rows
+from scroll_tactile.persistence.contents import ListedContents, StoredContents, refusal
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import apply_description, replay
 from scroll_tactile.validation.gate import MemoryStore, require_counted, wrong_retractions
@@ -70,7 +70,7 @@ class MergePlan:
         ours: Store,
         memory: Memory,
         theirs: MemoryStore,
-        contents: Contents | StoredContents,
+        contents: ListedContents | StoredContents,
         rules: MergeRules,
     ) -> Self:
         """Look through both journals; contents: which touches we have.
@@ -173,13 +173,13 @@ class MergePlan:
         return {**({SOURCE: self.said} if touch else {}), **head.attributes}
 
 
-def _row(contents: Contents | StoredContents, head: Head) -> int | None:
+def _row(contents: ListedContents | StoredContents, head: Head) -> int | None:
     """Our row of a touch that both have under one name; None where we have it not."""
     return contents.find(head.label, head.key)
 
 
 def _by_first_names(
-    incoming: Sequence[Head], contents: Contents | StoredContents, compacted: int, clipped: Collection[bytes]
+    incoming: Sequence[Head], contents: ListedContents | StoredContents, compacted: int, clipped: Collection[bytes]
 ) -> tuple[list[tuple[Head, str]], set[int]]:
     """The touches that are there, or came just before, under another name, and why each is refused.
 

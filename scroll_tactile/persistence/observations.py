@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal, cast
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory.rows import MEMBER, OBSERVE, SOURCE, active_rows, retracted_by
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, SOURCE, active_rows, retracted_by
 from scroll_tactile.results import Observation, Receipt
 from store import Head, Record, Store
 

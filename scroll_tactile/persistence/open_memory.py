@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory, give_back_scratch
-from scroll_tactile.persistence.contents import Contents, StoredContents
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import Added
+from scroll_tactile.persistence.contents import ListedContents, StoredContents
 from scroll_tactile.persistence.replaying import apply_appended
 from store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
 
-__all__ = ["OpenMemory"]
+__all__ = ["OpenMemory", "give_back_scratch"]
 
 logger = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer")
 
 Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
 """Arrays and attributes."""
@@ -49,7 +53,7 @@ class OpenMemory:
         load: Callable[[], Memory],
         store: Store | None = None,
         bare: bool = False,
-        contents: Contents | None = None,
+        contents: ListedContents | None = None,
     ) -> None:
         self.store = store
         self._contents = contents
@@ -80,7 +84,12 @@ class OpenMemory:
             self._changed()
         return self._memory
 
-    def contents(self) -> Contents | StoredContents:
+    def read(self, what: Callable[[Memory, Store | None], Answer]) -> Answer:
+        """What is read of the memory and its journal, while nobody changes them."""
+        with self.lock:
+            return what(self.memory, self.store)
+
+    def contents(self) -> ListedContents | StoredContents:
         """Which touches the memory has, by their content; whoever calls holds the lock.
 
         Raises StoreClosedError for a snapshot of a memory that was closed before anybody asked.
@@ -95,7 +104,12 @@ class OpenMemory:
             )
         return self._contents
 
-    def copied_contents(self) -> Contents | None:
+    def names(self, key: bytes) -> list[str]:
+        """The names of a touch with this content hash; raises as `contents`."""
+        with self.lock:
+            return self.contents().names(key)
+
+    def copied_contents(self) -> ListedContents | None:
         """All that `contents` has, to be changed apart; None where nobody knows."""
         known = self._contents is not None or (self.store is not None and not self._closed)
         return self.contents().copy() if known else None
@@ -246,3 +260,10 @@ class OpenMemory:
                 store.keep_derived(name, made[0], last_sequence=self._memory.sequence, attributes=made[1])
         except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
             logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)
+
+
+def give_back_scratch() -> None:
+    """Return freed memory to the system where the C library can: fitting and saving leave 40 MB of it."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)

@@ -11,8 +11,8 @@ from typing import Any, cast
 
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.validation.gate import MemoryStore
 from store import Checkpoint, DamageError, Head, Store
@@ -35,7 +35,6 @@ def pack_memory(
     if not readings:
         identity |= {"exemplars": 0, "kept_touches": 0}
         packed.kept = packed.exemplars = None
-        packed.capacity = 0
     with reported(path, "packing a memory"):
         path.parent.mkdir(parents=True, exist_ok=True)
         # What a failing disk does not let go of says nothing of what was packed.

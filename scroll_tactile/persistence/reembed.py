@@ -18,7 +18,8 @@ from pathlib import Path
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.rows import (
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import (
     DESCRIBE,
     OBSERVE,
     RETRACT,
@@ -28,43 +29,37 @@ from scroll_tactile.memory.rows import (
     pack_readings,
     unpack_readings,
 )
-from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.replaying import load, refill, replay
-from scroll_tactile.validation.gate import MemoryStore, require_counted
+from scroll_tactile.recipe import Recipe
+from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted, require_counted
 from store import Record, Store, StoreError
 from store.exceptions import reported
 from store.files import is_there, sync_folder
 from store.lock import WriterLock
 
-__all__ = ["Reembedding", "finish_interrupted"]
+__all__ = ["Reembedding"]
 
-BATCH = 64  # rows that wait for the disk together
-SNAPSHOT_EVERY = 256  # rows, after which a run that goes on does not embed them again
+ROWS_TOGETHER = 64  # rows that wait for the disk together
+CARRIED_EVERY = 256  # rows, after which a run that goes on does not embed them again
 
 
 class Reembedding:
     """The memory that takes the place of another one.
 
-    source: the store of the other one. identity: of the new one. empty: a memory of its making. encode: embeds
-    readings: the columns of the touch, and its rows of codes by scale. bare: whether rows keep readings alone.
+    source: the store of the other one. recipe: of the new one. encode: embeds readings: the columns of the touch, and
+    its rows of codes by scale.
 
     Raises MismatchError where not every observation has its readings, DamageError where a checkpoint counts touches
     that no row has, StoreError.
     """
 
-    def __init__(
-        self,
-        source: Store,
-        identity: Identity,
-        empty: Memory,
-        encode: Callable[[Readings], tuple[int, Codes]],
-        *,
-        bare: bool,
-    ) -> None:
+    def __init__(self, source: Store, recipe: Recipe, encode: Callable[[Readings], tuple[int, Codes]]) -> None:
+        identity = Identity.of(recipe)
         _require_readings(source)
-        self._source, self._encode, self._bare = source, encode, bare
-        folder = _named(source.path, "reembedding")
-        if is_there(whole := _named(source.path, "reembedded")):  # as far as it goes: rows may have come since
+        self.recipe = recipe
+        self._source, self._encode, self._bare = source, encode, identity.embedding.bare
+        folder = beside(source.path, "reembedding")
+        if is_there(whole := beside(source.path, "reembedded")):  # as far as it goes: rows may have come since
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
         self._draft = MemoryStore.open(folder, identity=identity.to_json())
@@ -72,7 +67,7 @@ class Reembedding:
             self._draft.close()
             shutil.rmtree(folder)
             self._draft = MemoryStore.open(folder, identity=identity.to_json())
-        self._memory = load(empty, self._draft)
+        self._memory = load(Memory(recipe, lambda readings: encode(readings)[1]), self._draft)
 
     def copy(self, progress: Callable[[str, int, int], object]) -> None:
         """Embed the rows that the new memory does not have yet; the old one can be used meanwhile.
@@ -82,10 +77,10 @@ class Reembedding:
         memory, draft = self._memory, self._draft
         while draft.last < self._source.last:
             with draft.batch():
-                for record in islice(self._source.records(after=memory.sequence), BATCH):
+                for record in islice(self._source.records(after=memory.sequence), ROWS_TOGETHER):
                     self._carry(record)
             refill(memory, draft)
-            if memory.sequence - memory.saved >= SNAPSHOT_EVERY:
+            if memory.sequence - memory.saved >= CARRIED_EVERY:
                 self._snapshot()
             progress("embedding", draft.last, self._source.last)
 
@@ -121,9 +116,9 @@ class Reembedding:
         )  # resolved: a link goes on leading to the memory
         for store in (self._draft, self._source):
             store.close()
-        whole, before, count = _named(folder, "reembedded"), _named(folder, "before"), 1
+        whole, before, count = beside(folder, "reembedded"), beside(folder, "before"), 1
         while before.exists():
-            before, count = _named(folder, f"before-{count + 1}"), count + 1
+            before, count = beside(folder, f"before-{count + 1}"), count + 1
         lock = WriterLock(folder)
         try:
             with Store.open(folder, mode="read") as old:
@@ -142,20 +137,6 @@ class Reembedding:
     def close(self) -> None:
         """Release the files; what was copied stays, for a run that goes on."""
         self._draft.close()
-
-
-def finish_interrupted(path: Path) -> None:
-    """Put the memory embedded anew in place, where the exchange was cut short just before that."""
-    folder, whole = path.resolve(), _named(path, "reembedded")
-    if not is_there(folder) and is_there(whole):
-        with reported(folder, "putting a memory embedded anew in place"):
-            whole.rename(folder)
-            sync_folder(folder.parent)
-
-
-def _named(path: Path, what: str) -> Path:
-    folder = path.resolve()
-    return folder.with_name(f"{folder.name}.{what}")
 
 
 def _require_readings(store: Store) -> None:

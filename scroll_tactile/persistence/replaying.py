@@ -11,7 +11,8 @@ from typing import cast
 
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description, describe
-from scroll_tactile.memory.rows import (
+from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
+from scroll_tactile.memory.touch_rows import (
     DESCRIBE,
     MEMBER,
     MERGE,
@@ -25,19 +26,18 @@ from scroll_tactile.memory.rows import (
     unpack_readings,
     unspanned,
 )
-from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = ["apply_appended", "apply_description", "load", "refill", "replay", "require_compaction", "until"]
 
 logger = logging.getLogger(__name__)
 
-ATTEMPTS = 20  # of a reader, while a writer changes the store
+LOAD_ATTEMPTS = 20  # of a reader, while a writer changes the store
 
 
 def load(empty: Memory, store: Store) -> Memory:
     """The memory that a store holds: its newest checkpoint, then the journal's rows after it; made as the empty one."""
-    for _ in range(ATTEMPTS - 1):
+    for _ in range(LOAD_ATTEMPTS - 1):
         newest = store.newest
         try:
             memory = _loaded(empty.empty_like(), store)
@@ -151,9 +151,7 @@ def refill(memory: Memory, store: Store) -> None:
     """Choose sample and exemplars again without what was retracted; does nothing where they held none of it."""
     if memory.stale:
         # Rows that a writer appended since this memory was read are left for the next `load`.
-        chosen = _chosen(memory, store, memory.sequence)
-        memory.sample, memory.kept, memory.exemplars = chosen.sample, chosen.kept, chosen.exemplars
-        memory.stale = False
+        memory.chosen = _chosen(memory, store, memory.sequence).chosen
 
 
 def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
@@ -164,9 +162,7 @@ def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
             apply_description(made.descriptions, head)
         elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             replay(later, store.record(head.sequence), store)
-    made.statistics = memory.statistics - later.statistics
-    made.compacted, made.sequence, made.tuned = memory.compacted, last_sequence, None
-    made.retracted = set(memory.retracted)
+    made.take_sums(memory, later, last_sequence)
     return made
 
 

@@ -16,10 +16,9 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,20 +30,19 @@ from scroll_tactile.errors import (
     RangeWarning,
     ScrollTactileError,
 )
-from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.rows import SOURCE
-from scroll_tactile.persistence.merge import Choice, MergeRules
+from scroll_tactile.memory.touch_rows import SOURCE
+from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.pipelines.addresses import expand, fetched
-from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.runfile import alone_in
-from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches, said_of
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, said_of
+from scroll_tactile.pipelines.workers.destination import Destination, FleetReport
 from scroll_tactile.pipelines.workers.engines import Engine, engine, require_workers
-from scroll_tactile.pipelines.workers.jobs import Made, Making, hush, learn_job
+from scroll_tactile.pipelines.workers.jobs import Made, learn_job
 from scroll_tactile.pipelines.workers.steps import NOTES, Step, Steps
+from scroll_tactile.recipe import RecipeRequest
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
-from store import DamageError, Head, NotAStoreError, StoreError, StoreFullError, VersionError
-from store.files import remove_tree
+from store import DamageError, NotAStoreError, StoreError, StoreFullError, VersionError
 
 __all__ = ["FleetReport", "learn"]
 
@@ -53,34 +51,8 @@ logger = logging.getLogger(__name__)
 SLOW = 5  # tries that one counts for which took all the patience that there is
 QUEUED = 2  # times its patience, and GRACE seconds: so long may a job be under way, for it may wait behind another, and
 GRACE = 10.0  # a worker takes a moment to begin
-SAVED_EVERY = 4096  # touches: what opening replays where a run was cut short; a checkpoint costs what 100 do
 
 Progress = Callable[[str, int, int], object]
-
-
-@dataclass
-class FleetReport:
-    """What a run did.
-
-    sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
-    those that had come before, by their names and contents. refused: what was not learned, and why; of touches that
-    came under two names the first counts, of the destination and then of the sources in their order. deaths: jobs whose
-    worker ended before them, or did not answer. seconds: of all, and of merging. processor: seconds of the workers,
-    and of this process. held, digest: of the memory that came out. range_problem: where touches do not fit the
-    sensor's range, what is wrong with the first, and what to do.
-    """
-
-    sources: int = 0
-    observations: int = 0
-    repeated: int = 0
-    refused: list[Refused] = field(default_factory=list)
-    deaths: int = 0
-    seconds: float = 0.0
-    merging: float = 0.0
-    held: int = 0
-    digest: str = ""
-    range_problem: str | None = None
-    processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "merging": 0.0})
 
 
 def learn(
@@ -128,30 +100,20 @@ def learn(
     place = Path(destination).absolute()
     found, missing = expand([os.fspath(source) for source in sources], patience)
     report = FleetReport(refused=missing)
-    settings: dict[str, Any] = {"augmentation": augmentation, "exemplars": exemplars, "kept_touches": kept_touches}
+    asked = RecipeRequest.of(sensor, embedding, augmentation, {"exemplars": exemplars, "kept_touches": kept_touches})
     folder = place.with_name(place.name + ".fleet")
     with ExitStack() as stack:
         stack.enter_context(alone_in(folder, place))
-        held = None
-        if place.exists():
-            held = stack.enter_context(TactileLearner.open(place, sensor=sensor, embedding=embedding, **settings))
-        making = Making.of(held, sensor, embedding, settings, options or SourceOptions(), patience)
-        learned = held is not None and bool(held.observations())
-        if learned and not (folder / NOTES).exists() and not add:
+        into = Destination(place, asked, options or SourceOptions(), patience, stack, report, descriptions)
+        if into.learned and not (folder / NOTES).exists() and not add:
             raise InputError(
                 f"{place} is there already, and not by a run of this kind: take another folder, or add=True to "
                 "add to it"
             )
-        into = _Destination(place, making, held, stack, report, descriptions)
-        steps = Steps(folder, making, afresh=not learned)
+        steps = Steps(folder, into.making, afresh=not into.learned)
         stack.callback(steps.leave)
         report.refused += steps.begin(found)
-        run = _Run(steps, report, into, making, progress, found)
-        if client is None and workers == 1 and patience is None:
-            run.work_here()
-        else:
-            with engine(client, workers) as chosen:
-                run.work(chosen)
+        _work(_Run(steps, report, into, progress, found), workers, client, patience)
         into.close()
         report.range_problem = steps.range_problem
         steps.end()
@@ -161,80 +123,13 @@ def learn(
     return report
 
 
-class _Destination:
-    """The memory that comes out: made when the first touches come in."""
-
-    def __init__(
-        self,
-        place: Path,
-        making: Making,
-        learner: TactileLearner | None,
-        stack: ExitStack,
-        report: FleetReport,
-        descriptions: Choice,
-    ) -> None:
-        self.learner, self._place, self._making, self._stack = learner, place, making, stack
-        self._report, self._descriptions, self._made = report, descriptions, learner is None
-        if learner is not None:
-            hush(learner)
-
-    def opened(self) -> TactileLearner:
-        """The memory, made where there is none."""
-        if self.learner is None:
-            self.learner = self._stack.enter_context(self._making.open(self._place))
-            hush(self.learner)
-        return self.learner
-
-    def learn(self, step: Step, progress: Progress) -> None:
-        """Learn the recordings of a step. Raises StoreError, CapacityError."""
-        making = self._making
-        if self.learner is None and not has_touches(making.sensor, step.sources, making.options, making.embedding):
-            learner = TactileLearner(sensor=making.sensor, embedding=making.embedding)  # for what is refused
-            hush(learner)
-        else:
-            learner = self.opened()
-        done = learn_sources(learner, step.sources, making.options, progress)
-        step.made, step.failed = Made("", range_problem=done.range_problem), done.failed
-        self._report.observations += done.learned.total()
-        self._report.repeated += done.skipped
-        self._report.refused += done.refused
-        self._save()
-
-    def merge(
-        self, path: Path, progress: Progress, clipped: Collection[bytes] = (), source: str | None = None
-    ) -> list[tuple[Head, str]]:
-        """Merge a memory, each touch once; its rows that are refused, and why. Raises as `Ledger.merge`."""
-        begun, processor = time.perf_counter(), time.process_time()
-        try:
-            ledger = self.opened()._ledger
-            # What our own workers made is taken as what this memory holds itself.
-            rules = MergeRules(True, True, self._descriptions, clipped, source, thorough=source is not None)
-            merged, refused = ledger.merge(path, rules, progress)
-            self._save()
-        finally:
-            self._report.merging += time.perf_counter() - begun
-            self._report.processor["merging"] += time.process_time() - processor
-        self._report.observations += merged.observations
-        self._report.repeated += merged.shared
-        return refused
-
-    def _save(self) -> None:
-        ledger = None if self.learner is None else self.learner._ledger
-        if ledger is not None:
-            ledger.save_behind(SAVED_EVERY)
-
-    def close(self) -> None:
-        """Write a checkpoint, and close it. Raises InputError where nothing was learned; it is not there then."""
-        if self.learner is None or (self._made and not self.learner.memory.sequence):
-            if self.learner is not None:
-                self.learner.close()
-                remove_tree(self._place)
-            refused = self._report.refused
-            first = f", such as {refused[0].source}: {refused[0].why}" if refused else ""
-            raise InputError(f"nothing was learned, and no memory made: {len(refused)} sources were refused{first}")
-        self._report.held, self._report.digest = sum(self.learner.materials.values()), self.learner.digest()
-        self.learner._ledger.saves = True
-        self.learner.close()
+def _work(run: _Run, workers: int | None, client: Any, patience: float | None) -> None:
+    """Have a run's steps learned, by this process where it is the only one, and nobody has a patience."""
+    if client is None and workers == 1 and patience is None:
+        run.work_here()
+        return
+    with engine(client, workers) as chosen:
+        run.work(chosen)
 
 
 class _Run:
@@ -244,13 +139,12 @@ class _Run:
         self,
         steps: Steps,
         report: FleetReport,
-        into: _Destination,
-        making: Making,
+        into: Destination,
         progress: Progress,
         found: Sequence[str],
     ) -> None:
         self._steps, self._report, self._into, self._progress = steps, report, into, progress
-        self._patience, self._total = making.patience, len(found)
+        self._patience, self._total = into.making.patience, len(found)
         self._begun = time.perf_counter()
         self._answered = -math.inf
         report.sources = len(steps.learned & set(found))

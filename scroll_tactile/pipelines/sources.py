@@ -16,7 +16,7 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import ContactDetector
-from scroll_tactile.live.pressing import FOLLOWED, PressDetector
+from scroll_tactile.live.pressing import REST_FOLLOWED, PressDetector
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
 from scroll_tactile.recordings.locations import is_remote
 from scroll_tactile.recordings.recording import require_columns
@@ -107,7 +107,7 @@ def contact_spans(learner: TactileLearner, recording: Recording) -> list[tuple[i
     sensor, rest = learner.sensor, capabilities_of(learner.embedding).rest
     detector = PressDetector(sensor, rest) if sensor.camera else ContactDetector(sensor, FALSE_CONTACTS)
     rows = _readings_of(sensor, recording)
-    before = round(FOLLOWED * sensor.rate) if isinstance(rest, str) else 0
+    before = round(REST_FOLLOWED * sensor.rate) if isinstance(rest, str) else 0
     spans: list[tuple[int, int]] = []
     for first, last in pairwise([0, *(gap.index for gap in recording.report.gaps), len(rows)]):
         detector.interrupt()

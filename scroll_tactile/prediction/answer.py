@@ -1,26 +1,261 @@
-"""The prediction for a touch, or for several of one thing, from what a model and its kept touches say of each."""
+"""The prediction for a touch, or for several of one thing; and what answers from a memory that is open."""
 
 from __future__ import annotations
 
 import math
+import os
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.embeddings.protocol import capabilities_of
+from scroll_tactile.errors import EmbeddingMismatchError, InputError
 from scroll_tactile.matching.conformal import Typicality
-from scroll_tactile.prediction.features import Encoded, FeatureExtractor
+from scroll_tactile.memory.descriptions import require_constituents
+from scroll_tactile.memory.identity import FingerprintCheck
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import Codes
+from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.persistence.buffer import exemplar_candidates
+from scroll_tactile.persistence.contents import ListedContents
+from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.replaying import load
+from scroll_tactile.prediction.current import CurrentModel, FrozenModel
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
+from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import judged, levels_seen
-from scroll_tactile.prediction.model import Judgement, Model
-from scroll_tactile.results import Prediction
+from scroll_tactile.prediction.model import Judgement, Model, enough_memory
+from scroll_tactile.prediction.stored import NAME
+from scroll_tactile.recipe import Recipe, RecipeRequest
+from scroll_tactile.results import Composition, Constituent, Prediction
+from scroll_tactile.settings import candidates_of
+from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.validation.gate import open_memory
 
-__all__ = ["answer"]
+__all__ = ["LogitsReader", "Predictor", "answer", "nothing_known"]
 
 FloatArray = npt.NDArray[np.float64]
 Touch = tuple[Encoded, Mapping[str, float] | None]
 """An encoded touch, and the logits of f* where it answers."""
+
+Answer = TypeVar("Answer")
+
+
+class LogitsReader(Protocol):
+    """What reads touches with a tuned model."""
+
+    tuned: Tuned
+
+    def logits_of(self, image: npt.NDArray[np.float32], candidates: Sequence[str]) -> Mapping[str, float] | None:
+        """The logits of a touch; None where the tuned model cannot answer."""
+
+
+class Predictor:
+    """What answers from one memory that is open: its extractor of features, its ledger and its current model.
+
+    recipe: what the memory is made with. tuned_reader: made when a tuned model first answers. replaced: whether the
+    memory was embedded again since; another predictor has it then.
+    """
+
+    def __init__(self, recipe: Recipe, extractor: FeatureExtractor, ledger: Ledger) -> None:
+        self.recipe, self.extractor, self.ledger = recipe, extractor, ledger
+        self.current = CurrentModel(recipe.settings, extractor)
+        self.tuned_reader: LogitsReader | None = None
+        self.replaced = False
+
+    @classmethod
+    def new(cls, recipe: Recipe) -> Self:
+        """Of an empty memory without a path. Raises InputError for an embedding that does not read the sensor."""
+        return cls(recipe, _extractor(recipe), Ledger(partial(Memory, recipe), contents=ListedContents()))
+
+    @classmethod
+    def open(
+        cls, path: str | os.PathLike[str], request: RecipeRequest, mode: Literal["write", "read"] = "write"
+    ) -> Self:
+        """Of the memory in a folder. Raises as `TactileLearner.open`."""
+        store, identity, recipe = open_memory(path, request, mode)
+        try:
+            extractor = _extractor(
+                recipe, FingerprintCheck(identity, store.path) if request.embedding is None else None
+            )
+            bare = identity.embedding.bare
+            encode = partial(_codes_of, extractor) if bare or capabilities_of(recipe.embedding).exact else None
+            return cls(recipe, extractor, Ledger(partial(load, Memory(recipe, encode), store), store, bare))
+        except BaseException:
+            store.close()
+            raise
+
+    @classmethod
+    def of_snapshot(cls, state: Mapping[str, Any]) -> Self:
+        """Of the memory that `snapshot` described, in memory only."""
+        recipe: Recipe = state["recipe"]
+        ledger = Ledger(lambda: Memory(recipe).fill(*state["held"]), contents=state["contents"])
+        return cls(recipe, _extractor(recipe, state["check"]), ledger)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that the memory knows at this moment, to be pickled."""
+        with self.ledger.lock:
+            memory = self.ledger.memory
+            arrays, attributes = memory.to_arrays(candidates=exemplar_candidates(memory, self.ledger.store))
+            held = arrays, attributes, memory.sequence
+            made_with = {"recipe": self.recipe, "check": self.extractor.check}
+            return made_with | {"held": held, "contents": self.ledger.copied_contents()}
+
+    def predict(
+        self,
+        streams: Sequence[Readings],
+        scene: Sequence[str] | None,
+        reader_of: Callable[[Predictor], LogitsReader | None] | None = None,
+    ) -> Prediction:
+        """As `TactileLearner.predict`. reader_of: gives what reads with the tuned model, where that is to answer."""
+        if not streams:
+            raise InputError("expected a stream to predict, or several of one thing; came none")
+        touches = [self.extractor.stream(stream) for stream in streams]
+
+        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Prediction]:
+            reader = None if reader_of is None else reader_of(self)
+            candidates = candidates_of(scene, model.names, model.known)
+            if not candidates:
+                return partial(nothing_known, math.fsum({touch.key: touch.seconds for touch in touches}.values()))
+
+            def read(touch: Stream) -> Touch:
+                encoded = extractor.encode(touch, model.longest, lambda columns: model.scales_for(candidates, columns))
+                if reader is None or not model.is_last(encoded.columns):
+                    return encoded, None
+                return encoded, reader.logits_of(encoded.image, candidates)
+
+            return lambda: self._answer(model, extractor, candidates, [read(touch) for touch in touches])
+
+        return self._of_one_state(begin)
+
+    def compose(self, readings: Readings, constituents: Sequence[str] | None, unfamiliar: float) -> Composition:
+        """As `TactileLearner.compose`."""
+        touch = self.extractor.stream(readings)
+
+        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Composition]:
+            wanted = require_constituents(self.ledger.memory.descriptions, constituents)
+            if not model.names:
+                nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
+                return lambda: Composition(nothing, 1.0, nothing_known(touch.seconds))
+            composer = self.current.composer(self.ledger, model)
+
+            def scales_for(columns: int) -> list[Scale]:
+                return sorted({*model.scales_for(model.names, columns), *composer.scales_for(columns)})
+
+            def composed() -> Composition:
+                encoded = extractor.encode(touch, model.longest, scales_for)
+                prediction = self._answer(model, extractor, model.names, [(encoded, None)])
+                made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
+                return Composition(made_of, new, prediction)
+
+            return composed
+
+        return self._of_one_state(begin)
+
+    def _of_one_state(self, begin: Callable[[Model, FeatureExtractor], Callable[[], Answer]]) -> Answer:
+        """An answer that rests on one state of the memory, which others may change while a touch is embedded.
+
+        begin: reads what it needs of the memory beside its model, and gives what reads the touch and answers.
+        """
+        reading = self._reading()
+        try:
+            with reading.verifying(), enough_memory():
+                with self.ledger.lock:
+                    frozen = self.current.frozen(self.ledger)
+                    answered = begin(frozen.model, reading)
+                    if frozen.model.reads_memory:
+                        return answered()
+                return answered()
+        except EmbeddingMismatchError as error:
+            self._disbelieve(reading, error)
+            return self._of_one_state(begin)
+
+    def _answer(
+        self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Touch]
+    ) -> Prediction:
+        return answer(model, extractor, candidates, touches, self.recipe.settings.false_alarms)
+
+    def _reading(self) -> FeatureExtractor:
+        with self.ledger.lock:
+            return self.current.reading(self.ledger)
+
+    def _disbelieve(self, reading: FeatureExtractor, error: EmbeddingMismatchError) -> None:
+        """Let go what was read from the disk; raise the error where nothing was."""
+        if reading is self.extractor:
+            raise error
+        with self.ledger.lock:
+            self.current.disbelieve()
+
+    def reading(self) -> FeatureExtractor:
+        """The extractor that reads the touches that predictions are asked for, after its fingerprint was compared."""
+        reading = self._reading()
+        try:
+            with reading.verifying():
+                return reading
+        except EmbeddingMismatchError as error:
+            self._disbelieve(reading, error)
+            return self.extractor.verified()
+
+    def frozen(self) -> FrozenModel:
+        """The model of the memory as it is now, which stays as it is for as long as this is held."""
+        with self.ledger.lock, enough_memory():
+            return self.current.frozen(self.ledger)
+
+    @contextmanager
+    def turn(self, model: Model) -> Iterator[None]:
+        """To be held while a model is asked: some read the memory."""
+        if not model.reads_memory:
+            yield
+            return
+        with self.ledger.lock:
+            yield
+
+    def answer_of(
+        self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Encoded]
+    ) -> Prediction:
+        """What a model that is held says of touches of one thing."""
+        with self.turn(model), enough_memory():
+            return self._answer(model, extractor, candidates, [(touch, None) for touch in touches])
+
+    def settle(self) -> None:
+        """As `TactileLearner.settle`."""
+        with self.ledger.lock, enough_memory():
+            self.current.settle(self.ledger)
+
+    def close(self) -> None:
+        """As `TactileLearner.close`."""
+        with self.ledger.lock:
+            self.ledger.close(NAME, lambda: self.current.kept(self.ledger))
+            self.current.close()
+
+    def fitted(self) -> Model:
+        """As `TactileLearner.model`."""
+        with self.ledger.lock, enough_memory():
+            memory = self.ledger.memory
+            model = Draft.of(memory, self.recipe.settings.readout).fit(self.extractor)
+            model.freeze(memory.statistics)
+            return model
+
+
+def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:
+    return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, recipe.augmentation, check)
+
+
+def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) -> Codes:
+    """The rows of codes of a touch whose readings a memory kept."""
+    return extractor.learned(Stream(extractor.sensor, readings))[1]
+
+
+def nothing_known(seconds: float) -> Prediction:
+    """The prediction for so many seconds of touch where there is nothing that it could be."""
+    return Prediction(None, 0.0, (), float("inf"), False, seconds)
 
 
 def answer(

@@ -24,9 +24,10 @@ from weakref import ReferenceType, ref
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.memory.rows import Added
-from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,8 @@ import numpy.typing as npt
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_competing, embed_windows, require_rest
 from scroll_tactile.errors import EmbeddingError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.memory.rows import Codes
+from scroll_tactile.memory.identity import FingerprintCheck
+from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
@@ -91,10 +93,20 @@ class WindowCache:
 class FeatureExtractor:
     """What a sensor, an embedding, a plan of windows and an augmentation make of touches; it learns nothing.
 
+    check: of the embedding's fingerprint, where it was made again for a memory.
+
     Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image that is not its.
     """
 
-    def __init__(self, sensor: Sensor, embedding: Embedding, plan: WindowPlan, augmentation: Augmented | None) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        embedding: Embedding,
+        plan: WindowPlan,
+        augmentation: Augmented | None,
+        check: FingerprintCheck | None = None,
+    ) -> None:
+        self._check, self._own = check, True
         self._sensor = sensor
         self._embedding = embedding
         self._plan = plan
@@ -114,7 +126,24 @@ class FeatureExtractor:
 
     def with_embedding(self, embedding: Embedding) -> FeatureExtractor:
         """The same with an embedding that gives the same features."""
-        return FeatureExtractor(self._sensor, embedding, self._plan, self._augmentation)
+        other = FeatureExtractor(self._sensor, embedding, self._plan, self._augmentation, self._check)
+        other._own = False
+        return other
+
+    @property
+    def check(self) -> FingerprintCheck | None:
+        """The check of its embedding that is still to be made."""
+        return self._check if self._check is not None and self._check.pending else None
+
+    def verified(self) -> FeatureExtractor:
+        """This extractor, whose embedding is the memory's. Raises EmbeddingMismatchError."""
+        if self.check is not None:
+            self.check.require(self._embedding)
+        return self
+
+    def verifying(self) -> AbstractContextManager[None]:
+        """As `verified`, beside what the block does, at the end of which it raises."""
+        return nullcontext() if self.check is None else self.check.beside(self._embedding, own=self._own)
 
     def stream(self, readings: Readings) -> Stream:
         """The sound stream of some readings; of a camera's, the frames in contact.
@@ -127,6 +156,11 @@ class FeatureExtractor:
     def image(self, stream: Stream) -> Image:
         """The tactile image of a `stream`."""
         return image_of(stream, self._rest) if self._sensor.camera else tactile_image(stream)
+
+    def learned(self, stream: Stream) -> tuple[int, Codes]:
+        """What a memory learns of a `stream`: its columns, and the `codes` that it adds. Raises as `verified`."""
+        image = self.verified().image(stream)
+        return image.shape[1], self.codes(image, stream.key)
 
     def codes(self, image: Image, key: bytes) -> Codes:
         """The rows of codes that a touch adds to the statistics, by scale: its own, behind them those of its copies.

@@ -21,7 +21,8 @@ from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
-from scroll_tactile.memory.state import Memory, give_back_scratch
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model

@@ -15,8 +15,8 @@ from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.matcher import TouchMatcher
-from scroll_tactile.memory.rows import Added
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.prediction.moments import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence

@@ -6,21 +6,18 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
-from scroll_tactile.embeddings.protocol import Embedding, window_plan
-from scroll_tactile.memory.identity import Identity, default_kept_touches
-from scroll_tactile.memory.kept import Keeping, usual_kept
-from scroll_tactile.memory.rows import Codes
-from scroll_tactile.memory.state import Memory
-from scroll_tactile.persistence.reembed import Reembedding, finish_interrupted
+from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.memory.identity import Identity
+from scroll_tactile.persistence.reembed import Reembedding
+from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.recipe import Recipe, RecipeRequest, default_kept_touches
+from scroll_tactile.settings import Settings
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.validation.gate import MemoryStore
+from scroll_tactile.validation.gate import MemoryStore, finish_interrupted
 from store import Store
 
-__all__ = ["reembed_memory", "reembedding"]
+__all__ = ["embed_again", "reembed_memory"]
 
 
 def reembed_memory(
@@ -32,8 +29,7 @@ def reembed_memory(
     """As `TactileLearner.reembed`, with the memory in a folder, also where its own embedding is not at hand."""
     finish_interrupted(Path(path))
     with MemoryStore.open(path) as store:
-        chosen = Identity.read(store).own_embedding(store.path) if embedding is None else embedding
-        carried = reembedding(store, chosen)
+        carried = _reembedding(store, embedding)
         try:
             carried.copy(progress or (lambda what, done, of: None))
             return carried.put_in_place()
@@ -41,21 +37,37 @@ def reembed_memory(
             carried.close()
 
 
-def reembedding(store: Store, embedding: Embedding) -> Reembedding:
-    """What carries the memory in a store over to another embedding."""
+def embed_again(
+    predictor: Predictor, embedding: Embedding | None, progress: Callable[[str, int, int], object]
+) -> tuple[Path, Predictor]:
+    """As `TactileLearner.reembed`; also what answers from the memory that took the place of the other."""
+    ledger = predictor.ledger
+    with ledger.lock:  # not in the midst of another thread's batch
+        store = ledger.require_store("be embedded again")
+        ledger.require_writing()
+    carried = _reembedding(store, embedding)
+    try:
+        carried.copy(progress)
+        with ledger.lock:
+            ledger.require_writing()
+            carried.copy(progress)
+            predictor.close()
+            before = carried.put_in_place()
+            predictor.replaced = True
+            kept = {"exemplars": None, "kept_touches": None}  # those of the new one
+            settings = predictor.recipe.settings.model_copy(update=kept)
+            return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, None, settings))
+    finally:
+        carried.close()
+
+
+def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
+    """What carries the memory in a store over to another embedding; None: to its own, made again."""
     made = Identity.read(store)
-    usual = usual_kept(made.sensor) if made.views else 0
+    chosen = made.own_embedding(store.path) if embedding is None else embedding
     # As many as were asked for, none too; where nobody asked, as many as are usual with the embedding that it gets.
-    kept_touches = default_kept_touches(made.sensor, embedding) if made.kept_touches == usual else made.kept_touches
-    identity = Identity.of(made.sensor, embedding, made.exemplars, made.augmentation, kept_touches)
-    keeping = Keeping(made.sensor, kept_touches)
-    plan = window_plan(made.sensor, embedding)
-    extractor = FeatureExtractor(made.sensor, embedding, plan, made.augmentation)
-
-    def encode(readings: npt.NDArray[np.float32]) -> tuple[int, Codes]:
-        touch = Stream(made.sensor, readings)
-        image = extractor.image(touch)
-        return image.shape[1], extractor.codes(image, touch.key)
-
-    empty = Memory(embedding.dimension, plan, made.exemplars, lambda readings: encode(readings)[1], keeping)
-    return Reembedding(store, identity, empty, encode, bare=identity.embedding.bare)
+    usual = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
+    kept = Settings(exemplars=made.exemplars, kept_touches=None if usual else made.kept_touches)
+    recipe = Recipe.of(made.sensor, chosen, made.augmentation, kept)
+    extractor = FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, recipe.augmentation)
+    return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))

@@ -266,7 +266,7 @@ class _Reader:
         expect(len(there) == len(levels) if self._same else bool(there), "kept-keys", "those that are kept", len(there))
         expect(len(there) == count or not self._same, "kept-keys", "no others than are kept", count)
         kept = {row: KeptTouch(*touches[row], levels[touches[row]]) for row in there}
-        channels, most = memory.made.sensor.channels, memory.made.most_columns
+        channels, most = memory.sensor.channels, memory.most_columns
         longest = int(counts("kept-longest", array(self._arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
         lengths = {row: touch.levels.shape[1] for row, touch in kept.items()}
         expect(max(lengths.values()) <= longest, "kept-longest", "the longest", longest)

@@ -15,7 +15,7 @@ from pydantic import Field, FiniteFloat
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.settings import FrozenModel
+from scroll_tactile.settings import ValidatedFields
 from scroll_tactile.signals.augmentation import Image, crop, resize
 
 __all__ = ["Augmented", "require_augmentable"]
@@ -23,7 +23,7 @@ __all__ = ["Augmented", "require_augmentable"]
 FEWEST = 2  # columns of a copy, however fast it is
 
 
-class Augmented(FrozenModel):
+class Augmented(ValidatedFields):
     """Which copies a touch is observed with.
 
     copies: how many, the same for every touch, so that each counts alike. speed: the most that a copy is slower, or

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.memory.rows import Arrays
+from scroll_tactile.memory.touch_rows import Arrays
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan
@@ -17,8 +17,10 @@ from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
 from scroll_tactile.statistics.tables import rows_of
 from scroll_tactile.validation.expected import (
-    MOST_COLUMNS,
+    LONGEST_TOUCH,
     array,
+    check_description,
+    check_readings,
     check_values,
     codes,
     counts,
@@ -27,7 +29,6 @@ from scroll_tactile.validation.expected import (
     name,
     whole,
 )
-from scroll_tactile.validation.row_checks import check_description, check_readings
 from store.records import LateArray
 
 __all__ = ["CheckpointChecks"]
@@ -92,7 +93,7 @@ class CheckpointChecks:
         observations = array(arrays, "observations", ("int64",), (count,))
         touches: list[int] = counts("observations", observations, 0, MOST_ROWS).tolist()
         lengths = array(arrays, "lengths", ("int64",), (None, 2))
-        counts("lengths", lengths[:, 0], 1, MOST_COLUMNS)
+        counts("lengths", lengths[:, 0], 1, LONGEST_TOUCH)
         counts("lengths", lengths[:, 1], 1, MOST_ROWS)
         expect(len(set(lengths[:, 0].tolist())) == len(lengths), "lengths", "different lengths", lengths[:, 0])
         total = int(lengths[:, 1].sum())
@@ -192,7 +193,7 @@ class CheckpointChecks:
     def _check_kept(self, arrays: Arrays, materials: list[str]) -> None:
         keys(arrays, "kept-keys", materials)
         columns = array(arrays, "kept-columns", ("int64",), (len(materials),))
-        counts("kept-columns", columns, fewest_readings(self._sensor), MOST_COLUMNS)
+        counts("kept-columns", columns, fewest_readings(self._sensor), LONGEST_TOUCH)
         array(arrays, "kept-levels", ("uint8",), (int(columns.sum()) * self._sensor.channels,))
 
     def _check_exemplars(
@@ -209,7 +210,7 @@ class CheckpointChecks:
         if "exemplar-readings" not in arrays:
             return
         lengths = array(arrays, "exemplar-lengths", ("int64",), (count,))
-        counts("exemplar-lengths", lengths, fewest_readings(self._sensor), MOST_COLUMNS)
+        counts("exemplar-lengths", lengths, fewest_readings(self._sensor), LONGEST_TOUCH)
         scales = array(arrays, "exemplar-scales", ("int64",), (count,)).tolist()
         for material, scale in zip(materials, scales, strict=True):
             found = next((totals for own, totals in rows.items() if int(own) == scale and own.width), {})

@@ -1,7 +1,7 @@
 """The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
-gate takes every row and checkpoint for what it must be (see `row_checks`, `checkpoint_checks`), and raises DamageError
+gate takes every row and checkpoint for what it must be (see `expected`, `checkpoint_checks`), and raises DamageError
 with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
 under another name is, and it fits.
 """
@@ -19,22 +19,31 @@ from typing import Any, Literal, cast
 
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, window_plan
+from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.embeddings.registry import require_configuration
-from scroll_tactile.errors import EmbeddingError, MismatchError
-from scroll_tactile.memory.identity import AbsentEmbedding, Identity, usual_embedding
-from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented, require_augmentable
+from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
+from scroll_tactile.memory.identity import AbsentEmbedding, Identity
+from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.validation.checkpoint_checks import CheckpointChecks
-from scroll_tactile.validation.expected import Unexpected
-from scroll_tactile.validation.row_checks import RowChecks
+from scroll_tactile.validation.expected import RowChecks, Unexpected
 from store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
-from store.files import file_size
+from store.exceptions import reported
+from store.files import file_size, is_there, sync_folder
 from store.layout import log_numbers, log_path
 
-__all__ = ["WRONG", "Gate", "MemoryStore", "check_memory", "open_store", "require_counted", "wrong_retractions"]
+__all__ = [
+    "WRONG",
+    "Gate",
+    "MemoryStore",
+    "beside",
+    "check_memory",
+    "finish_interrupted",
+    "open_memory",
+    "require_counted",
+    "wrong_retractions",
+]
 
 SMALLEST_ROW = 128  # bytes of the log: a frame and a row without texts
 # What reading values of wrong types can raise; what is no error of the values, such as ctrl-C, is none of them.
@@ -164,25 +173,51 @@ class MemoryStore(Store):
         return None if found is None else self.gate.checkpoint(found)
 
 
-def open_store(
-    path: str | os.PathLike[str],
-    sensor: Sensor | None,
-    embedding: Embedding | None,
-    augmentation: Augmented | None,
-    exemplars: int | None,
-    kept_touches: int | None,
-    mode: Literal["write", "read"],
+def finish_interrupted(path: Path) -> None:
+    """Put the memory embedded anew in place, where the exchange was cut short just before that."""
+    folder, whole = path.resolve(), beside(path, "reembedded")
+    if not is_there(folder) and is_there(whole):
+        with reported(folder, "putting a memory embedded anew in place"):
+            whole.rename(folder)
+            sync_folder(folder.parent)
+
+
+def beside(path: Path, what: str) -> Path:
+    """The folder beside a memory in which one that is embedded anew lies, or the one before it."""
+    folder = path.resolve()
+    return folder.with_name(f"{folder.name}.{what}")
+
+
+def open_memory(
+    path: str | os.PathLike[str], request: RecipeRequest, mode: Literal["write", "read"]
+) -> tuple[MemoryStore, Identity, Recipe]:
+    """The store in a folder, what is written there of its making, and its recipe; a new one where a sensor is given.
+
+    Raises as `TactileLearner.open`.
+    """
+    finish_interrupted(Path(path))
+    if request.sensor is None and not is_there(Path(path)):
+        raise InputError(f"there is no memory in {path}; to make one, say which sensor it is for")
+    store = _opened_or_made(path, request, mode)
+    try:
+        identity = Identity.read(store)
+        recipe = identity.recipe(store.path, request)
+        store.read_with(recipe.plan)
+    except BaseException:
+        store.close()
+        raise
+    return store, identity, recipe
+
+
+def _opened_or_made(
+    path: str | os.PathLike[str], request: RecipeRequest, mode: Literal["write", "read"]
 ) -> MemoryStore:
-    """The store in a folder; a new one where there is none and a sensor is given."""
     try:
         return MemoryStore.open(path, mode=mode)
     except NotAStoreError:
-        if sensor is None or mode == "read":
+        if request.sensor is None or mode == "read":
             raise
-    require_augmentable(sensor, augmentation)
-    chosen = usual_embedding(sensor) if embedding is None else embedding
-    identity = Identity.of(sensor, chosen, exemplars, augmentation, kept_touches)
-    return MemoryStore.open(path, identity=identity.to_json(), mode=mode)
+    return MemoryStore.open(path, identity=Identity.of(request.recipe()).to_json(), mode=mode)
 
 
 def require_counted(path: Path, checkpoint: Checkpoint, heads: Sequence[Head]) -> None:

@@ -33,7 +33,7 @@ from forging import (
 
 from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
 from faults.places import Attack, Scene, leftover, strange_file
-from scroll_tactile.memory.rows import pack_codes, unpack_readings
+from scroll_tactile.memory.touch_rows import pack_codes, unpack_readings
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
 from store.encoding import decode_payload, encode_payload

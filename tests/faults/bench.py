@@ -40,7 +40,7 @@ from faults.received import (
     read,
 )
 from scroll_tactile import TactileLearner
-from scroll_tactile.memory.rows import pack_codes
+from scroll_tactile.memory.touch_rows import pack_codes
 from scroll_tactile.persistence.replaying import replay
 from scroll_tactile.validation.gate import MemoryStore
 from store import Record, VersionError

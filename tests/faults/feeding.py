@@ -44,7 +44,9 @@ def touches(settings: dict[str, Any], materials: int, of_each: int) -> list[Felt
             )
             image = tactile_image(felt)
             bound = learner.embedding.bound
-            codes = {width: to_codes(rows, bound) for width, rows in learner._extractor.features(image).items()}
+            codes = {
+                width: to_codes(rows, bound) for width, rows in learner._predictor.extractor.features(image).items()
+            }
             found.append(Felt(f"material {name}", felt, image.shape[1], codes))
     return found
 

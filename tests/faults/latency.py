@@ -31,7 +31,7 @@ from faults.common import file_system, folder, parser, progress, run
 from faults.feeding import BIOTAC, TINY, endless, observe, touches
 from faults.shim import Shim, begin_again_watched
 from scroll_tactile import TactileLearner
-from scroll_tactile.memory.rows import pack_codes
+from scroll_tactile.memory.touch_rows import pack_codes
 
 INSERT = "INSERT INTO kept (bytes) VALUES (?)"
 TOGETHER = 25  # of one kind in a row

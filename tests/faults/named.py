@@ -37,7 +37,7 @@ from forging import (
 from numcodecs import zstd
 
 from faults.places import Scene
-from scroll_tactile.memory.rows import pack_codes
+from scroll_tactile.memory.touch_rows import pack_codes
 
 Named = Callable[[Path, Scene], None]
 

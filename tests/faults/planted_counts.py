@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from faults.planting import Patches, nothing
-from scroll_tactile.memory.rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.persistence import ledger, merge, packing, replaying
 from store import checkpoints, journal, repair
 

@@ -45,6 +45,7 @@ import numpy as np
 import scroll_tactile.learner
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
+import scroll_tactile.prediction.answer
 import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.model
@@ -153,7 +154,7 @@ LOCAL = threading.local()
 @contextmanager
 def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
     """While it lasts each answer is asked for twice of the model that gives it, which must stay as it is."""
-    own = scroll_tactile.learner.answer
+    own = scroll_tactile.prediction.answer.answer
 
     def answer(model: Any, *rest: Any) -> Prediction:
         before, said = learned_by(model), own(model, *rest)
@@ -165,7 +166,7 @@ def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
         LOCAL.learned = before
         return said
 
-    with patch.object(scroll_tactile.learner, "answer", answer):
+    with patch.object(scroll_tactile.prediction.answer, "answer", answer):
         yield
 
 
@@ -461,7 +462,7 @@ def begun(home: Path, seed: int) -> Round:
                 material = worker.material()
                 readings = round_.fresh(material)
                 round_.readings[other.observe(material, readings).key] = readings
-    codes = learner._extractor.codes(learner._extractor.image(learner.stream(touch("a", 0))), b"")
+    codes = learner._predictor.extractor.codes(learner._predictor.extractor.image(learner.stream(touch("a", 0))), b"")
     ROWS.update({int(scale): len(rows) for scale, rows in codes.items()})
     round_.reader = TactileLearner.open(home / "memory", mode="read")
     return round_

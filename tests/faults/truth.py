@@ -15,7 +15,8 @@ import numpy.typing as npt
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.match import KeptTouch
-from scroll_tactile.memory.rows import DESCRIBE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import DESCRIBE, OBSERVE, RETRACT, unspanned
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
@@ -88,7 +89,7 @@ class Truth:
     def codes(self, key: bytes) -> Any:
         """What it added to the sums."""
         if key not in self._codes:
-            extractor = self._learner._extractor
+            extractor = self._learner._predictor.extractor
             self._codes[key] = extractor.codes(extractor.image(self.stream(key)), key)
         return self._codes[key]
 
@@ -109,7 +110,7 @@ class Truth:
     def _summed(self, row: int) -> tuple[str, Learned]:
         touches = self.states[row].touches
         if touches not in self._sums:
-            sums = self._learner._empty_memory().statistics
+            sums = Memory(self._learner._predictor.recipe).statistics
             for material, key in touches:
                 sums.add(material, self.codes(key), LENGTH)
             self._sums[touches] = (
@@ -125,15 +126,15 @@ class Truth:
 
     def typical(self, row: int, names: Sequence[str], streams: Sequence[Stream]) -> tuple[float, ...]:
         """How typical touches of one thing are of some materials."""
-        keeping = self._learner._empty_memory().kept.made  # type: ignore[union-attr]
+        kept_touches = Memory(self._learner._predictor.recipe).kept
         if row not in self._conformal:
             kept = [
-                KeptTouch(name, key, keeping.levels(self.stream(key).readings))
+                KeptTouch(name, key, kept_touches.levels(self.stream(key).readings))
                 for name, key in self.states[row].touches
             ]
             self._conformal[row] = Conformal(kept)
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
-        found = [self._conformal[row].p_values(keeping.levels(once[key].readings)) for key in sorted(once)]
+        found = [self._conformal[row].p_values(kept_touches.levels(once[key].readings)) for key in sorted(once)]
         if len(found) == 1:
             return tuple(found[0][name].share for name in names)
         return tuple(min(1.0, 2 * math.fsum(of[name].share for of in found) / len(found)) for name in names)

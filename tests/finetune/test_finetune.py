@@ -260,7 +260,7 @@ def test_the_start_is_f_itself_as_its_windows_judge():
 def test_a_fold_held_out_starts_as_a_memory_that_never_observed_it(readout):
     learner = learned("kernels", readout=readout)
     model, statistics = learner.model(), copy.deepcopy(learner.memory.statistics)
-    extractor = learner._extractor
+    extractor = learner._predictor.extractor
     held = [(name, extractor.stream(stream)) for name, stream in touches[4:14]]
     samples = []
     for name, stream in held:
@@ -278,7 +278,7 @@ def test_a_fold_held_out_starts_as_a_memory_that_never_observed_it(readout):
 
 def test_a_material_of_which_all_is_held_out_is_not_compared():
     learner = learned("kernels")
-    model, extractor = learner.model(), learner._extractor
+    model, extractor = learner.model(), learner._predictor.extractor
     learner.observe("once", SCENE.touch(SCENE.materials[6], 0))
     stream = extractor.stream(SCENE.touch(SCENE.materials[6], 0))
     image = extractor.image(stream)

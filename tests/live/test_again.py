@@ -9,7 +9,7 @@ from touches import PAD
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError
-from scroll_tactile.live.session import EARLIER
+from scroll_tactile.live.session import MOST_EARLIER
 
 RANDOM = np.random.default_rng(14)
 
@@ -155,12 +155,12 @@ def test_gaps_and_steps_back_in_time_change_nothing():
 
 
 def test_only_so_many_touches_of_one_thing_are_held():
-    made, touches = learner(), [slide("b", 10, RANDOM) for _ in range(EARLIER + 3)]
+    made, touches = learner(), [slide("b", 10, RANDOM) for _ in range(MOST_EARLIER + 3)]
     with made.live(contact="manual") as live:
         touched(live, touches[0])
         found = [touched(live, touch, again=True) for touch in touches[1:]]
-    assert max(len(touch.earlier) for touch in found) == EARLIER
-    assert found[-1].prediction == made.predict(*touches[-EARLIER - 1 :])
+    assert max(len(touch.earlier) for touch in found) == MOST_EARLIER
+    assert found[-1].prediction == made.predict(*touches[-MOST_EARLIER - 1 :])
 
 
 def test_again_without_a_touch_before_says_what_to_do():

@@ -23,7 +23,7 @@ from scroll_tactile.memory.exemplars import (
     quotas,
     rank,
 )
-from scroll_tactile.memory.rows import pack_readings
+from scroll_tactile.memory.touch_rows import pack_readings
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
 

@@ -16,6 +16,7 @@ from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision
 from scroll_tactile.embeddings.protocol import capabilities_of, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
+from scroll_tactile.recipe import Recipe
 from store import Store
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
@@ -126,7 +127,7 @@ MADE = [make() for make in EMBEDDINGS.values()] + [
 
 @pytest.mark.parametrize("embedding", MADE, ids=repr)
 def test_what_follows_from_readings_on_any_machine_is_known_without_making_it(embedding):
-    identity = Identity.of(PAD, embedding, None)
+    identity = Identity.of(Recipe.of(PAD, embedding))
     assert identity.embedding.bare == capabilities_of(embedding).exact
     assert AbsentEmbedding(identity, None).capabilities.exact == capabilities_of(embedding).exact
 
@@ -178,7 +179,7 @@ def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
 
 def prepare(path, embedding, change):
     """An empty memory whose identity is changed before anything is observed."""
-    identity = Identity.of(PAD, embedding, None).to_json()
+    identity = Identity.of(Recipe.of(PAD, embedding)).to_json()
     change(identity)
     Store.open(path, identity=identity).close()
 
@@ -195,7 +196,7 @@ VIEWS = ("whole", "shape", "competing")
 
 @pytest.mark.parametrize(("embedding", "views"), [(Kernels(dimension=64), VIEWS), (Windowed(dimension=64), ())])
 def test_whether_whole_touches_are_read_is_known_without_the_embedding(tmp_path, embedding, views):
-    made = Identity.of(PAD, embedding, 4)
+    made = Identity.of(Recipe.of(PAD, embedding))
     assert made.views == views
     assert made.to_json()["views"] == list(views)
     assert Identity.from_json(made.to_json()) == made

@@ -10,7 +10,8 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.kept import Keeping, KeptTouches, usual_kept
+from scroll_tactile.memory.state import KeptTouches
+from scroll_tactile.recipe import default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
 from store import Store
 
@@ -20,11 +21,11 @@ SPARE = [("d", (40 + i, 60)) for i in range(3)]
 
 def test_levels_are_those_of_the_readings_and_at_most_twice_as_long_as_is_usual():
     for readings in (2, 50, 100, 101, 5000):
-        levels = Keeping(PAD, 3).levels(stream((0, readings)))
+        levels = KeptTouches(PAD, 3).levels(stream((0, readings)))
         assert levels.dtype == np.uint8
         assert np.array_equal(levels, levels_of(stream((0, readings))[:100], PAD))
     short = PAD.model_copy(update={"duration": 0.02})
-    assert Keeping(short, 3).levels(stream((0, 60))).shape == (2, 2)
+    assert KeptTouches(short, 3).levels(stream((0, 60))).shape == (2, 2)
 
 
 def test_each_channel_has_levels_of_its_own_range():
@@ -41,7 +42,7 @@ def test_each_channel_has_levels_of_its_own_range():
 @settings(max_examples=60, deadline=None)
 def test_they_are_a_function_of_the_set_and_come_back_from_their_arrays(touches, capacity, rng):
     def kept(order):
-        chosen = KeptTouches(Keeping(PAD, capacity))
+        chosen = KeptTouches(PAD, capacity)
         for material, seed, readings in order:
             chosen.take(material, bytes([seed, readings]) * 16, stream((seed, readings)))
         return chosen
@@ -50,7 +51,7 @@ def test_they_are_a_function_of_the_set_and_come_back_from_their_arrays(touches,
     shuffled = [*touches, *touches[:3]]
     rng.shuffle(shuffled)
     arrays, materials = first.to_arrays()
-    for other in (kept(shuffled), KeptTouches(Keeping(PAD, capacity))):
+    for other in (kept(shuffled), KeptTouches(PAD, capacity)):
         if not len(other):
             other.fill(arrays, materials)
         again, names = other.to_arrays()
@@ -64,7 +65,7 @@ def test_they_are_a_function_of_the_set_and_come_back_from_their_arrays(touches,
 
 
 def test_a_touch_without_readings_is_not_kept():
-    kept = KeptTouches(Keeping(PAD, 3))
+    kept = KeptTouches(PAD, 3)
     kept.take("a", b"a" * 32, None)
     assert not kept.touches()
 
@@ -100,7 +101,7 @@ def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):
 @pytest.mark.parametrize("made", [None, 0, FEW])
 def test_how_many_is_chosen_once(tmp_path, made):
     learner, _ = filled(tmp_path / "m", kept_touches=made)
-    count = usual_kept(PAD) if made is None else made
+    count = default_kept_touches(PAD, views=True) if made is None else made
     assert learner.settings.kept_touches == count
     learner.close()
     for mode in ("write", "read"):
@@ -115,10 +116,10 @@ def test_how_many_is_chosen_once(tmp_path, made):
 
 
 def test_none_are_kept_where_they_are_of_no_use():
-    assert usual_kept(BIOTAC) == 1000
-    assert usual_kept(GELSIGHT) == 0
+    assert default_kept_touches(BIOTAC, views=True) == 1000
+    assert default_kept_touches(GELSIGHT, views=True) == 0
     large = BIOTAC.model_copy(update={"channels": 2000, "duration": 60.0})
-    assert 1 <= usual_kept(large) < 20
+    assert 1 <= default_kept_touches(large, views=True) < 20
     windowed = TactileLearner(sensor=PAD, embedding=Windowed(dimension=64))
     windowed.observe("a", stream((0, 60)))
     assert windowed.settings.kept_touches == 0

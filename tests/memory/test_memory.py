@@ -1,5 +1,7 @@
 """A memory: what a journal row holds, and what comes back from a store."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,8 +10,8 @@ from hypothesis.extra import numpy as arrays_of
 
 from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import CapacityError, MismatchError
-from scroll_tactile.memory.rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan, extent
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.statistics.sample import stage_rows
@@ -96,7 +98,10 @@ def touch(seed):
 
 
 def filled(seeds):
-    memory = Memory(DIMENSION, READING)
+    made_with = SimpleNamespace(
+        plan=READING, embedding=SimpleNamespace(dimension=DIMENSION), exemplars=0, kept_touches=0
+    )
+    memory = Memory(made_with)
     for i, seed in enumerate(seeds, start=1):
         memory.add(*touch(seed), i, None, None)
     return memory

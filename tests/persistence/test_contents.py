@@ -8,7 +8,7 @@ from forging import spoil_row
 from touches import contents, fed, filled, require_same, stream
 
 from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.persistence.contents import Contents
+from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.simulation.scene import Scene
 from store import StoreClosedError, StoreError, StoreFullError
 from store.log_writer import LogWriter
@@ -197,7 +197,7 @@ def many(touches, **settings):
 
 
 def test_a_row_that_is_not_there_is_no_error():
-    held = Contents([("a", b"1", 1)])
+    held = ListedContents([("a", b"1", 1)])
     held.remove("a", b"1", 2)
     held.remove("b", b"2", 1)
     assert held.names(b"1") == ["a"] and held.find("a", b"1") == 1 and held.find("a", b"3") is None

@@ -12,6 +12,7 @@ from examples.paper.transfer.maps import Maps
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.persistence import reembed
+from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.reembedding import reembed_memory
 from store import DamageError, LockedError, Store, StoreFullError
 
@@ -71,8 +72,8 @@ def test_it_is_what_the_other_embedding_would_have_made(path, other):
 
 @pytest.mark.parametrize("stopped", [1, 2, 3])
 def test_a_run_that_was_cut_short_goes_on(path, other, stopped, monkeypatch):
-    monkeypatch.setattr(reembed, "BATCH", 4)
-    monkeypatch.setattr(reembed, "SNAPSHOT_EVERY", 5)
+    monkeypatch.setattr(reembed, "ROWS_TOGETHER", 4)
+    monkeypatch.setattr(reembed, "CARRIED_EVERY", 5)
     learner, _ = eventful(path)
     steps = []
 
@@ -131,7 +132,7 @@ def test_killed_in_the_exchange_one_of_them_is_whole(path, call, monkeypatch):
 
 
 def test_what_is_observed_meanwhile_is_in_it(path, other, monkeypatch):
-    monkeypatch.setattr(reembed, "BATCH", 4)
+    monkeypatch.setattr(reembed, "ROWS_TOGETHER", 4)
     learner, _ = filled(path, OBSERVED[:6])
     late = iter(OBSERVED[6:9])
 
@@ -147,6 +148,22 @@ def test_what_is_observed_meanwhile_is_in_it(path, other, monkeypatch):
         kept = len(learner.observations())
         assert 8 <= kept <= 9
         assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
+
+
+def test_a_prediction_that_had_begun_is_of_the_memory_before(path, monkeypatch):
+    learner, _ = eventful(path)
+    reading, before = CurrentModel.reading, repr(learner.predict(stream((10, 60))))
+
+    def embedded_again(*given):
+        monkeypatch.undo()
+        extractor = reading(*given)
+        learner.reembed(OTHER["exact"]())
+        return extractor
+
+    monkeypatch.setattr(CurrentModel, "reading", embedded_again)
+    assert repr(learner.predict(stream((10, 60)))) == before
+    assert learner.embedding.dimension == 128
+    learner.close()
 
 
 def test_rows_that_are_not_those_of_the_checkpoint_are_not_carried_over(path):

@@ -16,11 +16,10 @@ from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.pipelines import fleet
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import SourceOptions
-from scroll_tactile.pipelines.workers import engines, jobs, steps
+from scroll_tactile.pipelines.workers import destination, engines, jobs, steps
 from store import StoreFullError
 
 BY_FOLDER = SourceOptions(by="folder")
@@ -74,7 +73,7 @@ class TestSameBytes:
         touches = [draw.choice(TOUCHES) for _ in range(draw.randrange(1, 20))]
         touch_files(tmp_path / "in", touches)
         monkeypatch.setattr(steps, "MOST_SOURCES", draw.randrange(1, 6))
-        monkeypatch.setattr(steps, "TRIES", 50)
+        monkeypatch.setattr(steps, "MOST_TRIES", 50)
         ends = DyingExecutor(draw.choice([0.0, 0.3, 0.6]), seed)
         done = run(tmp_path / "m", [tmp_path / "in"], client=ends)
         assert done.observations == len(set(touches)) and not done.refused
@@ -236,7 +235,7 @@ class TestGoingOn:
 
     @pytest.mark.parametrize("workers", [1, 2])
     def test_a_run_that_was_cut_short_replays_little(self, tmp_path, monkeypatch, workers):
-        monkeypatch.setattr(fleet, "SAVED_EVERY", 4)
+        monkeypatch.setattr(destination, "SAVED_EVERY", 4)
         monkeypatch.setattr(steps, "MOST_SOURCES", 2)
         paths = touch_files(tmp_path / "in", TOUCHES)
 
@@ -388,7 +387,7 @@ class TestWhatCannotBeLearned:
 class TestProcesses:
     def test_workers_that_are_killed_again_and_again_change_nothing(self, tmp_path, monkeypatch):
         touch_files(tmp_path / "in", TOUCHES)
-        monkeypatch.setattr(steps, "TRIES", 50)
+        monkeypatch.setattr(steps, "MOST_TRIES", 50)
         killed = []
 
         def kill(what, done, of):
@@ -407,7 +406,7 @@ class TestProcesses:
         require_learned(tmp_path / "m")
 
     def test_a_job_that_takes_too_long_is_given_up(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(steps, "TRIES", 1)
+        monkeypatch.setattr(steps, "MOST_TRIES", 1)
         touch_files(tmp_path / "in", TOUCHES[:2])
         os.mkfifo(tmp_path / "in" / "a" / "stuck.csv")  # nobody ever writes it
         done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=3.0, **SETTINGS)

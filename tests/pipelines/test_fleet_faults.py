@@ -121,7 +121,7 @@ class TestGarbage:
         ],
     )
     def test_what_is_no_answer_is_asked_for_again_and_named_in_the_end(self, tmp_path, sources, monkeypatch, made):
-        monkeypatch.setattr(steps, "TRIES", 3)
+        monkeypatch.setattr(steps, "MOST_TRIES", 3)
 
         class Garbage(DyingExecutor):
             def submit(self, what, job):
@@ -152,7 +152,7 @@ class TestGarbage:
         assert done.observations == 12 and done.digest == expected().digest()
 
     def test_one_that_is_never_there_is_named_in_the_end(self, tmp_path, sources, monkeypatch):
-        monkeypatch.setattr(steps, "TRIES", 2)
+        monkeypatch.setattr(steps, "MOST_TRIES", 2)
 
         class Elsewhere(DyingExecutor):
             """Has a folder of its own under this name."""

@@ -54,7 +54,7 @@ def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path
     paths = touch_files(tmp_path / "in", touches)
     draw.shuffle(paths)
     monkeypatch.setattr(steps, "MOST_SOURCES", draw.randrange(1, 5))
-    monkeypatch.setattr(steps, "TRIES", 50)
+    monkeypatch.setattr(steps, "MOST_TRIES", 50)
     if seed < 6:
         done = run(tmp_path / "m", paths, client=Shuffled(seed))
     else:

@@ -66,7 +66,7 @@ def require_followed(learner):
     """Its readouts count each touch that the memory has, once."""
     learner.predict(stream(*PROBES[0]))
     statistics = learner.memory.statistics
-    for scale, readout in learner._current.present(learner._ledger).readouts.items():
+    for scale, readout in learner._predictor.current.present(learner._ledger).readouts.items():
         names = statistics.names(scale)
         counts = [readout.counts[readout.places[name]] for name in names]
         assert counts == statistics.counts(scale, names).tolist()
@@ -122,9 +122,9 @@ def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
     learner.settle()
     fresh = fed(sorted(observed), readout=readout)
     assert bits(learner) == bits(fresh)
-    before = learner._current._model
+    before = learner._predictor.current._model
     learner.settle()
-    assert learner._current._model is before  # settled already
+    assert learner._predictor.current._model is before  # settled already
 
 
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
@@ -133,9 +133,9 @@ def test_what_was_just_observed_counts_and_a_fit_that_is_there_answers(readout):
     for i in range(16):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 200 + i))
         learner.predict(stream(*PROBES[0]))
-        if (fit := learner._current._fit) is not None:
+        if (fit := learner._predictor.current._fit) is not None:
             fit.future.result()
-        model = learner._current.present(learner._ledger)
+        model = learner._predictor.current.present(learner._ledger)
         touches = learner.memory.statistics.touches
         assert 0 <= touches - model.fitted_to < max(2, model.fitted_to // 8)
         assert model.names == list(learner.materials)
@@ -185,7 +185,7 @@ def test_no_prediction_waits_for_a_fit_that_never_ends(monkeypatch):
 def test_readouts_solved_again_are_those_of_a_fit(monkeypatch):
     learner = fed(OBSERVED)
     learner.predict(stream(*PROBES[0]))
-    before = learner._current.present(learner._ledger)
+    before = learner._predictor.current.present(learner._ledger)
     for i in range(30):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i))
     memory = learner.memory
@@ -208,7 +208,7 @@ def test_many_touches_without_a_question_are_not_kept(monkeypatch):
     learner.predict(stream(*PROBES[0]))
     for i in range(current.MOST_BEHIND + 50):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i))
-    held = learner._current
+    held = learner._predictor.current
     jobs = [job for job in (held._fit, held._renewal) if job is not None]
     assert sum(len(kept or []) for kept in (held._behind, *(job.since for job in jobs))) <= 3 * current.MOST_BEHIND
     require_followed(learner)
@@ -266,10 +266,10 @@ def test_a_fit_that_failed_beside_is_made_again(monkeypatch):
         failing(broken, Draft, "fit", MemoryError("no room"))
         for i in range(3):
             learner.observe("a", stream("a", 90 + i))
-        failed = learner._current._fit
+        failed = learner._predictor.current._fit
         failed.future.exception()
     learner.predict(stream(*PROBES[0]))
-    again = learner._current._fit
+    again = learner._predictor.current._fit
     assert again is not failed
     again.future.result()
     assert bits(learner) == bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
@@ -310,7 +310,7 @@ def fitting(monkeypatch):
     learner.predict(stream(*PROBES[0]))
     for i in range(3):
         learner.observe("a", stream("a", 90 + i))
-    assert not learner._current._fit.future.done()
+    assert not learner._predictor.current._fit.future.done()
     return learner
 
 
@@ -318,7 +318,7 @@ def test_closed_pickled_copied_and_dropped_while_a_fit_runs(fitting):
     fresh = bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
     for snapshot in (pickle.loads(pickle.dumps(fitting)), copy.deepcopy(fitting)):
         assert bits(snapshot) == fresh
-    job = fitting._current._fit
+    job = fitting._predictor.current._fit
     fitting.close()
     assert job.future.done()
     for _ in range(3):

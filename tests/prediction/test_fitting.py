@@ -115,7 +115,7 @@ def test_settled_it_is_that_of_a_fresh_learner_to_the_bit(model, order):
         again.observe(*TOUCHES[0])
         again.predict(LATER[1][1])
     again.settle()
-    assert table(again._current.settle(again._ledger)) == table(model)
+    assert table(again._predictor.current.settle(again._ledger)) == table(model)
     fresh = learned()
     fresh.settle()
     for _, touch in LATER[:4]:

@@ -268,16 +268,16 @@ def test_a_prediction_is_of_one_state_that_there_was(monkeypatch, readings):
 
 def test_a_held_model_stays_as_it_is_and_what_nobody_holds_is_followed_in_place():
     learner = learned()
-    held = learner._current.frozen(learner._ledger)
+    held = learner._predictor.current.frozen(learner._ledger)
     arrays = {name: value.copy() for name, value in _arrays(held.model).items()}
     changing(learner)()
     now = _arrays(held.model)
     assert held.model.names == ["a", "b", "c"]
     assert all(np.array_equal(now[name], arrays[name]) for name in arrays)
-    current = learner._current.frozen(learner._ledger).model
+    current = learner._predictor.current.frozen(learner._ledger).model
     assert current is not held.model
     learner.observe("c", touch("c", 70))
-    assert learner._current.present(learner._ledger) is current  # not fitted anew: what follows shows that
+    assert learner._predictor.current.present(learner._ledger) is current  # not fitted anew: what follows shows that
     assert current.readouts[min(current.readouts)].counts.sum() > 0
 
 
@@ -300,7 +300,7 @@ def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
     for seed in range(12):
         learner.observe("a", touch("a", 60 + seed, 20))
     assert learner.memory.statistics.usual_least == 20
-    assert draft.fit(learner._extractor).least == other.model().least == 50
+    assert draft.fit(learner._predictor.extractor).least == other.model().least == 50
 
 
 def test_tables_are_there_for_any_number_of_threads():

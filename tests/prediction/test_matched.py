@@ -195,7 +195,7 @@ def test_ragged_touches(matching):
 
 def present(learner):
     """The matcher that answers now."""
-    return learner._current.present(learner._ledger).matcher
+    return learner._predictor.current.present(learner._ledger).matcher
 
 
 def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
@@ -212,7 +212,7 @@ def test_a_model_that_followed_matches_what_one_fitted_anew_does(tmp_path):
         kept = {(material, key) for material, key, _ in learner.memory.kept}
         assert followed.kept.held == kept
         rng = np.random.default_rng(0)
-        asked = [learner.memory.keeping.levels(uniform(values, rng)) for _, values in ASKED[:8]]
+        asked = [learner.memory.kept.levels(uniform(values, rng)) for _, values in ASKED[:8]]
         before = [followed.match(levels) for levels in asked]
         learner.settle()
         anew = present(learner)

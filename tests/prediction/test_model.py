@@ -104,7 +104,7 @@ def test_materials_held_only_when_asked_for_are_weighed_alike(monkeypatch, touch
             assert ours.novelty == pytest.approx(theirs.novelty, rel=1e-7, abs=1e-7)
         for learner in (plain, held):  # materials that were held, that were not, and new ones
             learner.observe([*NAMES, "new", "newer"][5 * i % 14], stream(5 * i % 14, 100 + i))
-            if (fit := learner._current._fit) is not None:  # both go on with what a thread fitted
+            if (fit := learner._predictor.current._fit) is not None:  # both go on with what a thread fitted
                 fit.future.result()
 
 

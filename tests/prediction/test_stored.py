@@ -10,6 +10,7 @@ from prediction.test_current import OBSERVED, PAD, SMALL, bits, fed, stream
 import store.derived
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError
+from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.stored import NAME
 from store import DamageError, check_store, repair_store
@@ -126,7 +127,7 @@ def test_rows_behind_the_checkpoint_are_taken_in(path, fits, change):
     with opened(path) as reader:
         assert reader.digest() == wanted
         said, numbers = bits(reader), reader.memory.statistics
-        model = reader._current.present(reader._ledger)
+        model = reader._predictor.current.present(reader._ledger)
         assert model.names == list(numbers.materials)
         for scale, readout in model.readouts.items():
             assert readout.counts.sum() == numbers.counts(scale, numbers.names(scale)).sum()
@@ -241,7 +242,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
         kept(path).write_bytes(whole)
         forge(path, change)
         with opened(path) as learner:
-            model = learner._current
+            model = learner._predictor.current
             model._look(learner._ledger)
             if model._model is None:
                 refused += 1
@@ -271,7 +272,7 @@ def test_banks_that_give_other_features_are_found_by_the_fingerprint(made, path,
 
     forge(path, change)
     with opened(path) as learner:
-        learner._unverified = _Identity(), path
+        learner._predictor.extractor._check = FingerprintCheck(_Identity(), path)
         assert bits(learner) == made[1]
 
 

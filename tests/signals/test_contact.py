@@ -7,6 +7,7 @@ from scroll_tactile import Frames, Kernels, TactileLearner, sensors
 from scroll_tactile.embeddings.protocol import require_rest
 from scroll_tactile.errors import InputError, MismatchError, NoContactError, StreamError
 from scroll_tactile.memory.identity import Identity
+from scroll_tactile.recipe import Recipe
 from scroll_tactile.signals.contact import MOST_FRAMES, image_of, in_contact, pressed
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
@@ -100,9 +101,9 @@ def test_an_embedding_that_cannot_read_the_sensor_leaves_no_memory_behind(tmp_pa
 
 
 def test_a_cameras_memory_says_that_its_windows_are_frames_and_one_that_does_not_is_refused(tmp_path):
-    identity = Identity.of(SMALL, Kernels(dimension=64), 0).to_json()
+    identity = Identity.of(Recipe.of(SMALL, Kernels(dimension=64))).to_json()
     assert identity["grid"]["frames"] is True
-    assert Identity.of(sensors.BIOTAC, Kernels(dimension=64), 0).grid.frames is False
+    assert Identity.of(Recipe.of(sensors.BIOTAC, Kernels(dimension=64))).grid.frames is False
     identity["grid"]["frames"] = False
     Store.open(tmp_path / "other", identity=identity).close()
     with pytest.raises(MismatchError, match="was made with"):

@@ -13,7 +13,7 @@ from touches import PAD, SETTINGS, contents, filled, stream
 
 from scroll_tactile import Augmented, Kernels, TactileLearner
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
-from scroll_tactile.memory.rows import pack_readings
+from scroll_tactile.memory.touch_rows import pack_readings
 from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.validation.gate import check_memory

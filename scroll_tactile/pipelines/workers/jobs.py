@@ -8,21 +8,19 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.identity import Identity, usual_embedding
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import Refused, SourceOptions
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
+from scroll_tactile.recipe import Recipe
 from store.archive import Files, files_of, write_archive
 from store.exceptions import reported
 
@@ -33,50 +31,20 @@ CONTENT = re.compile("[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Making:
-    """What all memories of a run are made with. patience: seconds that a job may take; None: any."""
+    """What all memories of a run are made with, and how sources are read. patience: seconds for a job; None: any."""
 
-    sensor: Sensor
-    embedding: Embedding
-    augmentation: Augmented | None
-    exemplars: int | None
-    kept_touches: int | None
+    recipe: Recipe
     options: SourceOptions
     patience: float | None = None
-
-    @classmethod
-    def of(
-        cls,
-        held: TactileLearner | None,
-        sensor: Sensor | None,
-        embedding: Embedding | None,
-        settings: Mapping[str, Any],
-        options: SourceOptions,
-        patience: float | None,
-    ) -> Making:
-        """That of a memory that is held; or of a new one, by the arguments. Raises InputError."""
-        if held is not None:
-            sensor, embedding, kept = held.sensor, held.embedding, held.settings
-            return cls(sensor, embedding, held.augmentation, kept.exemplars, kept.kept_touches, options, patience)
-        if sensor is None:
-            raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
-        chosen = usual_embedding(sensor) if embedding is None else embedding
-        return cls(sensor, chosen, **settings, options=options, patience=patience)
 
     @property
     def identity(self) -> Identity:
         """That of the memory that comes out."""
-        return Identity.of(self.sensor, self.embedding, self.exemplars, self.augmentation, self.kept_touches)
+        return Identity.of(self.recipe)
 
     def open(self, path: Path) -> TactileLearner:
-        """A learner of this making, in a folder."""
-        return TactileLearner.open(
-            path,
-            sensor=self.sensor,
-            embedding=self.embedding,
-            augmentation=self.augmentation,
-            exemplars=self.exemplars,
-            kept_touches=self.kept_touches,
-        )
+        """A learner of this recipe, in a folder."""
+        return TactileLearner.open(path, **self.recipe.arguments)
 
 
 @dataclass(frozen=True)

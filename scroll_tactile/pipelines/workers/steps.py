@@ -24,9 +24,9 @@ logger = logging.getLogger(__name__)
 
 JOBS_A_WORKER = 4  # at least, so that all have something to do to the end; a merge costs what 50 touches do
 MOST_SOURCES = 1024  # of a step: what is lost with a worker
-MOST_BYTES = 2**28  # of their files, where these are here
+MOST_STEP_BYTES = 2**28  # of their files, where these are here
 NOTES = "run.json"
-TRIES = 20  # of a job of one source whose worker died: on a machine that kills a worker a second, nearly all end sooner
+MOST_TRIES = 20  # of a job of one source whose worker died: where one dies each second, nearly all end sooner
 NOTING = 20  # times as long as noting took, nothing is noted again: of a million sources it takes seconds
 
 
@@ -127,7 +127,7 @@ class Steps:
             if whole != tuple(names[place : place + len(whole)]):
                 whole = ()
             own = 0 if memory else _bytes_of(source)
-            if group and (memory or whole or len(group) >= most or size + own > MOST_BYTES):
+            if group and (memory or whole or len(group) >= most or size + own > MOST_STEP_BYTES):
                 self.steps.append(Step(tuple(group)))
                 group, size = [], 0
             if whole:
@@ -176,9 +176,9 @@ class Steps:
             self.waiting.extendleft(reversed(parts))
             return True
         step.tries += tries
-        if step.tries < TRIES:
+        if step.tries < MOST_TRIES:
             self.waiting.appendleft(step)
-        return step.tries < TRIES
+        return step.tries < MOST_TRIES
 
     def _note(self, *, now: bool = False) -> None:
         """Note what was learned, unless that was just now: what a kill leaves unnoted is learned again, and once."""

@@ -59,9 +59,9 @@ Added = tuple[str, Codes, int]
 
 MOST_BYTES = 2**28  # of the readings of a touch as float32: a row is read into memory whole
 CODES = "codes-"  # and a scale
-WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
-SHAPE, ZERO, REST = "readings-shape", "readings-zero", "readings-rest"
-MANTISSA, LARGEST = 24, 128  # bits of a float32's mantissa, and its largest exponent
+PACKED_WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
+PACKED_SHAPE, PACKED_ZERO, PACKED_REST = "readings-shape", "readings-zero", "readings-rest"
+MANTISSA, LARGEST_EXPONENT = 24, 128  # bits of a float32's mantissa, and its largest exponent
 
 
 def require_row(stream: Stream) -> None:
@@ -82,9 +82,9 @@ def pack_readings(readings: Readings) -> dict[str, npt.NDArray[Any]]:
     """
     if (counts := _counts(readings)) is None:
         zero = readings.view(np.uint32) == 0  # of the bits: −0 is none
-        return {SHAPE: np.array(readings.shape), ZERO: np.packbits(zero), REST: readings[~zero]}
+        return {PACKED_SHAPE: np.array(readings.shape), PACKED_ZERO: np.packbits(zero), PACKED_REST: readings[~zero]}
     power, whole = counts
-    return {f"{WHOLE}{power}": np.ascontiguousarray(np.moveaxis(whole, 0, -1))}
+    return {f"{PACKED_WHOLE}{power}": np.ascontiguousarray(np.moveaxis(whole, 0, -1))}
 
 
 def _counts(readings: Readings) -> tuple[int, npt.NDArray[np.integer]] | None:
@@ -95,7 +95,7 @@ def _counts(readings: Readings) -> tuple[int, npt.NDArray[np.integer]] | None:
     mantissas, exponents = np.frexp(some)
     digits = np.ldexp(mantissas, MANTISSA).astype(np.int32)
     trailing = np.frexp((digits & -digits).astype(np.float32))[1] - 1
-    power = int((exponents - MANTISSA + trailing).min(initial=LARGEST)) if len(some) else 0
+    power = int((exponents - MANTISSA + trailing).min(initial=LARGEST_EXPONENT)) if len(some) else 0
     whole = np.ldexp(readings.astype(np.float64), -power)
     for kind in (np.uint8, np.int8, np.int16):
         if np.iinfo(kind).min <= whole.min(initial=0) and whole.max(initial=0) <= np.iinfo(kind).max:
@@ -107,13 +107,13 @@ def unpack_readings(arrays: Arrays) -> Readings | None:
     """The readings that `pack_readings` packed, or that a compaction checkpoint has as they are; None without any."""
     if "readings" in arrays:
         return arrays["readings"]
-    if REST in arrays:
-        readings: Readings = np.zeros(arrays[SHAPE], np.float32)
-        readings.reshape(-1)[np.unpackbits(arrays[ZERO], count=readings.size) == 0] = arrays[REST]
+    if PACKED_REST in arrays:
+        readings: Readings = np.zeros(arrays[PACKED_SHAPE], np.float32)
+        readings.reshape(-1)[np.unpackbits(arrays[PACKED_ZERO], count=readings.size) == 0] = arrays[PACKED_REST]
         return readings
     for name, whole in arrays.items():
-        if name.startswith(WHOLE):
-            power = int(name.removeprefix(WHOLE))
+        if name.startswith(PACKED_WHOLE):
+            power = int(name.removeprefix(PACKED_WHOLE))
             return np.ldexp(np.ascontiguousarray(np.moveaxis(whole, -1, 0)).astype(np.float32), power)
     return None
 

@@ -1,0 +1,197 @@
+"""What a learner does with its memory without a touch at hand: changes, copies, and what the journal says."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from scroll_tactile.arguments import require_arguments
+from scroll_tactile.errors import InputError
+from scroll_tactile.memory.descriptions import Description, checked
+from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.buffer import ranked_exemplars
+from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.observations import observations
+from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.results import Compacted, Observation, Receipt
+from scroll_tactile.settings import require_name, require_source, require_text
+
+__all__ = ["MemoryKeeper"]
+
+
+class MemoryKeeper(ABC):
+    """The part of a learner that keeps its memory; it embeds nothing, and answers nothing."""
+
+    @property
+    @abstractmethod
+    def _ledger(self) -> Ledger:
+        """What has the memory, and its journal."""
+
+    @property
+    def path(self) -> Path | None:
+        """The folder of the memory; None where it is in memory only."""
+        return None if self._ledger.store is None else self._ledger.store.path
+
+    @property
+    def memory(self) -> Memory:
+        """What it has learned: statistics, sample, exemplars, descriptions and f*. Read it; never change it."""
+        return self._ledger.read(lambda memory, _: memory)
+
+    @property
+    def materials(self) -> dict[str, int]:
+        """Material → number of observations, in alphabetical order."""
+        return self._ledger.read(lambda memory, _: memory.statistics.materials)
+
+    def digest(self) -> str:
+        """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
+        return self._ledger.read(lambda memory, _: memory.statistics.digest())
+
+    @property
+    def descriptions(self) -> dict[str, Description]:
+        """Material → its description, in alphabetical order, whether it was observed or not."""
+        described = self._ledger.read(lambda memory, _: sorted(memory.descriptions.items()))
+        return {name: dict(description) for name, description in described}
+
+    def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
+        """Say what a material is made of, before or after it is touched; durable when this returns.
+
+        constituents: name → share by mass, from 0 to 1, summing to one; a mass that is not named is absent. For
+        attributes that are no masses: True or False; one that is not named is unknown. None for a name: unknown, and
+        nothing is learned of that constituent from this material. None for all: removes the description.
+
+        A later description replaces an earlier one as a whole; the same one again changes nothing. Statistics and
+        `digest` stay as they are. `forget` removes the description too, `retract` does not.
+
+        Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, or names
+        that cannot be used (nothing was changed); StoreError.
+        """
+        material = require_name(material)
+        self._ledger.describe(material, None if constituents is None else checked(material, constituents))
+
+    @contextmanager
+    def batch(self) -> Iterator[None]:
+        """Make what is observed, retracted or forgotten in the block durable together, when it ends.
+
+        For many touches: it waits for the disk once. If the process dies in the block, none of it is kept; after an
+        exception, what came before it is. Other threads wait for its end, and it allows no fine-tuning, merging,
+        compacting or closing. In a memory without a path it does nothing.
+
+        Raises StoreError where the batch could not be made durable: the memory is then as it was before it.
+        """
+        with self._ledger.batch():
+            yield
+
+    def retract(self, receipt: Receipt | int) -> None:
+        """Take one observation out again, by its receipt or its sequence; durable when this returns.
+
+        Statistics, exemplars and readouts are then, to the bit, those of a memory that never had it; an f* that was
+        made from it is gone. Its features stay in the journal, unused, until `compact`.
+
+        Raises ObservationError (nothing was changed) for one that is not there, was retracted before or was
+        compacted, or for a receipt of another memory; InputError in a memory without a path; StoreError.
+        """
+        self._ledger.retract(receipt)
+
+    def relabel(self, receipt: Receipt | int, material: str) -> int:
+        """Give an observation another name: retract it and observe its readings under the new one, durable as one.
+
+        Returns its new sequence; it keeps its time and source. A description stays with the name that it was given to.
+
+        Raises what `retract` raises (nothing was changed), also MaterialError for a name that is none; InputError where
+        it has that name already, and in a batch.
+        """
+        return self._ledger.relabel(receipt, require_name(material))
+
+    def forget(self, material: str | None = None, *, source: str | None = None) -> int:
+        """Retract all observations of a material, or from a source, as `retract` does one; returns how many.
+
+        A forgotten material loses its description, too. source: a file, as `observations` names it, or a folder or
+        address that files lie in, such as a robot's day.
+
+        Raises UnknownMaterialError for a material never observed, and ObservationError (nothing was changed) where some
+        of them were compacted, or a source has none; InputError for both or neither, and in a memory without a path;
+        StoreError.
+        """
+        if (material is None) == (source is None):
+            raise InputError("say what is to be forgotten: a material, or a source")
+        if material is not None:
+            require_text(material)
+        return self._ledger.forget(material, None if source is None else require_source(source))
+
+    def backup(
+        self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
+    ) -> None:
+        """Copy the memory to a new folder, also while it is in use: whole, as it was at one moment, or not at all.
+
+        Raises InputError in a memory without a path; StoreError where something is there already, or it cannot be
+        written or verified.
+        """
+        require_arguments({"destination": destination}, {"progress": progress})
+        self._ledger.require_store("be copied").backup(destination, progress=progress)
+
+    def pack(
+        self, path: str | os.PathLike[str], *, rows: bool = True, readings: bool = True, source: str | None = None
+    ) -> None:
+        """Write the memory as one file that travels, and that `merge` takes; whole and durable, or not there at all.
+
+        It holds what was learned: sums, sampled touches, kept touches and descriptions, and of each observation its
+        name, content hash, time and source. f* and retracted observations stay behind.
+        rows: also each observation's readings, or codes where the memory has no readings, so that it can be retracted
+        where the file is merged, and counted once where it is there already. They are left out of a memory of which any
+        were compacted. Without them come the readings of the exemplars. readings: False leaves out all that shows a
+        touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with
+        exemplars=0 and kept_touches=0. source: what is said of observations that have none.
+
+        Raises InputError in a memory without a path, and for a source that is none; StoreError.
+        """
+        require_arguments({"path": path})
+        said = None if source is None else require_source(source)
+        ledger = self._ledger
+        with ledger.lock:
+            store = ledger.require_store("be packed")
+            pack_memory(store, ledger.memory, Path(path), rows=rows, readings=readings, source=said)
+
+    def compact(self, *, keep: int = 0) -> Compacted:
+        """Give up the features and readings of old observations, for space; what was learned from them stays.
+
+        keep: how many of the newest observations can still be retracted afterwards, by `retract` and `forget`; the
+        older ones cannot any more. What was retracted before is gone from the disk, too.
+
+        Raises InputError for a keep below 0, in a batch, and in a memory without a path; StoreError.
+        """
+        return self._ledger.compact(keep)
+
+    def refresh(self) -> bool:
+        """In a memory opened to read, take in what was committed since; whether there was anything.
+
+        Raises StoreError; what was known before stays then.
+        """
+        return self._ledger.refresh()
+
+    def observations(self) -> list[Observation]:
+        """Every observation in the journal, in order, and its state; none in a memory without a path.
+
+        Raises StoreError.
+        """
+        return self._ledger.read(lambda _, store: [] if store is None else observations(store))
+
+    @property
+    def exemplars(self) -> dict[str, list[bytes]]:
+        """Material → content hashes of its exemplars, in rank order; materials in alphabetical order."""
+        return {name: [exemplar.key for exemplar in ranked] for name, ranked in self.ranked_exemplars().items()}
+
+    def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
+        """Material → its exemplars with their readings (T, n) in the sensor's unit, in rank order.
+
+        Raises StoreError; CompactedError in a memory opened to read that was compacted since: `refresh` it first.
+        """
+        return self._ledger.read(ranked_exemplars)
+
+    def tuned_digest(self) -> str | None:
+        """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
+        tuned = self.memory.tuned
+        return None if tuned is None else tuned.digest()

@@ -32,7 +32,7 @@ from scroll_tactile.prediction.moments import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.readout_arrays import readout_from_arrays, readout_to_arrays
+from scroll_tactile.readouts.task import readout_from_arrays, readout_to_arrays
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.validation.expected import KEY_BYTES, Unexpected, array, counts, expect, whole

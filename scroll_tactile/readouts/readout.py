@@ -23,15 +23,14 @@ H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.derived import Derived
 from scroll_tactile.readouts.held_means import HeldMeans, class_means
-from scroll_tactile.readouts.many_materials import ManyMaterials
-from scroll_tactile.readouts.pruning import likeliest
+from scroll_tactile.readouts.pruning import ManyMaterials, likeliest
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
@@ -68,6 +67,19 @@ class Numbers(NamedTuple):
     share: float
     penalty: float
     precision: FloatArray
+
+
+@dataclass(frozen=True)
+class Derived:
+    """What ridge and novelty need of a readout as it is at one moment.
+
+    gram: G of the reference materials about their mean, shape (R, R). background: H. towards: what is taken off z
+    beside its mean to bring it about the mean of the reference materials, shape (R,).
+    """
+
+    gram: FloatArray
+    background: FloatArray
+    towards: FloatArray
 
 
 class Readout:
@@ -252,10 +264,17 @@ class Readout:
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""
-        found = self._derived
-        if found is None:
-            self._derived = found = Derived.of(self)
-        return found
+        if self._derived is None:
+            shares, (means, solved) = self.shares, self.means_solved()
+            with one_thread():
+                gram = self.gamma * (means @ solved.T)
+                gram = (gram + gram.T) / 2
+                onto = gram @ shares
+                size = float(shares @ onto)
+                gram = gram - onto[:, None] - onto + size
+                background = np.linalg.inv(np.diag(1.0 / ((1 - self.share) * shares)) + gram)
+            self._derived = Derived(gram, (background + background.T) / 2, onto - size)
+        return self._derived
 
     def _reference_z(self, codes: FloatArray) -> FloatArray:
         """z of the reference materials about the origin, shape (R,)."""

@@ -26,10 +26,15 @@ from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, st
 from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.moments import Fusion
-from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
+from scroll_tactile.readouts.calibration import (
+    PRIOR_WEIGHT,
+    Calibration,
+    HeldOutProbabilities,
+    calibrate_stage,
+    held_out_probabilities,
+)
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOutProbabilities, held_out_probabilities
-from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
@@ -125,7 +130,7 @@ class Draft:
             fit = _Fit(self, readouts, extractor)
             held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
             reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
-            calibrations = [fit.calibrated(stage, scales, held_out) for stage, scales in enumerate(reached)]
+            calibrations = [fit.calibrated(stage, scales, held_out)[0] for stage, scales in enumerate(reached)]
             whole, fusion = fit.fused(len(reached) - 1, held_out) if reached else (None, None)
         give_back_scratch()
         return Model(
@@ -162,11 +167,17 @@ class _Fit:
         own = None if queries is None else queries[scale]
         return held_out_scores(self.readouts[scale], draft.sample, stages, draft.kind, own)
 
-    def calibrated(self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]) -> Calibration:
-        """The calibration of a stage. number: the stage, or that of the query under which `held_out` has the scores."""
-        materials = [material for material, *_ in self.draft.sample]
-        own = [(self.readouts[scale], held_out[scale]) for scale in scales]
-        return calibrate_stage(number, materials, own, self.draft.kind, viewed=bool(self.draft.views))
+    def calibrated(
+        self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]
+    ) -> tuple[Calibration, HeldOutProbabilities]:
+        """The calibration of some scales, and what they say so of the touches held out.
+
+        number: the stage, or that of the query under which `held_out` has the scores.
+        """
+        found = StageScores(number, self.draft.sample, [held_out[scale] for scale in scales])
+        readouts = [self.readouts[scale] for scale in scales]
+        calibration = calibrate_stage(found, readouts, self.draft.kind, viewed=bool(self.draft.views))
+        return calibration, held_out_probabilities(found, scales, calibration)
 
     def judged(
         self,
@@ -176,10 +187,8 @@ class _Fit:
         held_out: Mapping[Scale, HeldOutScores],
         matches: Mapping[bytes, Match],
     ) -> HeldOutMoment:
-        """What some scales and the kept touches say at a moment, given as its columns and stage."""
-        calibration = self.calibrated(number, scales, held_out)
-        answers = held_out_probabilities(number, scales, self.draft.sample, held_out, calibration)
-        return HeldOutMoment(*moment, calibration, answers, matches)
+        """What some scales and the kept touches say at a moment, given as its steps and stage."""
+        return HeldOutMoment(*moment, *self.calibrated(number, scales, held_out), matches)
 
     def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
         """What readouts say of complete touches held out, and the table of weights of readouts and kept touches.

@@ -36,8 +36,14 @@ from scroll_tactile.prediction.moments import (
     match_weight,
     tempered,
 )
-from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import (
+    AHEAD,
+    FEWEST,
+    UNMEASURED,
+    Calibration,
+    HeldOutProbabilities,
+    fit_weights,
+)
 
 __all__ = ["HeldOutMoment", "chosen_of", "full_match_weight", "fuse", "moments_of"]
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 from scroll_tactile.prediction.judging import fused
 from scroll_tactile.prediction.model import Judgement, Model
 from scroll_tactile.prediction.moments import tempered
-from scroll_tactile.readouts.held_out import held_out_probabilities
+from scroll_tactile.readouts.calibration import held_out_probabilities
+from scroll_tactile.readouts.leave_one_out import StageScores
 
 __all__ = ["HeldOutTouch", "held_out_touches"]
 
@@ -68,7 +69,8 @@ def _held_out_touches(model: Model, false_alarms: float) -> Iterator[HeldOutTouc
     for stage in range(len(model.calibrations) - 1, -1, -1):
         calibration = model.calibration("complete", fusion.complete, stage)
         scales, moment = model.scales("complete", stage), fusion.latest(stage)
-        held = held_out_probabilities(stage, scales, model.sample, model.held_out, calibration)
+        found = StageScores(stage, model.sample, [model.held_out[scale] for scale in scales])
+        held = held_out_probabilities(found, scales, calibration)
         for i, place in enumerate(held.places):
             if place in judged:
                 continue

@@ -24,7 +24,7 @@ from scroll_tactile.readouts.leave_one_out import HeldOutScores
 from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
 from scroll_tactile.results import Unusual
-from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
 from scroll_tactile.statistics.sample import SampledTouch
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
@@ -337,8 +337,8 @@ class Model:
         distances = np.array(
             [readout.diagonal_distance(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
         )
-        measuring = [readout.scale.measures_novelty for readout in readouts]
-        return calibration.weights_at(distances), float(calibration.relative(distances)[measuring].min())
+        novel = measuring([readout.scale for readout in readouts])
+        return calibration.weights_at(distances), float(calibration.relative(distances)[novel].min())
 
     def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """The calibration by which scores are read at a stage: the moment's, if it is of this stage.
@@ -370,8 +370,8 @@ class Model:
         self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> FloatArray:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
-        measuring = [scale for scale in scales if scale.measures_novelty]
-        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in measuring])
+        novel = [scales[place] for place in measuring(scales)]
+        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
 
 
 def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:

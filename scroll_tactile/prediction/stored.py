@@ -33,7 +33,7 @@ from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.task import readout_from_arrays, readout_to_arrays
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.signals.windows import Scale, measuring
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.validation.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from store import Checkpoint
@@ -323,7 +323,7 @@ class _Reader:
 
     def _calibrations(self, scales: Sequence[Sequence[Scale]]) -> Iterator[Calibration]:
         """A calibration of each of some lists of scales."""
-        sizes = [(len(of), sum(scale.measures_novelty for scale in of)) for of in scales]
+        sizes = [(len(own), len(measuring(own))) for own in scales]
         edges = np.cumsum([(0, 0), *sizes], axis=0).tolist()
         total, measuring = edges[-1]
         lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import FEWEST, HeldOutProbabilities, fit_weights
 
 __all__ = ["Dependence", "dependence_of"]
 

@@ -15,8 +15,7 @@ from scroll_tactile.prediction.fusion import (
     moments_of,
 )
 from scroll_tactile.prediction.moments import Moment, tempered
-from scroll_tactile.readouts.calibration import FEWEST, Calibration
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import FEWEST, Calibration, HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]
 C = len(NAMES)

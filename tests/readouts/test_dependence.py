@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
+from scroll_tactile.readouts.calibration import HeldOutProbabilities
 from scroll_tactile.readouts.dependence import USUAL, Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(12)]
 

@@ -36,10 +36,10 @@ from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
 from scroll_tactile.persistence.reembed import finish_interrupted
 from scroll_tactile.persistence.replaying import load
-from scroll_tactile.prediction.answer import Touch, answer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.judging import Touch, answer
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.reembedding import reembedding
 from scroll_tactile.prediction.stored import NAME
@@ -512,7 +512,7 @@ class TactileLearner:
 
             def read(touch: Stream) -> Touch:
                 encoded = extractor.encode(touch, model.longest, lambda columns: model.scales_for(candidates, columns))
-                if reader is None or not model.is_last(encoded.columns):
+                if reader is None or not model.is_last(encoded.steps):
                     return encoded, None
                 return encoded, reader.logits_of(encoded.image, candidates)
 

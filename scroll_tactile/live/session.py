@@ -355,7 +355,7 @@ class LiveSession:
         current = encoded(stream, touch.cache)
         touch.prediction = self._memory.answer(model, candidates, [*touch.encoded, current])
         several = bool(touch.earlier)
-        touch.decided = touch.decided or touch.rule.decided(touch.prediction, current.columns, several=several)
+        touch.decided = touch.decided or touch.rule.decided(touch.prediction, current.steps, several=several)
         return touch.prediction
 
     def _end(self, end: End) -> None:

@@ -206,7 +206,7 @@ class KeptArrays:
         self.gapless = bool(parts.gapless[:count].all())
         self.quiet = parts.unchanging[:count].sum(axis=0)
 
-    def beginnings(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
+    def prefixes(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
         """The levels of some touches one below the other, (rows, C · T); T: columns, or those of the longest."""
         kept = [self._levels[row] for row in rows]
         found = np.full((len(kept), self.channels, columns or self.longest), MISSING, dtype=np.uint8)
@@ -222,7 +222,7 @@ class KeptArrays:
         for length in np.flatnonzero(np.bincount(lengths)).tolist():  # touches of one length are brought alike
             same = np.flatnonzero(lengths == length)
             places = np.arange(columns) * ((length - 1) / max(columns - 1, 1))
-            kept = self.beginnings(rows[same], length).reshape(len(same), self.channels, length)
+            kept = self.prefixes(rows[same], length).reshape(len(same), self.channels, length)
             brought[same] = at_places(kept, places, np.float32)
         return brought.reshape(len(rows), -1)
 
@@ -261,12 +261,12 @@ class KeptArrays:
         if not len(others):
             return None
         far = self.squares[others].sum(axis=1) - 2 * _product(self.blocks[others], self.blocks[row])
-        own, other = self.beginnings([row, int(others[np.argmin(far)])])
+        own, other = self.prefixes([row, int(others[np.argmin(far)])])
         return own, other
 
     def _read(self) -> npt.NDArray[np.bool_]:
         """Whether a touch has any value in a block, (touches, C · B)."""
-        values = (self.beginnings(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
+        values = (self.prefixes(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
         return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self), -1)
 
 

@@ -171,12 +171,12 @@ class Composer:
             stages = [fitter.fit(targets) for fitter in fitters]
         return cls(model, targets, stages, [fitter.space for fitter in fitters])
 
-    def scales_for(self, columns: int) -> list[Scale]:
-        """The scales whose windows the heads read of a touch of so many columns."""
-        return self.model.stages[self._stage(columns)]
+    def scales_for(self, steps: int) -> list[Scale]:
+        """The scales whose windows the heads read of a touch of so many steps."""
+        return self.model.stages[self._stage(steps)]
 
-    def _stage(self, columns: int) -> int:
-        return min(len(self.model.plan.stages(columns)), len(self.stages)) - 1
+    def _stage(self, steps: int) -> int:
+        return min(len(self.model.plan.stages(steps)), len(self.stages)) - 1
 
     def compose(
         self, wanted: Sequence[str], feels_like: Mapping[str, float], encoded: Encoded, expected: float
@@ -186,7 +186,7 @@ class Composer:
         feels_like: probability of each material observed. encoded: the touch, with the scales of `scales_for`.
         expected: the probability of a material never observed before the touch.
         """
-        stage = self._stage(encoded.columns)
+        stage = self._stage(encoded.steps)
         heads = self.stages[stage]
         z = _combined(self.model, stage, self.spaces[stage].names, encoded.means)
         new = float(heads.novel(self.model.novelty(stage, encoded.means, self.model.names)))

@@ -42,15 +42,15 @@ class Encoded:
     seconds: float
 
     @property
-    def columns(self) -> int:
-        """T, the columns of the image."""
+    def steps(self) -> int:
+        """T, the steps of the image."""
         return int(self.image.shape[1])
 
 
 class WindowCache:
     """Features of the finished windows of one touch that is still growing, so that none is embedded twice.
 
-    A row is given again where the columns that it was made of are, to the bit, those of the last image.
+    A row is given again where the steps that it was made of are, to the bit, those of the last image.
     """
 
     def __init__(self) -> None:
@@ -59,15 +59,15 @@ class WindowCache:
 
     def turn(self, image: Image) -> None:
         """Keep the rows that hold for an image (C, T)."""
-        columns, same = min(self._image.shape[1], image.shape[1]), 0
-        if columns and len(self._image) == len(image):
-            changed = (self._image[:, :columns] != image[:, :columns]).any(axis=0)
-            same = int(changed.argmax()) if changed.any() else columns
+        steps, same = min(self._image.shape[1], image.shape[1]), 0
+        if steps and len(self._image) == len(image):
+            changed = (self._image[:, :steps] != image[:, :steps]).any(axis=0)
+            same = int(changed.argmax()) if changed.any() else steps
         self._rows = {(width, start): row for (width, start), row in self._rows.items() if start + width <= same}
         self._image = image
 
     def missing(self, windows: Extent) -> Extent:
-        """Of windows, width → first columns, those without a row; no width without any."""
+        """Of windows, width → first steps, those without a row; no width without any."""
         absent = {
             width: [start for start in starts if (width, start) not in self._rows] for width, starts in windows.items()
         }
@@ -77,13 +77,13 @@ class WindowCache:
         self, windows: Extent, absent: Extent, embedded: Mapping[int, npt.NDArray[np.floating]]
     ) -> dict[int, npt.NDArray[np.floating]]:
         """Width → features (windows, d): those embedded, at the `absent`, with the rows that were kept."""
-        columns = self._image.shape[1]
+        steps = self._image.shape[1]
         fresh = {
             (width, start): row
             for width, starts in absent.items()
             for start, row in zip(starts, embedded[width], strict=True)
         }
-        self._rows |= {(width, start): row for (width, start), row in fresh.items() if start + width <= columns}
+        self._rows |= {(width, start): row for (width, start), row in fresh.items() if start + width <= steps}
         every = self._rows | fresh
         return {width: np.stack([every[width, start] for start in starts]) for width, starts in windows.items()}
 
@@ -161,7 +161,7 @@ class FeatureExtractor:
     ) -> Encoded:
         """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
 
-        longest: its columns. scales_for: the scales to be read of a touch of so many columns. cache: of the same touch
+        longest: its steps. scales_for: the scales to be read of a touch of so many steps. cache: of the same touch
         when it was shorter.
         """
         within = self._within(stream, longest)
@@ -191,7 +191,7 @@ class FeatureExtractor:
         """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales.
 
         places: of the windows of each scale, those that are embedded; all unless given. Of the many with which a touch
-        begins, half are never scored. cache: of the image when it had fewer columns.
+        begins, half are never scored. cache: of the image when it had fewer steps.
         """
         wanted = self._plan.scales if scales is None else scales
         extent = self._plan.extent(image.shape[1])
@@ -228,7 +228,7 @@ class FeatureExtractor:
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of windows, of which only those are embedded that have no row; of the columns that they need."""
+        """The features of windows, of which only those are embedded that have no row; of the steps that they need."""
         cache.turn(image)
         absent = cache.missing(windows)
         if not absent:

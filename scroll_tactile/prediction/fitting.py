@@ -1,6 +1,6 @@
 """Fitting: a model of a memory as it is, solved once, and read by touches that are held out of it.
 
-A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its beginnings, and it at other
+A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its prefixes, and it at other
 paces, are made of its kept levels. Readouts and kept touches, both without it, judge all of these, as they will judge a
 touch to come. The calibrations, and the weights of readouts and kept touches at each moment, are fitted to that, here
 and nowhere else: a prediction measures nothing, and all is a function of the set of touches.
@@ -17,10 +17,9 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.blends import at_places
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.matching.match import KeptTouch, Match
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import TouchMatcher, matcher_of
 from scroll_tactile.memory.state import Memory, give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
@@ -122,7 +121,7 @@ class Draft:
     def fit(self, extractor: FeatureExtractor | None) -> Model:
         """Solve the readouts and fit how they are read, once: the tasks are let go.
 
-        extractor: reads kept touches; without it nothing is fitted to their beginnings, nor to them at other paces.
+        extractor: reads kept touches; without it nothing is fitted to their prefixes, nor to them at other paces.
         """
         with one_thread():
             # One after the other, each task let go: of all at once the memory would be twice a model's.
@@ -145,7 +144,7 @@ class Draft:
             sample=self.sample,
             fusion=fusion,
             dependence=Dependence() if whole is None else dependence_of(whole),
-            conformal=Conformal(self.kept) if fusion is not None and fusion.matcher is not None else None,
+            conformal=Conformal.of(self.kept) if fusion is not None and fusion.matcher is not None else None,
             least=self.least,
             longest=self.longest,
             fitted_to=self.touches,
@@ -154,7 +153,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One fit: a draft, its readouts, solved, and what reads the beginnings of kept touches."""
+    """One fit: a draft, its readouts, solved, and what reads the prefixes of kept touches."""
 
     draft: Draft
     readouts: Mapping[Scale, Readout]
@@ -199,8 +198,8 @@ class _Fit:
         matcher = matcher_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
         complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], held_out, {})
-        columns = moments_of(milestones, least, matched=matcher is not None)
-        moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
+        steps = moments_of(milestones, least, matched=matcher is not None)
+        moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in steps]
         chosen, counts = chosen_of(complete.held_out, matcher)
         weight = PRIOR_WEIGHT[draft.kind]
         if matcher is None:
@@ -213,10 +212,10 @@ class _Fit:
         if not chosen or self.extractor is None:
             alone = self.judged((least, last), last, draft.views, held_out, {})
             return complete.held_out, fuse(
-                matcher, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
+                matcher, [*kept.prefixes(moments), complete], [alone], chosen, counts, weight
             )
         paced = [kept.paced(pace, chosen, last) for pace in PACES]
-        return complete.held_out, fuse(matcher, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
+        return complete.held_out, fuse(matcher, [*kept.prefixes(moments), complete], paced, chosen, counts, weight)
 
 
 @dataclass(frozen=True)
@@ -245,31 +244,31 @@ class _KeptTouches:
         matches = {key: matcher.match(levels[key], held_out=row) for key, row in rows.items()}
         return cls(fit, matcher, chosen, rows, levels, places, matches)
 
-    def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
-        """What is said of their beginnings at each moment, given as its columns and stage."""
+    def prefixes(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
+        """What is said of their prefixes at each moment, given as its steps and stage."""
         held_out, judged = self._read(moments), []
-        for number, (columns, stage) in enumerate(moments):
+        for number, (steps, stage) in enumerate(moments):
             matches = {}
             for key in self.chosen:
-                if (levels := self.levels[key]).shape[1] >= columns:
+                if (levels := self.levels[key]).shape[1] >= steps:
                     # The noise is estimated once, on the whole touch: that is most of the cost of a match.
                     noise = self.matches[key].noise
-                    matches[key] = self.matcher.match(levels[:, :columns], held_out=self.rows[key], noise=noise)
+                    matches[key] = self.matcher.match(levels[:, :steps], held_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]
-            judged.append(self.fit.judged((columns, stage), number, scales, held_out, matches))
+            judged.append(self.fit.judged((steps, stage), number, scales, held_out, matches))
         return judged
 
     def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, HeldOutScores]:
-        """What each scale of windows says of their beginnings, by the moment's number."""
+        """What each scale of windows says of their prefixes, by the moment's number."""
         fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
         queries: Queries = {scale: {} for scale in fit.readouts if scale not in draft.views}
         for key in self.chosen if moments else ():
             assert extractor is not None
             touch, cache = stream_of(self.levels[key], extractor.sensor), WindowCache()
-            for number, (columns, stage) in enumerate(moments):
-                if columns > len(touch):
+            for number, (steps, stage) in enumerate(moments):
+                if steps > len(touch):
                     break
-                image = extractor.image(touch.first(columns / touch.sensor.rate))
+                image = extractor.image(touch.first(steps / touch.sensor.rate))
                 for scale, mean in extractor.means(image, draft.stages[stage], cache=cache).items():
                     queries[scale].setdefault(self.places[key], {})[number] = mean
         return {scale: fit.held_out_scores(scale, queries) for scale in queries}
@@ -287,12 +286,12 @@ class _KeptTouches:
             for scale, mean in extractor.means(image, views).items():
                 queries[scale][self.places[key]] = {0: mean}
         lengths = [self.levels[key].shape[1] / pace for key in keys]
-        columns = max(1, round(float(np.median(lengths)))) if lengths else 1
+        steps = max(1, round(float(np.median(lengths)))) if lengths else 1
         held_out = {scale: fit.held_out_scores(scale, queries) for scale in views}
-        return fit.judged((columns, last), 0, views, held_out, matches)
+        return fit.judged((steps, last), 0, views, held_out, matches)
 
 
 def at_pace(levels: LevelArray, pace: float) -> LevelArray:
     """A touch as if it had been made so many times as fast: (C, T) to (C, T / pace)."""
-    columns = max(2, round(levels.shape[1] / pace))
-    return at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))
+    steps = max(2, round(levels.shape[1] / pace))
+    return at_places(levels, np.linspace(0, levels.shape[1] - 1, steps))

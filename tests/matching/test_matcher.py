@@ -6,11 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
 from scroll_tactile.matching.match import KeptTouch
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import TouchMatcher, matcher_of
 from scroll_tactile.sensors import Sensor
 
 CHANNELS, READINGS, MATERIALS = 8, 120, 5

@@ -166,7 +166,7 @@ def _scores(graph: Graph, model: Model, features: dict[Scale, str], columns: int
         scores = graph.add("Add", graph.add("MatMul", about, graph.constant(weights)), graph.constant(offsets))
         weighed = graph.add("Mul", scores, graph.constant(np.float64(weight)))
         logits = graph.add("Add", logits, weighed) if logits else weighed
-    odd = model.moment("complete" if columns >= model.least else "beginning", columns).model_outlier_rate
+    odd = model.moment("complete" if columns >= model.least else "prefix", columns).model_outlier_rate
     familiar = graph.add("Mul", graph.add("Softmax", logits, axis=1), graph.constant(np.float64(1 - odd)))
     chances = graph.add("Add", familiar, graph.constant(np.float64(odd / len(model.names))))
     return graph.add("Squeeze", graph.add("Log", chances), graph.constant(np.array([0])))

@@ -89,7 +89,8 @@ class StageScores:
     def distances(self) -> FloatArray:
         """The relative Mahalanobis distance if that material is the nearest, at the scales that measure novelty."""
         picked = self._picked([one.distances for one in self._held_out])
-        return picked[:, measuring([one.scale for one in self._held_out])]
+        # In one order in memory: the bits of a mean over touches depend on it.
+        return np.ascontiguousarray(picked[:, measuring([one.scale for one in self._held_out])])
 
     def diagonal_distances(self) -> FloatArray:
         """Diagonal distances from the material of the highest score, (N, S)."""

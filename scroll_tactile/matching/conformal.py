@@ -267,5 +267,5 @@ def _least_of_others(nearest: FloatArray) -> FloatArray:
 
 def _nonconformity(own: FloatArray, other: FloatArray) -> FloatArray:
     """α of distances from a material and from all others."""
-    apart = np.where(np.isfinite(other), other, 0.0)
-    return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(apart))
+    others = np.where(np.isfinite(other), other, 0.0)
+    return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(others))

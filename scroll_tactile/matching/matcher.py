@@ -126,7 +126,7 @@ class _Others:
 class TouchMatcher:
     """Compares a touch with kept touches. deviation: of these kept touches from each other, or of most of them.
 
-    Any number of threads may ask at once. The kept touches follow where nobody asks: otherwise those of a copy do.
+    Any number of threads may use it at once. The kept touches follow where nobody uses it: otherwise those of a copy.
     """
 
     def __init__(self, kept: KeptArrays, deviation: NaturalDeviation) -> None:

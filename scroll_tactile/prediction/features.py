@@ -1,4 +1,4 @@
-"""From a touch to its features: codes for what is observed, mean features for what is evaluated."""
+"""From a touch to its features: quantised for what is observed, their means for what is evaluated."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Encoded:
 
     @property
     def steps(self) -> int:
-        """T, the steps of the image."""
+        """T, the steps of time in the image."""
         return int(self.image.shape[1])
 
 
@@ -89,7 +89,7 @@ class WindowCache:
 
 
 class FeatureExtractor:
-    """What a sensor, an embedding, a plan of windows and an augmentation make of touches; it learns nothing.
+    """Makes features of touches, by a sensor, an embedding, a plan of windows and an augmentation; it learns nothing.
 
     Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image that is not its.
     """
@@ -129,7 +129,7 @@ class FeatureExtractor:
         return image_of(stream, self._rest) if self._sensor.camera else tactile_image(stream)
 
     def codes(self, image: Image, key: bytes) -> Codes:
-        """The rows of codes that a touch adds to the statistics, by scale: its own, behind them those of its copies.
+        """The quantised features that a touch adds to the statistics, rows by scale: its own, then those of its copies.
 
         Its own come first: the sample finds them by their place. Copies are no longer than the touch, so they have no
         other scales.
@@ -201,7 +201,7 @@ class FeatureExtractor:
         views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
         by_width = {int(scale): starts for scale, starts in windows.items()}
         if views and views[WHOLE] is image and cache is None and self._plan.whole not in by_width:
-            # A touch of the usual length is convolved once for its windows and for itself.
+            # A touch of the default length is convolved once for its windows and for itself.
             embedded, found = self._whole(image, by_width)
         else:
             embedded = self._embedded(image, by_width) if cache is None else self._completed(image, by_width, cache)
@@ -239,9 +239,9 @@ class FeatureExtractor:
         return cache.joined(windows, absent, self._embedded(part, shifted))
 
     def _views(self, image: Image) -> dict[Scale, Image]:
-        """The pictures of a whole touch by view; of a touch of the usual length the first is the image itself."""
-        usual = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
-        return {WHOLE: usual, SHAPE: shape_image(usual)}
+        """The pictures of a whole touch by view; of a touch of the default length the first is the image itself."""
+        whole = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
+        return {WHOLE: whole, SHAPE: shape_image(whole)}
 
     def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
         return self._sound(embed_windows(self._embedding, image, windows), windows)

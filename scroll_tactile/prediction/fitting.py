@@ -46,7 +46,7 @@ FloatArray = npt.NDArray[np.float64]
 Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
 """Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `held_out_scores`."""
 
-PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
+PACES = (2.0, 1.41, 0.71, 0.5)  # times their own, at which touches are resampled: twice to half
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class _Fit:
     def calibrated(
         self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]
     ) -> tuple[Calibration, HeldOutProbabilities]:
-        """The calibration of some scales, and what they say so of the touches held out.
+        """The calibration of some scales, and their probabilities of the held-out touches by it.
 
         number: the stage, or that of the query under which `held_out` has the scores.
         """
@@ -186,13 +186,13 @@ class _Fit:
         held_out: Mapping[Scale, HeldOutScores],
         matches: Mapping[bytes, Match],
     ) -> HeldOutMoment:
-        """What some scales and the kept touches say at a moment, given as its steps and stage."""
+        """Some scales and the kept touches at a moment, given as its steps and stage."""
         return HeldOutMoment(*moment, *self.calibrated(number, scales, held_out), matches)
 
     def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
-        """What readouts say of complete touches held out, and the table of weights of readouts and kept touches.
+        """The readouts' probabilities of complete held-out touches, and the table of all weights.
 
-        last: the last stage that any touch reached. held_out: what each scale says of the sampled touches.
+        last: the last stage that any touch reached. held_out: each scale's scores of the sampled touches.
         """
         draft, milestones = self.draft, self.draft.memory.plan.milestones()[: last + 1]
         matcher = matcher_of(draft.kept) if draft.kept else None
@@ -236,7 +236,7 @@ class _KeptTouches:
 
     @classmethod
     def held_out(cls, fit: _Fit, matcher: TouchMatcher, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
-        """Those with some keys."""
+        """The kept touches with some keys."""
         kept = matcher.kept.rows()
         rows = {key: kept[key] for key in sorted(keys)}
         levels = {key: matcher.kept.levels(row) for key, row in rows.items()}
@@ -245,7 +245,7 @@ class _KeptTouches:
         return cls(fit, matcher, chosen, rows, levels, places, matches)
 
     def prefixes(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
-        """What is said of their prefixes at each moment, given as its steps and stage."""
+        """Readouts and kept touches on their prefixes at each moment, given as its steps and stage."""
         held_out, judged = self._read(moments), []
         for number, (steps, stage) in enumerate(moments):
             matches = {}
@@ -259,7 +259,7 @@ class _KeptTouches:
         return judged
 
     def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, HeldOutScores]:
-        """What each scale of windows says of their prefixes, by the moment's number."""
+        """The scores of their prefixes by each scale of windows, by the moment's number."""
         fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
         queries: Queries = {scale: {} for scale in fit.readouts if scale not in draft.views}
         for key in self.chosen if moments else ():
@@ -274,7 +274,7 @@ class _KeptTouches:
         return {scale: fit.held_out_scores(scale, queries) for scale in queries}
 
     def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
-        """What the views and the kept touches say of some of them, had they been made so many times as fast."""
+        """The views and the kept touches on some of them, had they been made so many times as fast."""
         fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
         assert extractor is not None
         queries: Queries = {scale: {} for scale in views}

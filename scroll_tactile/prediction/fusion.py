@@ -79,7 +79,7 @@ def moments_of(milestones: Sequence[int], least: int, *, matched: bool) -> tuple
 class HeldOutMoment:
     """What readouts and kept touches give at one moment, from `steps` on, of held-out touches.
 
-    stage, calibration: of the readouts. held_out: what they say. matches: what the kept touches say, by key.
+    stage, calibration: of the readouts. held_out: their probabilities. matches: of the kept touches, by key.
     """
 
     steps: int

@@ -108,8 +108,8 @@ def judged(
     own: Hypothesis = "complete" if steps >= model.least else "prefix"
     alone = model.judge(candidates, encoded.means, steps, own)
     matcher = fusion.matcher
-    usual_length = model.least <= len(encoded.stream) <= model.longest
-    if matcher is None or (usual_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
+    learned_length = model.least <= len(encoded.stream) <= model.longest
+    if matcher is None or (learned_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
         return _by_readouts(model, encoded, alone, own)
     levels = _levels_of(encoded.stream)
     matches: list[tuple[Match, Hypothesis]] = [(matcher.match(levels), own)]

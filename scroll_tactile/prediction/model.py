@@ -32,7 +32,7 @@ __all__ = ["Hypothesis", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["prefix", "complete", "paced"]
-"""What a touch may be: the prefix of a usual one, a complete one, or a complete one at another pace."""
+"""What a touch may be: the prefix of a complete one, a complete one, or a complete one at another pace."""
 
 # Logits, to which the logarithm of the number of materials is added: materials further behind have less than 2e-8 of
 # the probability together, and are not read from the memory.
@@ -61,7 +61,7 @@ def enough_memory() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is said of a touch by the readouts alone, or with the kept touches.
+    """The judgement of a touch by the readouts alone, or with the kept touches.
 
     probability: of each candidate, shape (C,). novelty: see Prediction. moment: whose threshold the novelty has.
     distance: the smallest ratio, over the scales that measure novelty, of the diagonal distance to the best-scoring
@@ -83,7 +83,7 @@ class Model:
     views: the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are
     read, as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing
     was learned. conformal: how typical others are of the kept touches. held_out: scale → the sampled touches held out;
-    sample: these. dependence: how far touches of one thing say the same. least: the steps of all but the shortest
+    sample: these. dependence: how far touches of one thing are correlated. least: the steps of all but the shortest
     touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
 
     Any number of threads may use it at once; if it `reads_memory`, only the one that holds the memory's lock. `follow`
@@ -117,7 +117,7 @@ class Model:
 
     @property
     def reads_memory(self) -> bool:
-        """Whether it has so many materials that it reads those that are asked for from the memory."""
+        """Whether it has so many materials that it reads the requested ones from the memory."""
         return len(self.names) > EAGER
 
     def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:

@@ -83,7 +83,7 @@ class Moment:
         return float(np.clip(1.0 / max(distance, LEAST_SPREAD), least, 1.0))
 
     def suffices(self, probability: float, distance: float) -> bool:
-        """Whether the readouts' word is enough: their highest probability, and how far off the touch is.
+        """Whether the readouts are enough, by their highest probability and by how far off the touch is.
 
         Where no touch could be held out any probability suffices: a new touch then always looks noisy.
         """
@@ -150,10 +150,10 @@ class Fusion:
         return self.moments[max(0, bisect_right([moment.steps for moment in self.moments], steps) - 1)]
 
 
-def match_scores(matcher: TouchMatcher, names: Sequence[str], way: Match) -> FloatArray:
-    """What the kept touches say of some materials, (C,); the least of those of which none is kept."""
-    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(way.scores.min())
-    return np.array([way.scores[places[name]] if name in places else least for name in names])
+def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:
+    """The kept touches' scores of some materials, (C,); the least of all for materials of which none is kept."""
+    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(match.scores.min())
+    return np.array([match.scores[places[name]] if name in places else least for name in names])
 
 
 def tempered(chances: FloatArray, outlier_rate: float) -> FloatArray:

@@ -116,7 +116,7 @@ def calibrate_stage(
 ) -> Calibration:
     """Calibrate one stage.
 
-    found: what each scale that judges says of the touches held out of it. readouts: of these scales, in their order.
+    found: the scores of held-out touches by each scale that judges. readouts: of these scales, in their order.
     viewed: whether a scale's weight falls with a touch's diagonal distance.
     """
     scales = len(readouts)
@@ -144,7 +144,7 @@ def calibrate_stage(
 
 @dataclass(frozen=True)
 class HeldOutProbabilities:
-    """What is said of N sampled touches, each held out, of the C materials that all scales know.
+    """Probabilities of the C materials that all scales know, for N sampled touches, each held out.
 
     names, places, keys, targets: see `StageScores`. logs: log-probability of the materials, (N, C). distance: the least
     diagonal distance at any scale that measures novelty, in units of the median, (N,). novelty: see `Prediction`, (N,).
@@ -170,7 +170,7 @@ class HeldOutProbabilities:
 def held_out_probabilities(
     found: StageScores, scales: Sequence[Scale], calibration: Calibration
 ) -> HeldOutProbabilities:
-    """What some scales say of the touches held out of them, as they are calibrated."""
+    """The probabilities by some scales of the touches held out of them, as they are calibrated."""
     diagonal, scores = found.diagonal_distances(), found.scores()
     weights = calibration.weights_at(diagonal)
     logits, distance, novelty = np.zeros((len(found.places), len(found.names))), np.zeros(0), np.zeros(0)

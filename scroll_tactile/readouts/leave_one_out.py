@@ -10,7 +10,7 @@ so that all of its scores follow from products with K⁻¹ of its rows and of th
 covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses it alike, and the paper's ridge by its leverage
 matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
 
-From its own material a touch left out is further away than one to come will be: of n touches' mean, where one is new,
+A held-out touch is further away from its own material than one to come will be: of n touches' mean, where one is new,
 the squared distance is expected to be 1 + 1/n of the scatter's, where one of the n is left out 1 + 1/(n − 1). So it is
 brought to 1 − 1/n² of what it is, n the touches of the material, where calibration would otherwise rest on touches that
 look less like their own than new ones will.
@@ -44,7 +44,7 @@ TOGETHER = 32  # touches: each step of all at once takes 8 MB
 
 @dataclass(frozen=True)
 class HeldOutScores:
-    """What a scale says of the sampled touches, each held out, of N rows and the R reference materials.
+    """Scores by one scale of the sampled touches, each held out: N rows, R reference materials.
 
     rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
     about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
@@ -61,7 +61,7 @@ class HeldOutScores:
 
 
 class StageScores:
-    """What S scales say at one stage of the N sampled touches that all of them held out.
+    """Scores by S scales at one stage of the N sampled touches that all of them held out.
 
     names: the C materials that are references of all scales, in alphabetical order. places: of the touches in the
     sample, ascending; none where there are fewer than two materials. keys: their content hashes. targets: the place of

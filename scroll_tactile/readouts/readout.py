@@ -1,6 +1,6 @@
 """Readouts: discriminants of one scale, solved once from the exact statistics and followed from touch to touch.
 
-With class means m_y, the scatter within classes S_w of N rows and its shrinkage ρ (see `shrinkage`), Σ⁻¹ = γ K⁻¹ with
+With class means m_y, the scatter within classes S_w of N rows and its shrinkage ρ (see `task`), Σ⁻¹ = γ K⁻¹ with
 K = S_w + P I, P = ρ / (1 − ρ) tr S_w / d and γ = N / (1 − ρ). All that answers need of a row x are
 
     z_y = γ m_yᵀ K⁻¹ x,    g_y = γ m_yᵀ K⁻¹ m_y,    G = γ M K⁻¹ Mᵀ of some reference materials,
@@ -44,8 +44,8 @@ ReadoutName = Literal["lda", "ridge"]
 Change = tuple[str, npt.NDArray[np.int32], int]
 """A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
-EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
-MOST_HELD = 2 * EAGER  # then those that were asked for are let go
+EAGER = 1024  # materials: of no more than these all are solved for at once, of others the requested ones
+MOST_HELD = 2 * EAGER  # then the requested ones are let go
 
 
 def held_at_first(reference: Places, count: int) -> Places:
@@ -87,8 +87,8 @@ class Readout:
 
     names: the materials; one is known by its place among them. The numbers are those of `Numbers`.
 
-    Any number of threads may ask one of at most EAGER materials at once, and one thread one of more. It follows where
-    nobody asks: otherwise a copy does.
+    Any number of threads may read one of at most EAGER materials at once, and one thread one of more. It follows
+    where nobody reads it: otherwise a copy does.
 
     Some materials are held, with all that scores need: the reference first. The others are read from `statistics`.
     """

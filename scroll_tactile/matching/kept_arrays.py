@@ -141,10 +141,6 @@ class KeptArrays:
         """What is kept, by material and key."""
         return set(self.touches)
 
-    def material(self, row: int) -> str:
-        """The material of a kept touch."""
-        return self.touches[row][0]
-
     def levels(self, row: int) -> LevelArray:
         """The levels of a kept touch, (C, T), as many columns as were kept."""
         return self._levels[row]

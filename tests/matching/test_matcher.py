@@ -169,10 +169,8 @@ def test_whatever_comes_and_goes_it_holds_what_a_set_would(toggled, rng):
     assert near(matcher.match(asked), anew.match(asked))
     for row in range(len(matcher.kept)):
         mine = next(stay for stay in stays if matcher.kept.rows()[stay.key] == row)
-        assert (matcher.kept.material(row), matcher.kept.levels(row).tobytes()) == (
-            mine.material,
-            mine.levels.tobytes(),
-        )
+        assert matcher.kept.touches[row] == (mine.material, mine.key)
+        assert matcher.kept.levels(row).tobytes() == mine.levels.tobytes()
 
 
 def test_what_cannot_be_followed_says_so():

@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.blends import blends, block_means, unchanging, weighted_means
-from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.kept_arrays import KeptArrays, blends, block_means, unchanging, weighted_means
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Likelihood, Noise, Table
 from scroll_tactile.matching.match import (
     KeptTouch,

@@ -15,9 +15,8 @@ from scroll_tactile.memory.rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
-from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.image import shape_image, stretched, tactile_image
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.signals.views import shape_image, stretched
 from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows

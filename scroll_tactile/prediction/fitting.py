@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.blends import at_places
 from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.kept_arrays import at_places
 from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher, matcher_of

@@ -3,7 +3,7 @@
 An embedding of a whole stream is lost when a touch is shorter or longer than those learned from. So a stream is read in
 windows of 0.3 s and of three quarters of the usual duration, and each of these scales has statistics of its own. A
 stream is known from its first 0.3 s on, and better with every reading. Windows in seconds are lost when a touch is made
-faster or slower: beside them the whole of it is read in its own time (see `views`).
+faster or slower: beside them the whole of it is read in its own time (see `image`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Scale:
     """A kind of features that has statistics of its own.
 
     kind: "window" for windows of `width` columns; without a width the views of a whole touch: "whole" for it as it is,
-    "competing" for it read by competing kernels, "shape" for what `signals.views` makes of it.
+    "competing" for it read by competing kernels, "shape" for what `signals.image` makes of it.
 
     Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it. A window's
     is its width.

@@ -17,9 +17,9 @@ from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.persistence.keeper import MemoryKeeper
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
-from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import Readings
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.prediction.reembedding import embed_again
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.results import Composition, Merged, Prediction, Receipt

@@ -23,8 +23,8 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import decision_rule
 from scroll_tactile.pipelines.metrics import calibration_error
-from scroll_tactile.prediction.answer import answer
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.judging import answer
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 

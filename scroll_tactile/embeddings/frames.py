@@ -9,8 +9,10 @@ bent so much, up or down. All of it is counts and sums of integers: the same bit
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import os
+import zlib
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,7 +23,6 @@ import numpy.typing as npt
 from scroll_tactile.embeddings.banks import LEVELS, to_levels
 from scroll_tactile.embeddings.kernels import angles
 from scroll_tactile.embeddings.protocol import Capabilities, canary
-from scroll_tactile.embeddings.registry import picture_to_json
 from scroll_tactile.embeddings.runtimes import RuntimeName, make_runtime, steady, version_of
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import require
@@ -130,7 +131,7 @@ class Frames:
             from scroll_tactile.embeddings.weights import digest_of
 
             weights = {"name": self._source, "sha256": digest_of(self._net)}
-        rest = picture_to_json(self.rest) if isinstance(self.rest, np.ndarray) else self.rest
+        rest = _picture_to_json(self.rest) if isinstance(self.rest, np.ndarray) else self.rest
         settings = {"cosines": self.cosines, "seed": self.seed, "runtime": self.runtime}
         return {"kind": "frames", "weights": weights, "rest": rest, **settings}
 
@@ -233,6 +234,12 @@ def _checked(rest: Rest | npt.ArrayLike) -> Rest:
         )
     picture.setflags(write=False)
     return picture
+
+
+def _picture_to_json(picture: FloatArray) -> dict[str, Any]:
+    """A resting picture (height, width, 3) in JSON's types, to the bit."""
+    deflated = zlib.compress(np.ascontiguousarray(picture, "<f4").tobytes(), 9)
+    return {"shape": list(picture.shape), "float32": base64.b64encode(deflated).decode("ascii")}
 
 
 def light(frame: IntArray) -> FloatArray:

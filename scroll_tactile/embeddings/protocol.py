@@ -43,9 +43,9 @@ class Capabilities:
 
     partial_windows: a touch of 0.65 of a wide window or more is read at that scale, as far as it goes.
     judged_scales: "all" scales that fit a touch judge it, or the "widest" of them alone: one pass for a touch.
-    reads_whole_touches: beside windows it embeds two views of each whole touch, see `signals.views`.
+    reads_whole_touches: beside windows it embeds two views of each whole touch, see `signals.image`.
     shrinkage: how many times as far as its formula says the scatter of its features is shrunk; see
-        `readouts.shrinkage`. More than once for features that are far from normally distributed.
+        `readouts.task`. More than once for features that are far from normally distributed.
     reads_frames: it reads a camera's frames, and no other sensor. rest: its resting image of them.
     embeds_windows: it has `embed_windows(image, windows)`, see `WindowEmbedding`.
     competes: it reads whole touches by competing kernels, too, a third view of them: it has `embed_competing(image,

@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias, cast
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -24,16 +24,11 @@ from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import EmbeddingError
 
-if TYPE_CHECKING:
-    from scroll_tactile.embeddings.frames import Frames
-    from scroll_tactile.embeddings.vision import Vision
-
 __all__ = [
     "MOST_DEPTH",
     "MOST_PARTS",
     "configuration_of",
     "from_configuration",
-    "picture_to_json",
     "require_configuration",
 ]
 
@@ -156,12 +151,6 @@ def require_configuration(configuration: Mapping[str, Any]) -> None:
     _validated(configuration)
 
 
-def picture_to_json(picture: npt.NDArray[np.float32]) -> dict[str, Any]:
-    """A resting picture (height, width, 3) in JSON's types, to the bit."""
-    deflated = zlib.compress(np.ascontiguousarray(picture, "<f4").tobytes(), 9)
-    return {"shape": list(picture.shape), "float32": base64.b64encode(deflated).decode("ascii")}
-
-
 def _picture(held: PictureConfiguration) -> npt.NDArray[np.float32]:
     size = 4 * math.prod(held.shape)
     try:
@@ -221,9 +210,9 @@ def _made(held: AnyConfiguration) -> Embedding:
     return cast(Embedding, make(**settings))
 
 
-def _weighted(make: Callable[..., Frames | Vision], held: WeightsConfiguration | None, **settings: Any) -> Embedding:
+def _weighted(make: Callable[..., Any], held: WeightsConfiguration | None, **settings: Any) -> Embedding:
     if held is None:
-        return make(**settings | {"weights": None})
+        return cast(Embedding, make(**settings | {"weights": None}))
     source = _source(held, make.__name__)
     embedding = make(**settings | {"weights": source})
     found = embedding.configuration()["weights"]["sha256"]
@@ -232,7 +221,7 @@ def _weighted(make: Callable[..., Frames | Vision], held: WeightsConfiguration |
             f"expected weights whose tensors have the SHA-256 {held.sha256[:12]}…; those of {source} have "
             f"{found[:12]}…. Pass embedding={make.__name__}(weights=…) with the weights that the memory was made with"
         )
-    return embedding
+    return cast(Embedding, embedding)
 
 
 def _source(held: WeightsConfiguration, kind: str) -> str | Path:

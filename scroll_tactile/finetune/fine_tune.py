@@ -37,9 +37,9 @@ from scroll_tactile.libraries import optional
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
 from scroll_tactile.persistence.buffer import ranked_exemplars
-from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.statistics.statistics import Statistics
 
 with optional("torch", "torch", "a fine-tune"):

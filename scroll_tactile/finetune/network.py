@@ -18,7 +18,7 @@ from scroll_tactile.errors import MismatchError
 from scroll_tactile.libraries import optional
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.prediction.answer import LogitsReader, Predictor
+from scroll_tactile.prediction.predictor import LogitsReader, Predictor
 from scroll_tactile.signals.windows import WindowPlan
 
 with optional("torch", "torch", "a fine-tune"):

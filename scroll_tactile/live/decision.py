@@ -87,7 +87,7 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     pairs, known = in_pairs(said, usual, model.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
     strange = max(BEYOND * float(np.nanmax(said.novelty)), UNMEASURED)
-    return DecisionRule((*(moment.columns for moment in moments), least), risk, sure, max(sure, together), strange)
+    return DecisionRule((*(moment.steps for moment in moments), least), risk, sure, max(sure, together), strange)
 
 
 def _least_sure_of(said: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:

@@ -13,9 +13,9 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import StreamError
 from scroll_tactile.live.decision import DecisionRule
-from scroll_tactile.prediction.answer import Predictor, nothing_known
 from scroll_tactile.prediction.current import FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
+from scroll_tactile.prediction.predictor import Predictor, nothing_known
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
@@ -142,5 +142,5 @@ class GrowingTouch:
         current = encoded(stream, self.cache)
         self.prediction = self.predictor.answer_of(model, self.extractor, candidates, [*self.encoded, current])
         several = bool(self.earlier)
-        self.decided = self.decided or self.rule.decided(self.prediction, current.columns, several=several)
+        self.decided = self.decided or self.rule.decided(self.prediction, current.steps, several=several)
         return self.prediction

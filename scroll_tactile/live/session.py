@@ -20,9 +20,9 @@ from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event
 from scroll_tactile.live.pressing import PressDetector
 from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows
-from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.results import Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.contact import MOST_FRAMES, Rest

@@ -5,7 +5,7 @@ another material (nearest-neighbour nonconformity; Vovk, Gammerman and Shafer 20
 
     α(x, y) = log(d_y(x) + 1) + 2 (log(d_y(x) + 1) − log(d_other(x) + 1)),
 
-d squared distances of the beginnings that both have. If x is of y, then x and the n touches kept of y could have come
+d squared distances of the prefixes that both have. If x is of y, then x and the n touches kept of y could have come
 in any order, so the share of these n + 1 that conform no better than x,
 
     p_y = (#{i kept of y : α(i, y) ≥ α(x, y)} + 1) / (n + 1),    each i compared with all others and with x,
@@ -56,23 +56,33 @@ class Typicality(NamedTuple):
 class Conformal:
     """Kept touches, and how typical another is of each of their materials.
 
-    touches: of one number of channels; lengths may differ. Any number of threads may ask at once. It follows where
-    nobody asks: otherwise a copy does.
+    The touches have one number of channels; lengths may differ. Any number of threads may read it at once. It follows
+    where nobody reads it: otherwise a copy does.
     """
 
-    def __init__(self, touches: Sequence[KeptTouch]) -> None:
-        longest = max(touch.levels.shape[1] for touch in touches)
-        self._set_up(len(touches[0].levels), longest, [], np.empty(0, np.intp))
-        self.follow(touches, set())
-
-    def _set_up(
-        self, channels: int, longest: int, touches: list[tuple[str, bytes]], lengths: npt.NDArray[np.intp]
+    def __init__(
+        self,
+        channels: int,
+        longest: int,
+        touches: Sequence[KeptTouch] = (),
+        steps: npt.NDArray[np.float32] | None = None,
     ) -> None:
-        self._channels, self._longest, self._touches, self._lengths = channels, longest, touches, lengths
+        """longest: columns of the longest touch that there may be. steps: the blocks of the touches, taken over."""
+        self._channels, self._longest = channels, longest
         self._edges = _edges(longest, channels)
-        self._steps = np.empty((0, channels * (len(self._edges) - 1)), np.float32)
+        self._touches = [(touch.material, touch.key) for touch in touches]
+        self._lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
+        self._steps = np.empty((0, channels * (len(self._edges) - 1)), np.float32) if steps is None else steps
         self._near: dict[int, tuple[FloatArray, FloatArray]] = {}  # blocks → d_own and d_other of what is kept
         self._squares: dict[int, npt.NDArray[np.float32] | None] = {}  # blocks → lengths, squared; None where some lack
+        self._index()
+
+    @classmethod
+    def of(cls, touches: Sequence[KeptTouch]) -> Conformal:
+        """Those of some kept touches, one or more."""
+        conformal = cls(len(touches[0].levels), max(touch.levels.shape[1] for touch in touches))
+        conformal.follow(touches, set())
+        return conformal
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
         """What is made of the kept touches in the order of `touches`, and of complete ones of them.
@@ -87,13 +97,8 @@ class Conformal:
         cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
     ) -> Conformal:
         """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
-        conformal = cls.__new__(cls)
-        lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
-        own = [(touch.material, touch.key) for touch in touches]
-        conformal._set_up(len(touches[0].levels), longest, own, lengths)
-        conformal._steps = arrays["steps"].astype(np.float32)
-        conformal._near = {len(conformal._edges) - 1: (arrays["own"], arrays["other"])}
-        conformal._named()
+        conformal = cls(len(touches[0].levels), longest, touches, arrays["steps"].astype(np.float32))
+        conformal._near[len(conformal._edges) - 1] = arrays["own"], arrays["other"]
         return conformal
 
     @staticmethod
@@ -121,11 +126,11 @@ class Conformal:
         ]
         self._steps, self._squares = np.concatenate([self._steps, *steps], dtype=np.float32), {}
         self._lengths = np.append(self._lengths, [touch.levels.shape[1] for touch in added]).astype(np.intp)
-        self._named()
+        self._index()
         for reach in list(self._near):
             self._near[reach] = self._nearer(reach, *self._near[reach], first)
 
-    def _named(self) -> None:
+    def _index(self) -> None:
         self._materials = sorted({material for material, _ in self._touches})
         place = {material: i for i, material in enumerate(self._materials)}
         self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
@@ -262,5 +267,5 @@ def _least_of_others(nearest: FloatArray) -> FloatArray:
 
 def _nonconformity(own: FloatArray, other: FloatArray) -> FloatArray:
     """α of distances from a material and from all others."""
-    apart = np.where(np.isfinite(other), other, 0.0)
-    return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(apart))
+    others = np.where(np.isfinite(other), other, 0.0)
+    return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(others))

@@ -1,4 +1,7 @@
-"""Kept touches in rows, with the arrays that a matcher compares a touch with: made, written, read and followed."""
+"""Kept touches in rows, with the arrays that a matcher compares a touch with: made, written, read and followed.
+
+And levels between those that were read: between the steps of a touch, over blocks of it, and among several touches.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.blends import at_places, block_means, unchanging
-from scroll_tactile.matching.likelihood import MISSING, LevelArray
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 
-__all__ = ["KeptArrays"]
+__all__ = ["KeptArrays", "at_places", "blends", "block_means", "unchanging", "weighted_means"]
 
+FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
@@ -141,10 +144,6 @@ class KeptArrays:
         """What is kept, by material and key."""
         return set(self.touches)
 
-    def material(self, row: int) -> str:
-        """The material of a kept touch."""
-        return self.touches[row][0]
-
     def levels(self, row: int) -> LevelArray:
         """The levels of a kept touch, (C, T), as many columns as were kept."""
         return self._levels[row]
@@ -206,7 +205,7 @@ class KeptArrays:
         self.gapless = bool(parts.gapless[:count].all())
         self.quiet = parts.unchanging[:count].sum(axis=0)
 
-    def beginnings(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
+    def prefixes(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
         """The levels of some touches one below the other, (rows, C · T); T: columns, or those of the longest."""
         kept = [self._levels[row] for row in rows]
         found = np.full((len(kept), self.channels, columns or self.longest), MISSING, dtype=np.uint8)
@@ -222,7 +221,7 @@ class KeptArrays:
         for length in np.flatnonzero(np.bincount(lengths)).tolist():  # touches of one length are brought alike
             same = np.flatnonzero(lengths == length)
             places = np.arange(columns) * ((length - 1) / max(columns - 1, 1))
-            kept = self.beginnings(rows[same], length).reshape(len(same), self.channels, length)
+            kept = self.prefixes(rows[same], length).reshape(len(same), self.channels, length)
             brought[same] = at_places(kept, places, np.float32)
         return brought.reshape(len(rows), -1)
 
@@ -261,12 +260,12 @@ class KeptArrays:
         if not len(others):
             return None
         far = self.squares[others].sum(axis=1) - 2 * _product(self.blocks[others], self.blocks[row])
-        own, other = self.beginnings([row, int(others[np.argmin(far)])])
+        own, other = self.prefixes([row, int(others[np.argmin(far)])])
         return own, other
 
     def _read(self) -> npt.NDArray[np.bool_]:
         """Whether a touch has any value in a block, (touches, C · B)."""
-        values = (self.beginnings(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
+        values = (self.prefixes(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
         return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self), -1)
 
 
@@ -280,3 +279,56 @@ def _product(blocks: npt.NDArray[np.float32], guess: npt.NDArray[np.float32]) ->
     """blocks @ guess."""
     parts = [blocks[row : row + AT_ONCE] @ guess for row in range(0, len(blocks), AT_ONCE)]
     return np.concatenate(parts)
+
+
+def at_places(
+    levels: LevelArray, places: npt.NDArray[np.floating], precision: npt.DTypeLike = np.float64
+) -> LevelArray:
+    """Levels (…, T) at places between 0 and T − 1, by linear interpolation; MISSING where a neighbour is.
+
+    precision: of the blends before they are rounded to levels. `signals.image.stretched` is another function: an image
+    is no level and lacks no value, and its weights are ratios of integers, the same bits on every machine.
+    """
+    first = places.astype(np.intp)
+    part: npt.NDArray[np.floating] = (places - first).astype(precision)
+    low, high = levels[..., first], levels[..., np.minimum(first + 1, levels.shape[-1] - 1)]
+    blended = np.rint(low * (1 - part) + high * part).astype(np.uint8)
+    return np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), blended)
+
+
+def unchanging(levels: LevelArray) -> npt.NDArray[np.bool_]:
+    """The channels of a touch that read one level throughout, or nothing, (C,)."""
+    read = levels != MISSING
+    highest, lowest = np.where(read, levels, 0).max(axis=1), np.where(read, levels, LEVELS).min(axis=1)
+    return np.asarray(highest <= lowest)
+
+
+def block_means(levels: LevelArray, edges: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Means of the blocks of a touch between edges, (C, B), 0 where nothing was read; and whether anything was.
+
+    A touch may end before the last edge.
+    """
+    seen, first = levels != MISSING, edges[:-1][edges[:-1] < levels.shape[1]]
+    sums, counts = np.zeros((2, len(levels), len(edges) - 1), dtype=np.int64)
+    np.add.reduceat(np.where(seen, levels, 0), first, axis=1, dtype=np.int64, out=sums[:, : len(first)])
+    np.add.reduceat(seen, first, axis=1, dtype=np.int64, out=counts[:, : len(first)])
+    return sums / np.maximum(counts, 1), counts > 0
+
+
+def blends(levels: LevelArray, logs: FloatArray, warmths: Sequence[float]) -> LevelArray:
+    """Weighted means of touches (n, C · T) of some log-likelihoods (n,), one for each warmth, (warmths, C · T).
+
+    warmths: how steeply the weight of a touch falls with its log-likelihood.
+    """
+    means = weighted_means(levels, np.exp(np.outer(warmths, logs - logs.max())))
+    return np.asarray(np.where(np.isnan(means), MISSING, np.rint(means)), dtype=np.uint8)
+
+
+def weighted_means(levels: LevelArray, weights: FloatArray) -> npt.NDArray[np.floating]:
+    """Means of touches (n, C · T) by weights (means, n); NaN where no touch has a value."""
+    single, known = weights.astype(np.float32), levels != MISSING
+    if known.all():
+        return np.asarray((single / single.sum(axis=1, keepdims=True)) @ levels.astype(np.float32))
+    total = single @ known.astype(np.float32)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(total > 0, single @ (levels * known).astype(np.float32) / total, np.nan))

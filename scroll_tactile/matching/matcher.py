@@ -7,7 +7,7 @@ A mean over windows forgets where a reading passes the noise's edge; kept touche
 The sum is over all values that were read. A channel that never changes, where hardly any kept touch has it so, is
 stuck: it says nothing of its own and is left out, as are values that are missing. Where it is often quiet, it says
 something by being so, unless the values are likelier without it. Beside the kept touches of a material stand blends of
-those that are likely: what is felt lies between them. A touch is compared with the beginnings of kept ones, in their
+those that are likely: what is felt lies between them. A touch is compared with the prefixes of kept ones, in their
 own time, or with the whole of each brought to its length: made at another speed, it has another length.
 
 All is a function of the set of kept touches, in any order.
@@ -15,19 +15,27 @@ All is a function of the set of kept touches, in any order.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.blends import blends, block_means, unchanging, weighted_means
-from scroll_tactile.matching.kept_arrays import KeptArrays
-from scroll_tactile.matching.likelihood import CLEAN, MISSING, UNIT, LevelArray, Noise, Table
-from scroll_tactile.matching.match import Match, NaturalDeviation, negative_entropy, noise_share, shape_of, without_zero
+from scroll_tactile.matching.kept_arrays import KeptArrays, blends, block_means, unchanging, weighted_means
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Likelihood, Noise, Table
+from scroll_tactile.matching.match import (
+    KeptTouch,
+    Match,
+    NaturalDeviation,
+    independent,
+    negative_entropy,
+    noise_share,
+    shape_of,
+    without_zero,
+)
 
-__all__ = ["TouchMatcher"]
+__all__ = ["TouchMatcher", "matcher_of", "spaced"]
 
 FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
@@ -41,6 +49,13 @@ STRIDE = 4  # coarse amplitudes in one at first: the likelihood has one peak ove
 WARMTHS = (0.03, 0.1, 0.3)  # of blends: how steeply the weight of a kept touch falls with its likelihood
 BLENDED = 6  # materials, the likeliest, that have blends
 RARELY = 20  # kept touches, of which fewer than one has a channel unchanging: then one that is so is stuck
+PAIRS, HELD_OUT = 200, 64  # kept touches by which the spread is measured, and the rest
+FEWEST = 8  # touches held out; with fewer nothing is measured
+ASSUMED = (10.0, 10.0)  # coherence and energy then: about what RoboSkin's and BioTac's touches have
+WITHIN = 0.95  # of touches held out: one in twenty is noisy itself
+EVEN = 2.0  # times the noise amplitude that those stay below: there the share of noise is a half
+ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
+PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardly any value was read
 
 
 @dataclass(frozen=True)
@@ -110,7 +125,7 @@ class _Others:
 class TouchMatcher:
     """Compares a touch with kept touches. deviation: of these kept touches from each other, or of most of them.
 
-    Any number of threads may ask at once. The kept touches follow where nobody asks: otherwise those of a copy do.
+    Any number of threads may use it at once. The kept touches follow where nobody uses it: otherwise those of a copy.
     """
 
     def __init__(self, kept: KeptArrays, deviation: NaturalDeviation) -> None:
@@ -127,7 +142,7 @@ class TouchMatcher:
 
         noise: what came over it; the likeliest unless given.
 
-        whole: with each of them brought to its length, and not with their beginnings; then what is beyond the longest
+        whole: with each of them brought to its length, and not with their prefixes; then what is beyond the longest
         is left out. Raises InputError for other channels.
         """
         if levels.ndim != 2 or len(levels) != self.kept.channels:
@@ -171,7 +186,7 @@ class TouchMatcher:
     def _others(self, rows: Rows, query: _Query) -> LevelArray:
         """The levels that a touch is compared with, of some kept ones, (rows, C · T)."""
         columns = query.levels.shape[1]
-        return self.kept.brought_to(rows, columns) if query.whole else self.kept.beginnings(rows, columns)
+        return self.kept.brought_to(rows, columns) if query.whole else self.kept.prefixes(rows, columns)
 
     def _shortlist(self, noises: Sequence[Noise], query: _Query, count: int) -> Rows:
         """Rows of the kept touches nearest to the touch as it was before each noise, (count, noises), ascending."""
@@ -268,3 +283,58 @@ class TouchMatcher:
                 pairs = self._pairs(blends(others.levels[own], logs[own], WARMTHS), query)
                 best[material] = max(best[material], float(pairs.logs(self._table(noise)).max()))
         return best
+
+
+def matcher_of(touches: Iterable[KeptTouch]) -> TouchMatcher:
+    """The matcher of kept touches, with their natural deviation: each of some is held out and compared with the others.
+
+    Raises InputError for touches of different channels, and for none.
+    """
+    kept = KeptArrays.of(touches)
+    return TouchMatcher(kept, _measured(TouchMatcher(kept, NaturalDeviation(_likelihood(kept), *ASSUMED))))
+
+
+def spaced(touches: Sized, count: int) -> list[int]:
+    """Places of at most so many touches, spread evenly over their keys: at random, but the same of the same set."""
+    return list(range(0, len(touches), max(1, -(-len(touches) // count))))
+
+
+def _likelihood(kept: KeptArrays) -> Likelihood:
+    """The tables of the spread by level: the mean deviation from the nearest touch, over levels half to twice as high.
+
+    The mean deviation, and not the standard deviation, which is a quarter more: kept touches that are likelier come
+    nearer than the nearest by all values does.
+    """
+    counts, deviations = np.zeros(LEVELS), np.zeros(LEVELS)
+    for row in spaced(kept, PAIRS):
+        pair = kept.nearest_alike(row)
+        if pair is None:
+            continue
+        both = (pair[0] != MISSING) & (pair[1] != MISSING)
+        mine, near = (levels[both].astype(np.int64) for levels in pair)
+        counts += np.bincount(near, minlength=LEVELS)
+        deviations += np.bincount(near, np.abs(mine - near), minlength=LEVELS)
+    levels = np.arange(LEVELS)
+    least, most = np.floor(levels / 1.5 - 1).clip(0).astype(int), np.ceil(levels * 1.5 + 2).clip(0, LEVELS).astype(int)
+    typical = (deviations.sum() + PRIOR_SPREAD) / (counts.sum() + 1)
+    spread = (_between(deviations, least, most) + PRIOR_VALUES * typical) / (
+        _between(counts, least, most) + PRIOR_VALUES
+    )
+    return Likelihood(spread, counts + 1 / LEVELS)
+
+
+def _between(values: FloatArray, least: npt.NDArray[np.int_], most: npt.NDArray[np.int_]) -> FloatArray:
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray(sums[most] - sums[least])
+
+
+def _measured(matcher: TouchMatcher) -> NaturalDeviation:
+    rows = spaced(matcher.kept, HELD_OUT)
+    if len(matcher.kept) < 2 or len(rows) < FEWEST:
+        return matcher.deviation
+    shapes = [matcher.deviation_of(row) for row in rows]
+    natural = float(np.median([coherence for _, coherence in shapes]))
+    noise = [independent(energy, coherence, natural) for energy, coherence in shapes]
+    most = EVEN**2 * float(np.quantile(noise, WITHIN))
+    energy = float(np.quantile([energy for energy, _ in shapes], WITHIN))
+    return NaturalDeviation(matcher.deviation.likelihood, natural, max(most, ROUNDING), max(energy, ROUNDING))

@@ -104,7 +104,7 @@ class _Scores(nn.Module):
             slopes, offsets = model.readouts[scale].linear(model.names, model.kind)
             arrays = model.readouts[scale].origin, weight * slopes, weight * offsets
             self.readouts.append([torch.from_numpy(array) for array in arrays])
-        self.odd = model.moment("complete" if columns >= model.least else "beginning", columns).model_outlier_rate
+        self.odd = model.moment("complete" if columns >= model.least else "prefix", columns).model_outlier_rate
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         planes = to_planes(image[None, :, : self.columns])

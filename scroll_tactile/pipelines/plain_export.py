@@ -37,7 +37,7 @@ def export_plain(
       (learned from, features given up), retracted; and its source, where it has one. A time out of the calendar's
       years 1 to 9999 is written as seconds since 1970. Only where the memory has a path.
     - `statistics.npz`: `materials`; for each scale (a width of windows; 1048576 the whole touch and 1048577 its shape,
-      see `signals.views`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
+      see `signals.image`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
       one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d) and `second-<scale>` Σ x xᵀ, int64 (d, d),
       of features x in units of bound · 2⁻²⁰.
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.

@@ -125,7 +125,7 @@ class CurrentModel:
         return present
 
     def reading(self, ledger: Ledger) -> FeatureExtractor:
-        """The extractor that reads the touches that predictions are asked for: it may have its banks from the disk."""
+        """The extractor that reads the touches to be predicted: it may have its banks from the disk."""
         self._look(ledger)
         self.take_in(ledger)
         return self._reading
@@ -156,7 +156,7 @@ class CurrentModel:
         give_back_scratch()
 
     def kept(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
-        """What `prediction.stored` writes of the model that would answer now; None where nobody asked for one.
+        """What `prediction.stored` writes of the model that would answer now; None where there is none.
 
         None, too, where one was read and nothing has changed since, and of a small memory that has no present one.
         """

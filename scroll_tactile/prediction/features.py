@@ -1,4 +1,4 @@
-"""From a touch to its features: codes for what is observed, mean features for what is evaluated."""
+"""From a touch to its features: quantised for what is observed, their means for what is evaluated."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.copies import Augmented
-from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.image import shape_image, stretched, tactile_image
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.signals.views import shape_image, stretched
 from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
@@ -44,15 +43,15 @@ class Encoded:
     seconds: float
 
     @property
-    def columns(self) -> int:
-        """T, the columns of the image."""
+    def steps(self) -> int:
+        """T, the steps of time in the image."""
         return int(self.image.shape[1])
 
 
 class WindowCache:
     """Features of the finished windows of one touch that is still growing, so that none is embedded twice.
 
-    A row is given again where the columns that it was made of are, to the bit, those of the last image.
+    A row is given again where the steps that it was made of are, to the bit, those of the last image.
     """
 
     def __init__(self) -> None:
@@ -61,15 +60,15 @@ class WindowCache:
 
     def turn(self, image: Image) -> None:
         """Keep the rows that hold for an image (C, T)."""
-        columns, same = min(self._image.shape[1], image.shape[1]), 0
-        if columns and len(self._image) == len(image):
-            changed = (self._image[:, :columns] != image[:, :columns]).any(axis=0)
-            same = int(changed.argmax()) if changed.any() else columns
+        steps, same = min(self._image.shape[1], image.shape[1]), 0
+        if steps and len(self._image) == len(image):
+            changed = (self._image[:, :steps] != image[:, :steps]).any(axis=0)
+            same = int(changed.argmax()) if changed.any() else steps
         self._rows = {(width, start): row for (width, start), row in self._rows.items() if start + width <= same}
         self._image = image
 
     def missing(self, windows: Extent) -> Extent:
-        """Of windows, width → first columns, those without a row; no width without any."""
+        """Of windows, width → first steps, those without a row; no width without any."""
         absent = {
             width: [start for start in starts if (width, start) not in self._rows] for width, starts in windows.items()
         }
@@ -79,19 +78,19 @@ class WindowCache:
         self, windows: Extent, absent: Extent, embedded: Mapping[int, npt.NDArray[np.floating]]
     ) -> dict[int, npt.NDArray[np.floating]]:
         """Width → features (windows, d): those embedded, at the `absent`, with the rows that were kept."""
-        columns = self._image.shape[1]
+        steps = self._image.shape[1]
         fresh = {
             (width, start): row
             for width, starts in absent.items()
             for start, row in zip(starts, embedded[width], strict=True)
         }
-        self._rows |= {(width, start): row for (width, start), row in fresh.items() if start + width <= columns}
+        self._rows |= {(width, start): row for (width, start), row in fresh.items() if start + width <= steps}
         every = self._rows | fresh
         return {width: np.stack([every[width, start] for start in starts]) for width, starts in windows.items()}
 
 
 class FeatureExtractor:
-    """What a sensor, an embedding, a plan of windows and an augmentation make of touches; it learns nothing.
+    """Makes features of touches, by a sensor, an embedding, a plan of windows and an augmentation; it learns nothing.
 
     check: of the embedding's fingerprint, where it was made again for a memory.
 
@@ -163,7 +162,7 @@ class FeatureExtractor:
         return image.shape[1], self.codes(image, stream.key)
 
     def codes(self, image: Image, key: bytes) -> Codes:
-        """The rows of codes that a touch adds to the statistics, by scale: its own, behind them those of its copies.
+        """The quantised features that a touch adds to the statistics, rows by scale: its own, then those of its copies.
 
         Its own come first: the sample finds them by their place. Copies are no longer than the touch, so they have no
         other scales.
@@ -195,7 +194,7 @@ class FeatureExtractor:
     ) -> Encoded:
         """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
 
-        longest: its columns. scales_for: the scales to be read of a touch of so many columns. cache: of the same touch
+        longest: its steps. scales_for: the scales to be read of a touch of so many steps. cache: of the same touch
         when it was shorter.
         """
         within = self._within(stream, longest)
@@ -225,7 +224,7 @@ class FeatureExtractor:
         """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales.
 
         places: of the windows of each scale, those that are embedded; all unless given. Of the many with which a touch
-        begins, half are never scored. cache: of the image when it had fewer columns.
+        begins, half are never scored. cache: of the image when it had fewer steps.
         """
         wanted = self._plan.scales if scales is None else scales
         extent = self._plan.extent(image.shape[1])
@@ -235,7 +234,7 @@ class FeatureExtractor:
         views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
         by_width = {int(scale): starts for scale, starts in windows.items()}
         if views and views[WHOLE] is image and cache is None and self._plan.whole not in by_width:
-            # A touch of the usual length is convolved once for its windows and for itself.
+            # A touch of the default length is convolved once for its windows and for itself.
             embedded, found = self._whole(image, by_width)
         else:
             embedded = self._embedded(image, by_width) if cache is None else self._completed(image, by_width, cache)
@@ -262,7 +261,7 @@ class FeatureExtractor:
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of windows, of which only those are embedded that have no row; of the columns that they need."""
+        """The features of windows, of which only those are embedded that have no row; of the steps that they need."""
         cache.turn(image)
         absent = cache.missing(windows)
         if not absent:
@@ -273,9 +272,9 @@ class FeatureExtractor:
         return cache.joined(windows, absent, self._embedded(part, shifted))
 
     def _views(self, image: Image) -> dict[Scale, Image]:
-        """The pictures of a whole touch by view; of a touch of the usual length the first is the image itself."""
-        usual = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
-        return {WHOLE: usual, SHAPE: shape_image(usual)}
+        """The pictures of a whole touch by view; of a touch of the default length the first is the image itself."""
+        whole = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
+        return {WHOLE: whole, SHAPE: shape_image(whole)}
 
     def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
         return self._sound(embed_windows(self._embedding, image, windows), windows)

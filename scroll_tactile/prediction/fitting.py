@@ -1,6 +1,6 @@
 """Fitting: a model of a memory as it is, solved once, and read by touches that are held out of it.
 
-A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its beginnings, and it at other
+A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its prefixes, and it at other
 paces, are made of its kept levels. Readouts and kept touches, both without it, judge all of these, as they will judge a
 touch to come. The calibrations, and the weights of readouts and kept touches at each moment, are fitted to that, here
 and nowhere else: a prediction measures nothing, and all is a function of the set of touches.
@@ -15,22 +15,26 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.blends import at_places
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.deviation import matcher_of
+from scroll_tactile.matching.kept_arrays import at_places
 from scroll_tactile.matching.likelihood import LevelArray
 from scroll_tactile.matching.match import KeptTouch, Match
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import TouchMatcher, matcher_of
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.moments import Fusion
-from scroll_tactile.readouts.calibration import PRIOR_WEIGHT, Calibration, calibrate_stage
+from scroll_tactile.readouts.calibration import (
+    PRIOR_WEIGHT,
+    Calibration,
+    HeldOutProbabilities,
+    calibrate_stage,
+    held_out_probabilities,
+)
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOutProbabilities, held_out_probabilities
-from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
 from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
@@ -43,7 +47,7 @@ FloatArray = npt.NDArray[np.float64]
 Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
 """Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `held_out_scores`."""
 
-PACES = (2.0, 1.41, 0.71, 0.5)  # times the usual one, at which touches are resampled: twice to half
+PACES = (2.0, 1.41, 0.71, 0.5)  # times their own, at which touches are resampled: twice to half
 
 
 @dataclass(frozen=True)
@@ -118,7 +122,7 @@ class Draft:
     def fit(self, extractor: FeatureExtractor | None) -> Model:
         """Solve the readouts and fit how they are read, once: the tasks are let go.
 
-        extractor: reads kept touches; without it nothing is fitted to their beginnings, nor to them at other paces.
+        extractor: reads kept touches; without it nothing is fitted to their prefixes, nor to them at other paces.
         """
         with one_thread():
             # One after the other, each task let go: of all at once the memory would be twice a model's.
@@ -126,7 +130,7 @@ class Draft:
             fit = _Fit(self, readouts, extractor)
             held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
             reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
-            calibrations = [fit.calibrated(stage, scales, held_out) for stage, scales in enumerate(reached)]
+            calibrations = [fit.calibrated(stage, scales, held_out)[0] for stage, scales in enumerate(reached)]
             whole, fusion = fit.fused(len(reached) - 1, held_out) if reached else (None, None)
         give_back_scratch()
         return Model(
@@ -141,7 +145,7 @@ class Draft:
             sample=self.sample,
             fusion=fusion,
             dependence=Dependence() if whole is None else dependence_of(whole),
-            conformal=Conformal(self.kept) if fusion is not None and fusion.matcher is not None else None,
+            conformal=Conformal.of(self.kept) if fusion is not None and fusion.matcher is not None else None,
             least=self.least,
             longest=self.longest,
             fitted_to=self.touches,
@@ -150,7 +154,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One fit: a draft, its readouts, solved, and what reads the beginnings of kept touches."""
+    """One fit: a draft, its readouts, solved, and what reads the prefixes of kept touches."""
 
     draft: Draft
     readouts: Mapping[Scale, Readout]
@@ -163,11 +167,17 @@ class _Fit:
         own = None if queries is None else queries[scale]
         return held_out_scores(self.readouts[scale], draft.sample, stages, draft.kind, own)
 
-    def calibrated(self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]) -> Calibration:
-        """The calibration of a stage. number: the stage, or that of the query under which `held_out` has the scores."""
-        materials = [material for material, *_ in self.draft.sample]
-        own = [(self.readouts[scale], held_out[scale]) for scale in scales]
-        return calibrate_stage(number, materials, own, self.draft.kind, viewed=bool(self.draft.views))
+    def calibrated(
+        self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]
+    ) -> tuple[Calibration, HeldOutProbabilities]:
+        """The calibration of some scales, and their probabilities of the held-out touches by it.
+
+        number: the stage, or that of the query under which `held_out` has the scores.
+        """
+        found = StageScores(number, self.draft.sample, [held_out[scale] for scale in scales])
+        readouts = [self.readouts[scale] for scale in scales]
+        calibration = calibrate_stage(found, readouts, self.draft.kind, viewed=bool(self.draft.views))
+        return calibration, held_out_probabilities(found, scales, calibration)
 
     def judged(
         self,
@@ -177,22 +187,20 @@ class _Fit:
         held_out: Mapping[Scale, HeldOutScores],
         matches: Mapping[bytes, Match],
     ) -> HeldOutMoment:
-        """What some scales and the kept touches say at a moment, given as its columns and stage."""
-        calibration = self.calibrated(number, scales, held_out)
-        answers = held_out_probabilities(number, scales, self.draft.sample, held_out, calibration)
-        return HeldOutMoment(*moment, calibration, answers, matches)
+        """Some scales and the kept touches at a moment, given as its steps and stage."""
+        return HeldOutMoment(*moment, *self.calibrated(number, scales, held_out), matches)
 
     def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
-        """What readouts say of complete touches held out, and the table of weights of readouts and kept touches.
+        """The readouts' probabilities of complete held-out touches, and the table of all weights.
 
-        last: the last stage that any touch reached. held_out: what each scale says of the sampled touches.
+        last: the last stage that any touch reached. held_out: each scale's scores of the sampled touches.
         """
         draft, milestones = self.draft, self.draft.memory.plan.milestones()[: last + 1]
         matcher = matcher_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
         complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], held_out, {})
-        columns = moments_of(milestones, least, matched=matcher is not None)
-        moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in columns]
+        steps = moments_of(milestones, least, matched=matcher is not None)
+        moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in steps]
         chosen, counts = chosen_of(complete.held_out, matcher)
         weight = PRIOR_WEIGHT[draft.kind]
         if matcher is None:
@@ -205,10 +213,10 @@ class _Fit:
         if not chosen or self.extractor is None:
             alone = self.judged((least, last), last, draft.views, held_out, {})
             return complete.held_out, fuse(
-                matcher, [*kept.beginnings(moments), complete], [alone], chosen, counts, weight
+                matcher, [*kept.prefixes(moments), complete], [alone], chosen, counts, weight
             )
         paced = [kept.paced(pace, chosen, last) for pace in PACES]
-        return complete.held_out, fuse(matcher, [*kept.beginnings(moments), complete], paced, chosen, counts, weight)
+        return complete.held_out, fuse(matcher, [*kept.prefixes(moments), complete], paced, chosen, counts, weight)
 
 
 @dataclass(frozen=True)
@@ -229,7 +237,7 @@ class _KeptTouches:
 
     @classmethod
     def held_out(cls, fit: _Fit, matcher: TouchMatcher, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
-        """Those with some keys."""
+        """The kept touches with some keys."""
         kept = matcher.kept.rows()
         rows = {key: kept[key] for key in sorted(keys)}
         levels = {key: matcher.kept.levels(row) for key, row in rows.items()}
@@ -237,37 +245,37 @@ class _KeptTouches:
         matches = {key: matcher.match(levels[key], held_out=row) for key, row in rows.items()}
         return cls(fit, matcher, chosen, rows, levels, places, matches)
 
-    def beginnings(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
-        """What is said of their beginnings at each moment, given as its columns and stage."""
+    def prefixes(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
+        """Readouts and kept touches on their prefixes at each moment, given as its steps and stage."""
         held_out, judged = self._read(moments), []
-        for number, (columns, stage) in enumerate(moments):
+        for number, (steps, stage) in enumerate(moments):
             matches = {}
             for key in self.chosen:
-                if (levels := self.levels[key]).shape[1] >= columns:
+                if (levels := self.levels[key]).shape[1] >= steps:
                     # The noise is estimated once, on the whole touch: that is most of the cost of a match.
                     noise = self.matches[key].noise
-                    matches[key] = self.matcher.match(levels[:, :columns], held_out=self.rows[key], noise=noise)
+                    matches[key] = self.matcher.match(levels[:, :steps], held_out=self.rows[key], noise=noise)
             scales = self.fit.draft.stages[stage]
-            judged.append(self.fit.judged((columns, stage), number, scales, held_out, matches))
+            judged.append(self.fit.judged((steps, stage), number, scales, held_out, matches))
         return judged
 
     def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, HeldOutScores]:
-        """What each scale of windows says of their beginnings, by the moment's number."""
+        """The scores of their prefixes by each scale of windows, by the moment's number."""
         fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
         queries: Queries = {scale: {} for scale in fit.readouts if scale not in draft.views}
         for key in self.chosen if moments else ():
             assert extractor is not None
             touch, cache = stream_of(self.levels[key], extractor.sensor), WindowCache()
-            for number, (columns, stage) in enumerate(moments):
-                if columns > len(touch):
+            for number, (steps, stage) in enumerate(moments):
+                if steps > len(touch):
                     break
-                image = extractor.image(touch.first(columns / touch.sensor.rate))
+                image = extractor.image(touch.first(steps / touch.sensor.rate))
                 for scale, mean in extractor.means(image, draft.stages[stage], cache=cache).items():
                     queries[scale].setdefault(self.places[key], {})[number] = mean
         return {scale: fit.held_out_scores(scale, queries) for scale in queries}
 
     def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
-        """What the views and the kept touches say of some of them, had they been made so many times as fast."""
+        """The views and the kept touches on some of them, had they been made so many times as fast."""
         fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
         assert extractor is not None
         queries: Queries = {scale: {} for scale in views}
@@ -279,12 +287,12 @@ class _KeptTouches:
             for scale, mean in extractor.means(image, views).items():
                 queries[scale][self.places[key]] = {0: mean}
         lengths = [self.levels[key].shape[1] / pace for key in keys]
-        columns = max(1, round(float(np.median(lengths)))) if lengths else 1
+        steps = max(1, round(float(np.median(lengths)))) if lengths else 1
         held_out = {scale: fit.held_out_scores(scale, queries) for scale in views}
-        return fit.judged((columns, last), 0, views, held_out, matches)
+        return fit.judged((steps, last), 0, views, held_out, matches)
 
 
 def at_pace(levels: LevelArray, pace: float) -> LevelArray:
     """A touch as if it had been made so many times as fast: (C, T) to (C, T / pace)."""
-    columns = max(2, round(levels.shape[1] / pace))
-    return at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))
+    steps = max(2, round(levels.shape[1] / pace))
+    return at_places(levels, np.linspace(0, levels.shape[1] - 1, steps))

@@ -36,8 +36,14 @@ from scroll_tactile.prediction.moments import (
     match_weight,
     tempered,
 )
-from scroll_tactile.readouts.calibration import AHEAD, FEWEST, UNMEASURED, Calibration, fit_weights
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import (
+    AHEAD,
+    FEWEST,
+    UNMEASURED,
+    Calibration,
+    HeldOutProbabilities,
+    fit_weights,
+)
 
 __all__ = ["HeldOutMoment", "chosen_of", "full_match_weight", "fuse", "moments_of"]
 
@@ -55,28 +61,28 @@ STEPS = 100  # of EM
 
 
 def moments_of(milestones: Sequence[int], least: int, *, matched: bool) -> tuple[int, ...]:
-    """The moments before a touch is complete, in columns: below `least`.
+    """The moments before a touch is complete, in steps: below `least`.
 
-    milestones: lengths at which other readouts judge. matched: whether there are kept touches, of which any beginning
+    milestones: lengths at which other readouts judge. matched: whether there are kept touches, of which any prefix
     can be seen: then there are two moments before the first milestone, and one between any two.
     """
-    found = {columns for columns in milestones if columns < least}
+    found = {steps for steps in milestones if steps < least}
     if matched:
         between = [round(math.sqrt(low * high)) for low, high in pairwise([*sorted(found), least])] if found else []
-        for columns in [milestones[0] // 3, 2 * milestones[0] // 3, *between]:
-            if 2 <= columns < least and all(max(columns, at) >= APART * min(columns, at) for at in found):
-                found.add(columns)
+        for steps in [milestones[0] // 3, 2 * milestones[0] // 3, *between]:
+            if 2 <= steps < least and all(max(steps, at) >= APART * min(steps, at) for at in found):
+                found.add(steps)
     return tuple(sorted(found))
 
 
 @dataclass(frozen=True)
 class HeldOutMoment:
-    """What readouts and kept touches give at one moment, from `columns` on, of held-out touches.
+    """What readouts and kept touches give at one moment, from `steps` on, of held-out touches.
 
-    stage, calibration: of the readouts. held_out: what they say. matches: what the kept touches say, by key.
+    stage, calibration: of the readouts. held_out: their probabilities. matches: of the kept touches, by key.
     """
 
-    columns: int
+    steps: int
     stage: int
     calibration: Calibration
     held_out: HeldOutProbabilities
@@ -111,7 +117,7 @@ def fuse(
     """Fit the table to held-out touches.
 
     judged: held-out touches by moment, ascending, the last of complete touches. paced: of complete ones at other paces,
-    ascending by columns. chosen: the keys of the touches that are seen at all moments. counts: of those that are seen
+    ascending by steps. chosen: the keys of the touches that are seen at all moments. counts: of those that are seen
     as complete ones, and how many touches each stands for. prior_weight: of the readouts' scores, where they are
     taken as they are.
     """
@@ -196,7 +202,7 @@ def _fitted(
     complete: bool,
 ) -> Moment:
     """A moment; near: the inputs at the moments near it, this one among them, where that is enough."""
-    held, columns, stage, calibration = judged.held_out, judged.columns, judged.stage, judged.calibration
+    held, steps, stage, calibration = judged.held_out, judged.steps, judged.stage, judged.calibration
     own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
     model_rate = _outlier_rate(own, len(held.names), np.ones(len(own))) if len(own) else 0.0
     distance_limit = float(np.quantile(held.distance, WITHIN)) if complete and len(held.keys) else np.inf
@@ -207,7 +213,7 @@ def _fitted(
         if matcher is not None:
             weight = full_match_weight(power * UNMATCHED, matcher.deviation.likelihood.table(CLEAN).information)
         rates = model_rate, model_rate
-        return Moment(columns, stage, calibration, 1.0, weight, weight, *rates, np.inf, 0.0, 1.0 / UNMEASURED)
+        return Moment(steps, stage, calibration, 1.0, weight, weight, *rates, np.inf, 0.0, 1.0 / UNMEASURED)
     together = _joined(near)
     prior = np.array([1.0, _worth(together) / 2])
     shared = np.maximum(_weights(together, prior, PRIOR_TOUCHES), LEAST_PRIOR * prior)
@@ -219,12 +225,12 @@ def _fitted(
     excess_loss = float(np.average(inputs.excess_loss, weights=inputs.counts))
     spread = max(float(np.average((inputs.excess_loss - excess_loss) ** 2, weights=inputs.counts)) ** 0.5, LEAST_SPREAD)
     weighted = float(weights[0]), match, lone
-    moment = Moment(columns, stage, calibration, *weighted, 0.0, model_rate, distance_limit, excess_loss, spread)
+    moment = Moment(steps, stage, calibration, *weighted, 0.0, model_rate, distance_limit, excess_loss, spread)
     own = _chances(moment, inputs)[np.arange(len(inputs.targets)), inputs.targets]
     return replace(moment, outlier_rate=_outlier_rate(own, inputs.logs.shape[1], inputs.counts))
 
 
-UNMATCHED = 1 / 16_000  # β where nothing can be held out: after one touch of each, beginnings are lost to a larger one
+UNMATCHED = 1 / 16_000  # β where nothing can be held out: after one touch of each, prefixes are lost to a larger one
 
 
 def _worth(inputs: _FusionInputs) -> float:

@@ -24,15 +24,15 @@ from scroll_tactile.readouts.leave_one_out import HeldOutScores
 from scroll_tactile.readouts.pruning import likeliest
 from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
 from scroll_tactile.results import Unusual
-from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
 from scroll_tactile.statistics.sample import SampledTouch
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
 __all__ = ["Hypothesis", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
-Hypothesis = Literal["beginning", "complete", "paced"]
-"""What a touch may be: the beginning of a usual one, a complete one, or a complete one at another pace."""
+Hypothesis = Literal["prefix", "complete", "paced"]
+"""What a touch may be: the prefix of a complete one, a complete one, or a complete one at another pace."""
 
 # Logits, to which the logarithm of the number of materials is added: materials further behind have less than 2e-8 of
 # the probability together, and are not read from the memory.
@@ -61,7 +61,7 @@ def enough_memory() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is said of a touch by the readouts alone, or with the kept touches.
+    """The judgement of a touch by the readouts alone, or with the kept touches.
 
     probability: of each candidate, shape (C,). novelty: see Prediction. moment: whose threshold the novelty has.
     distance: the smallest ratio, over the scales that measure novelty, of the diagonal distance to the best-scoring
@@ -83,7 +83,7 @@ class Model:
     views: the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are
     read, as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing
     was learned. conformal: how typical others are of the kept touches. held_out: scale → the sampled touches held out;
-    sample: these. dependence: how far touches of one thing say the same. least: the columns of all but the shortest
+    sample: these. dependence: how far touches of one thing are correlated. least: the steps of all but the shortest
     touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
 
     Any number of threads may use it at once; if it `reads_memory`, only the one that holds the memory's lock. `follow`
@@ -117,7 +117,7 @@ class Model:
 
     @property
     def reads_memory(self) -> bool:
-        """Whether it has so many materials that it reads those that are asked for from the memory."""
+        """Whether it has so many materials that it reads the requested ones from the memory."""
         return len(self.names) > EAGER
 
     def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:
@@ -175,7 +175,7 @@ class Model:
         else:  # one is longer than all before it: what they say of themselves stays
             touches = memory.kept.touches()
             self.fusion = replace(self.fusion, matcher=TouchMatcher(KeptArrays.of(touches), matcher.deviation))
-            self.conformal = Conformal(touches)
+            self.conformal = Conformal.of(touches)
         return True
 
     def crowded(self, behind: Sequence[Added]) -> bool:
@@ -186,55 +186,55 @@ class Model:
                 return True
         return False
 
-    def is_last(self, columns: int) -> bool:
-        """Whether a touch of so many columns is judged at the last stage, whose scores f* gives."""
-        return min(len(self.plan.stages(columns)), len(self.calibrations)) == len(self.stages)
+    def is_last(self, steps: int) -> bool:
+        """Whether a touch of so many steps is judged at the last stage, whose scores f* gives."""
+        return min(len(self.plan.stages(steps)), len(self.calibrations)) == len(self.stages)
 
     def scales(self, hypothesis: Hypothesis, stage: int) -> list[Scale]:
         """The scales that judge a touch at a stage.
 
-        Windows judge a beginning, views a touch at another pace, both a complete one. Before the last stage windows
+        Windows judge a prefix, views a touch at another pace, both a complete one. Before the last stage windows
         alone judge.
         """
-        if hypothesis == "beginning" or not self.views or stage < len(self.calibrations) - 1:
+        if hypothesis == "prefix" or not self.views or stage < len(self.calibrations) - 1:
             return list(self.stages[stage])
         return list(self.views) if hypothesis == "paced" else [*self.stages[stage], *self.views]
 
-    def moment(self, hypothesis: Hypothesis, columns: int) -> Moment:
-        """The row of the table by which a touch of so many columns is judged."""
+    def moment(self, hypothesis: Hypothesis, steps: int) -> Moment:
+        """The row of the table by which a touch of so many steps is judged."""
         assert self.fusion is not None
-        if hypothesis == "beginning":
-            return self.fusion.at(columns)
+        if hypothesis == "prefix":
+            return self.fusion.at(steps)
         if hypothesis == "complete":
             return self.fusion.complete
-        return self.fusion.at_pace(columns)
+        return self.fusion.at_pace(steps)
 
-    def scales_for(self, candidates: Sequence[str], columns: int) -> list[Scale]:
-        """The scales that are read to judge these candidates for a touch of so many columns."""
-        decided = self._decided(candidates, len(self.plan.stages(columns)))
+    def scales_for(self, candidates: Sequence[str], steps: int) -> list[Scale]:
+        """The scales that are read to judge these candidates for a touch of so many steps."""
+        decided = self._decided(candidates, len(self.plan.stages(steps)))
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]} | set(self.views))
 
     def judge(
         self,
         candidates: Sequence[str],
         means: Mapping[Scale, FloatArray],
-        columns: int,
+        steps: int,
         hypothesis: Hypothesis,
         tuned: Mapping[str, float] | None = None,
     ) -> Judgement:
         """Weigh the candidates for a touch by the readouts alone.
 
-        means: for each of the scales of `scales_for`, mean features in the codes' unit, (d,). columns: observed so far.
+        means: for each of the scales of `scales_for`, mean features in the codes' unit, (d,). steps: observed so far.
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
         A material is weighed at the last stage at which it has rows, against all candidates there, and keeps that
         probability. Later stages divide the rest among the candidates that reached them.
         """
-        moment = self.moment(hypothesis, columns)
+        moment = self.moment(hypothesis, steps)
         if hypothesis == "paced":  # every touch has views, of all of it
             decided: list[tuple[int, Sequence[int]]] = [(len(self.calibrations) - 1, range(len(candidates)))]
         else:
-            decided = self._decided(candidates, len(self.plan.stages(columns)))
+            decided = self._decided(candidates, len(self.plan.stages(steps)))
         probability, mass, distance = np.ones(len(candidates)), 1.0, 0.0
         for i, (stage, members) in enumerate(decided):
             names = candidates if len(members) == len(candidates) else [candidates[place] for place in members]
@@ -337,17 +337,17 @@ class Model:
         distances = np.array(
             [readout.diagonal_distance(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
         )
-        measuring = [readout.scale.measures_novelty for readout in readouts]
-        return calibration.weights_at(distances), float(calibration.relative(distances)[measuring].min())
+        novel = measuring([readout.scale for readout in readouts])
+        return calibration.weights_at(distances), float(calibration.relative(distances)[novel].min())
 
     def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """The calibration by which scores are read at a stage: the moment's, if it is of this stage.
 
-        Otherwise the stage's own: for materials whose touches ended at an earlier stage, and for a beginning where
+        Otherwise the stage's own: for materials whose touches ended at an earlier stage, and for a prefix where
         "complete" is the only row.
         """
         assert self.fusion is not None
-        begun = hypothesis == "beginning" and moment is self.fusion.complete
+        begun = hypothesis == "prefix" and moment is self.fusion.complete
         return self.calibrations[stage] if begun or stage != moment.stage else moment.calibration
 
     def _novelty(
@@ -370,8 +370,8 @@ class Model:
         self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]
     ) -> FloatArray:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
-        measuring = [scale for scale in scales if scale.measures_novelty]
-        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in measuring])
+        novel = [scales[place] for place in measuring(scales)]
+        return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
 
 
 def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:

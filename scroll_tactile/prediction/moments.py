@@ -41,9 +41,9 @@ LEAST_DISTANCE_WEIGHT = 0.5  # the least weight at another pace, as a share of t
 
 @dataclass(frozen=True)
 class Moment:
-    """How a touch is judged from so many columns on.
+    """How a touch is judged from so many steps on.
 
-    columns: from how many on; of the last moment, those of a complete touch. stage: of the readouts that judge.
+    steps: from how many on; of the last moment, those of a complete touch. stage: of the readouts that judge.
     calibration: how their scores are read. model_weight: g. match_weight: β at an information of 1, called r, see
     `match_weight_at`. lone_match_weight: the same where noise or distance leaves the readouts no weight.
     outlier_rate: ε. model_outlier_rate: ε of the readouts' own probabilities. distance_limit: the relative distance
@@ -51,7 +51,7 @@ class Moment:
     deviation of the excess loss of known touches beside the kept ones.
     """
 
-    columns: int
+    steps: int
     stage: int
     calibration: Calibration
     model_weight: float
@@ -83,7 +83,7 @@ class Moment:
         return float(np.clip(1.0 / max(distance, LEAST_SPREAD), least, 1.0))
 
     def suffices(self, probability: float, distance: float) -> bool:
-        """Whether the readouts' word is enough: their highest probability, and how far off the touch is.
+        """Whether the readouts are enough, by their highest probability and by how far off the touch is.
 
         Where no touch could be held out any probability suffices: a new touch then always looks noisy.
         """
@@ -119,7 +119,7 @@ class Trajectories:
 class Fusion:
     """The table of all moments, ascending, the last "complete"; matcher: the kept touches, None where there are none.
 
-    paced: how complete touches are judged that were made at other paces, ascending by columns. trajectories: of the
+    paced: how complete touches are judged that were made at other paces, ascending by steps. trajectories: of the
     touches that it was fitted to, at all moments before the last.
     """
 
@@ -133,27 +133,27 @@ class Fusion:
         """How a complete touch is judged."""
         return self.moments[-1]
 
-    def reaches(self, columns: int) -> bool:
+    def reaches(self, steps: int) -> bool:
         """Whether a complete touch may be so long by its pace alone: about half to twice as long as usual."""
-        return self.paced[0].columns <= APART * columns and columns <= APART * self.paced[-1].columns
+        return self.paced[0].steps <= APART * steps and steps <= APART * self.paced[-1].steps
 
-    def at_pace(self, columns: int) -> Moment:
+    def at_pace(self, steps: int) -> Moment:
         """The row for a complete touch made at another pace: the one nearest in length, by ratio."""
-        return min(self.paced, key=lambda row: abs(math.log(row.columns / columns)))
+        return min(self.paced, key=lambda row: abs(math.log(row.steps / steps)))
 
     def latest(self, stage: int) -> Moment:
         """The latest moment of a stage; that of complete touches, where the stage has none."""
         return next((moment for moment in reversed(self.moments) if moment.stage == stage), self.complete)
 
-    def at(self, columns: int) -> Moment:
-        """The latest moment that so many columns reached; the first, where they reached none."""
-        return self.moments[max(0, bisect_right([moment.columns for moment in self.moments], columns) - 1)]
+    def at(self, steps: int) -> Moment:
+        """The latest moment that so many steps reached; the first, where they reached none."""
+        return self.moments[max(0, bisect_right([moment.steps for moment in self.moments], steps) - 1)]
 
 
-def match_scores(matcher: TouchMatcher, names: Sequence[str], way: Match) -> FloatArray:
-    """What the kept touches say of some materials, (C,); the least of those of which none is kept."""
-    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(way.scores.min())
-    return np.array([way.scores[places[name]] if name in places else least for name in names])
+def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:
+    """The kept touches' scores of some materials, (C,); the least of all for materials of which none is kept."""
+    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(match.scores.min())
+    return np.array([match.scores[places[name]] if name in places else least for name in names])
 
 
 def tempered(chances: FloatArray, outlier_rate: float) -> FloatArray:

@@ -9,8 +9,8 @@ from pathlib import Path
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.persistence.reembed import Reembedding
-from scroll_tactile.prediction.answer import Predictor
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.recipe import Recipe, RecipeRequest, default_kept_touches
 from scroll_tactile.settings import Settings
 from scroll_tactile.signals.stream import Stream

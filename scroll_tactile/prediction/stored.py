@@ -32,8 +32,8 @@ from scroll_tactile.prediction.moments import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.readout_arrays import readout_from_arrays, readout_to_arrays
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.readouts.task import readout_from_arrays, readout_to_arrays
+from scroll_tactile.signals.windows import Scale, measuring
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.validation.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from store import Checkpoint
@@ -47,7 +47,7 @@ NAME = "model"
 MADE_BY = f"{__version__}, 2"  # the release, and how it is written: the judge may differ in another
 MOST_BANKS = 64
 OF_MOMENT = (
-    "columns",
+    "steps",
     "stage",
     "model_weight",
     "match_weight",
@@ -314,8 +314,8 @@ class _Reader:
         of_rows += [of_rows[-1] if matcher is None else list(views)] * (len(rows) - count)
         found = list(self._calibrations([*stages, *of_rows]))
         moments = [
-            Moment(int(columns), int(stage), calibration, *rest)
-            for (columns, stage, *rest), calibration in zip(rows.tolist(), found[len(stages) :], strict=True)
+            Moment(int(steps), int(stage), calibration, *rest)
+            for (steps, stage, *rest), calibration in zip(rows.tolist(), found[len(stages) :], strict=True)
         ]
         trajectories = self._trajectories(count - 1)
         fusion = Fusion(tuple(moments[:count]), tuple(moments[count:]), matcher, trajectories)
@@ -323,13 +323,13 @@ class _Reader:
 
     def _calibrations(self, scales: Sequence[Sequence[Scale]]) -> Iterator[Calibration]:
         """A calibration of each of some lists of scales."""
-        sizes = [(len(of), sum(scale.measures_novelty for scale in of)) for of in scales]
+        sizes = [(len(own), len(measuring(own))) for own in scales]
         edges = np.cumsum([(0, 0), *sizes], axis=0).tolist()
-        total, measuring = edges[-1]
+        total, novel = edges[-1]
         lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))
         counts("novelty-counts", lengths, 0, MOST_ROWS)
         weights, medians = self.floats("weights", (total,), 0.0, 1e300), self.floats("median_distances", (total,), 0.0)
-        shapes = self.floats("scale_novelty", (measuring, 2))
+        shapes = self.floats("scale_novelty", (novel, 2))
         expect(bool((shapes[:, 1] > 0).all()), "scale_novelty", "spreads above 0", "others")
         novelties = self.floats("novelties", (int(lengths.sum()),))
         ends = np.cumsum([0, *lengths.tolist()]).tolist()

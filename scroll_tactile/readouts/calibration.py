@@ -7,7 +7,7 @@ arXiv 1706.04599):
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
 w⁰ the prior and ρ the touches that it counts as: first one weight is fitted that all scales have in common, and then
-one each that is drawn to it. Scores of left-out touches are nearly collinear, and by themselves the weights run into a
+one each that is drawn to it. Scores of held-out touches are nearly collinear, and by themselves the weights run into a
 corner: all on one scale, that a longer touch may spoil. Where a touch is viewed in several ways, a view has less weight
 the further the touch lies from its nearest material there: the view's scores count as min(1, u_k / r_k) s_k, r_k the
 squared Mahalanobis distance with diagonal scatter (`Readout.diagonal_distance`) and u_k its median over held-out
@@ -25,8 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import HeldOutScores
+from scroll_tactile.readouts.leave_one_out import StageScores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
+from scroll_tactile.signals.windows import Scale, measuring
 
 __all__ = [
     "AHEAD",
@@ -34,21 +35,21 @@ __all__ = [
     "PRIOR_WEIGHT",
     "UNMEASURED",
     "Calibration",
+    "HeldOutProbabilities",
     "calibrate_stage",
-    "common_names",
     "fit_weights",
-    "judged_touches",
+    "held_out_probabilities",
     "scale_weights",
 ]
 
 FloatArray = npt.NDArray[np.float64]
 
-FEWEST = 8  # left-out touches; with fewer, a stage keeps the threshold and the spreads set beforehand
+FEWEST = 8  # held-out touches; with fewer, a stage keeps the threshold and the spreads set beforehand
 PRIOR_WEIGHT = {
     "lda": 0.1,
     "ridge": 10.0,
 }  # of the scores of all scales together: what both sensors' data come to
-# Logits by which the mean of a material is ahead of the next one's where no touch can be left out, see `_unheld`: of
+# Logits by which the mean of a material is ahead of the next one's where no touch can be held out, see `_unheld`: of
 # one touch of each, log loss was least from 1.5 to 2 on fifteen sets (BioTac, RoboSkin, letters, simulated events and
 # light contacts, eight series).
 AHEAD = 2.0
@@ -64,7 +65,7 @@ class Calibration:
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
     scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
-    novelties: sorted standardised novelty of known, left-out touches, shape (touches,).
+    novelties: sorted standardised novelty of known, held-out touches, shape (touches,).
     median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
     touch counts alike.
     """
@@ -90,11 +91,11 @@ class Calibration:
         return standard
 
     def measures(self, false_alarms: float) -> bool:
-        """Whether enough known touches were left out to say which novelty such a share of them exceeds."""
+        """Whether enough known touches were held out to say which novelty such a share of them exceeds."""
         return self._rank(false_alarms) <= len(self.novelties)
 
     def threshold(self, false_alarms: float) -> float:
-        """The novelty that a share `false_alarms` of known touches exceeds, by the left-out ones."""
+        """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
         if len(self.novelties) < FEWEST:
             return UNMEASURED
         if not self.measures(false_alarms):
@@ -107,71 +108,80 @@ class Calibration:
 
 
 TINY = 1e-300
-UNMEASURED = 5.0  # spreads: where too little could be left out to measure the distances of known touches
+UNMEASURED = 5.0  # spreads: where too few could be held out to measure the distances of known touches
 
 
 def calibrate_stage(
-    stage: int,
-    materials: Sequence[str],
-    scales: Sequence[tuple[Readout, HeldOutScores]],
-    kind: ReadoutName,
-    *,
-    viewed: bool = False,
+    found: StageScores, readouts: Sequence[Readout], kind: ReadoutName, *, viewed: bool = False
 ) -> Calibration:
     """Calibrate one stage.
 
-    materials: of the sampled touches. scales: of those that judge, ascending, the readout and what it left out.
+    found: the scores of held-out touches by each scale that judges. readouts: of these scales, in their order.
     viewed: whether a scale's weight falls with a touch's diagonal distance.
     """
-    held_out = [left for _, left in scales]
-    measuring = [(readout, left) for readout, left in scales if readout.scale.measures_novelty]
-    names = common_names(held_out)
-    touches = judged_touches(stage, held_out) if len(names) > 1 else []
-    medians = np.full(len(held_out), np.inf)
-    if not touches:
-        unheld = np.full(len(held_out), _unheld(names, scales, kind))
-        return Calibration(unheld, _assumed(measuring), np.zeros(0), medians)
-    scores = np.stack([_picked(left, left.scores, names, touches, stage) for left in held_out], axis=1)
-    measured = [_picked(left, left.distances, names, touches, stage).min(axis=1) for _, left in measuring]
-    distances = np.stack(measured, axis=1)
-    own = {name: i for i, name in enumerate(names)}
+    scales = len(readouts)
+    novel = [readouts[place] for place in measuring([readout.scale for readout in readouts])]
+    medians = np.full(scales, np.inf)
+    if not found.places:
+        unheld = np.full(scales, _unheld(found.names, readouts, kind))
+        return Calibration(unheld, _assumed(novel), np.zeros(0), medians)
+    scores, distances = found.scores(), found.distances().min(axis=2)
     if viewed:
-        rows = [[left.rows[touch, stage] for touch in touches] for left in held_out]
-        away = np.stack(
-            [left.diagonal_distances[own_rows] for left, own_rows in zip(held_out, rows, strict=True)], axis=1
-        )
+        away = found.diagonal_distances()
         medians = np.median(away, axis=0)
         scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
-    weights = scale_weights(scores, [own[materials[touch]] for touch in touches], PRIOR_WEIGHT[kind] / len(held_out))
+    weights = scale_weights(scores, found.targets.tolist(), PRIOR_WEIGHT[kind] / scales)
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed(measuring), np.zeros(0), medians)
+        return Calibration(weights, _assumed(novel), np.zeros(0), medians)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
     unsorted = Calibration(weights, shape, np.zeros(0), medians).novelty(distances)
     # The mean of scales that agree only in part spreads less than one: back to units of its own spread.
-    spread = shape[:, 1] * max(float(unsorted.std()), 1e-9)
-    shape = np.stack([shape[:, 0], spread], axis=1)
+    shape[:, 1] *= max(float(unsorted.std()), 1e-9)
     own_novelty = Calibration(weights, shape, np.zeros(0), medians).novelty(distances)
     return Calibration(weights, shape, np.sort(own_novelty), medians)
 
 
-def common_names(held_out: Sequence[HeldOutScores]) -> list[str]:
-    """The reference materials of all of some scales, in alphabetical order."""
-    return sorted(set.intersection(*(set(left.names) for left in held_out)))
+@dataclass(frozen=True)
+class HeldOutProbabilities:
+    """Probabilities of the C materials that all scales know, for N sampled touches, each held out.
+
+    names, places, keys, targets: see `StageScores`. logs: log-probability of the materials, (N, C). distance: the least
+    diagonal distance at any scale that measures novelty, in units of the median, (N,). novelty: see `Prediction`, (N,).
+    """
+
+    names: list[str]
+    places: list[int]
+    keys: list[bytes]
+    targets: npt.NDArray[np.intp]
+    logs: FloatArray
+    distance: FloatArray
+    novelty: FloatArray
+
+    @property
+    def margins(self) -> FloatArray:
+        """How far each one's own material is ahead of the next, in logits; below 0 where it is behind, (N,)."""
+        rows = np.arange(len(self.targets))
+        others = self.logs.copy()
+        others[rows, self.targets] = -np.inf
+        return np.asarray(self.logs[rows, self.targets] - others.max(axis=1, initial=-np.inf))
 
 
-def judged_touches(stage: int, held_out: Sequence[HeldOutScores]) -> list[int]:
-    """The sampled touches, by their place in the sample, that all of some scales left out at a stage."""
-    found = [{touch for touch, reached in left.rows if reached == stage} for left in held_out]
-    return sorted(set.intersection(*found))
-
-
-def _picked(left: HeldOutScores, values: FloatArray, names: list[str], touches: list[int], stage: int) -> FloatArray:
-    """The values of some touches at a stage for some of the materials, shape (touches, names)."""
-    own = {name: i for i, name in enumerate(left.names)}
-    rows = np.array([left.rows[touch, stage] for touch in touches], dtype=np.intp)
-    picked: FloatArray = values[np.ix_(rows, np.array([own[name] for name in names]))]
-    return picked
+def held_out_probabilities(
+    found: StageScores, scales: Sequence[Scale], calibration: Calibration
+) -> HeldOutProbabilities:
+    """The probabilities by some scales of the touches held out of them, as they are calibrated."""
+    diagonal, scores = found.diagonal_distances(), found.scores()
+    weights = calibration.weights_at(diagonal)
+    logits, distance, novelty = np.zeros((len(found.places), len(found.names))), np.zeros(0), np.zeros(0)
+    for place in range(len(scales)):
+        logits += weights[:, place, None] * scores[:, place]
+    logits -= logits.max(axis=1, keepdims=True) if found.names else 0.0
+    logits -= np.log(np.exp(logits).sum(axis=1, keepdims=True))
+    if found.places:
+        distance = calibration.relative(diagonal)[:, measuring(scales)].min(axis=1)
+        novelty = calibration.novelty(found.distances().min(axis=2))
+    return HeldOutProbabilities(found.names, found.places, found.keys, found.targets, logits, distance, novelty)
 
 
 def scale_weights(scores: FloatArray, targets: Sequence[int], prior: float) -> FloatArray:
@@ -190,7 +200,7 @@ def fit_weights(
 ) -> FloatArray:
     """Weights ≥ 0 of least log loss, a convex problem, drawn to the prior where touches are few.
 
-    scores: of touches left out, shape (touches, scales, classes). targets: the class of each. touches: that the prior
+    scores: of held-out touches, shape (touches, scales, classes). targets: the class of each. touches: that the prior
     counts as. counts: how many touches each of them stands for, shape (touches,); 1 unless given.
     """
     counted = np.ones(len(scores)) if counts is None else counts
@@ -230,19 +240,20 @@ def fit_weights(
     return weights
 
 
-def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, HeldOutScores]], kind: ReadoutName) -> float:
-    """The weight of each scale where no touch can be left out, most materials having one.
+def _unheld(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName) -> float:
+    """The weight of each scale where no touch can be held out, most materials having one.
 
     Within-class scatter is then that within a touch alone, and touches of a material differ by far more: how far the
     scores are to weigh nothing says but the scores between the materials. So a touch that is the mean of its
     material is ahead by so many logits, and what lies between two materials is as likely to be either.
     """
-    share = PRIOR_WEIGHT[kind] / len(scales)
+    share = PRIOR_WEIGHT[kind] / len(readouts)
     if kind == "ridge" or len(names) < 2:  # a ridge's scores are of targets of 0 and 1
         return share
     ahead = np.zeros((len(names), len(names)))
-    for readout, left in scales:
-        own = [left.names.index(name) for name in names]
+    for readout in readouts:
+        known = [readout.names[place] for place in readout.reference]
+        own = [known.index(name) for name in names]
         gram = readout.derived().gram[np.ix_(own, own)]
         sizes = np.diagonal(gram)
         ahead += (sizes[:, None] + sizes - 2 * gram) / 2
@@ -250,10 +261,10 @@ def _unheld(names: Sequence[str], scales: Sequence[tuple[Readout, HeldOutScores]
     return min(share, AHEAD / max(float(np.median(ahead.min(axis=1))), TINY))
 
 
-def _assumed(scales: Sequence[tuple[Readout, HeldOutScores]]) -> FloatArray:
-    """Without touches left out: the distances of the class means themselves, spread by their own mean size."""
+def _assumed(readouts: Sequence[Readout]) -> FloatArray:
+    """Without held-out touches: the distances of the class means themselves, spread by their own mean size."""
     shapes = []
-    for readout, _ in scales:
+    for readout in readouts:
         derived = readout.derived()
         sizes = np.diagonal(derived.gram)
         typical = np.einsum("ri,ij,rj->r", derived.gram, derived.background, derived.gram) - sizes

@@ -6,7 +6,7 @@ novelties spreads by √((1 + (k − 1) ρ') / k) of what one does:
 
     log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
 
-ρ is fitted to pairs of touches left out, by least log loss, and ρ' is their intraclass correlation. One touch is what
+ρ is fitted to pairs of held-out touches, by least log loss, and ρ' is their intraclass correlation. One touch is what
 it is by itself.
 """
 
@@ -19,14 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.calibration import FEWEST, fit_weights
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import FEWEST, HeldOutProbabilities, fit_weights
 
 __all__ = ["Dependence", "dependence_of"]
 
 FloatArray = npt.NDArray[np.float64]
 
-USUAL = 0.25  # ρ and ρ' where nothing is measured: about what beginnings of BioTac's touches have
+DEFAULT = 0.25  # ρ and ρ' where nothing is measured: about that of prefixes of BioTac's touches
 PRIOR_TOUCHES = 2.0  # pairs that ρ counts as
 TINY = 1e-300
 
@@ -35,8 +34,8 @@ TINY = 1e-300
 class Dependence:
     """Correlations of two touches of one material, from 0 to 1: ρ of their log-probabilities, ρ' of their novelties."""
 
-    log_probability: float = USUAL
-    novelty: float = USUAL
+    log_probability: float = DEFAULT
+    novelty: float = DEFAULT
 
     def probability(self, chances: Sequence[FloatArray]) -> FloatArray:
         """The probability of the candidates, (C,), from those by each touch."""
@@ -62,7 +61,7 @@ def dependence_of(held: HeldOutProbabilities) -> Dependence:
     if len(pairs) < FEWEST or len(groups) < 2:
         return Dependence()
     scores = np.array([[held.logs[first] + held.logs[second]] for first, second in pairs])
-    prior = np.array([1 / (1 + USUAL)])
+    prior = np.array([1 / (1 + DEFAULT)])
     weight = float(fit_weights(scores, [int(held.targets[first]) for first, _ in pairs], prior, PRIOR_TOUCHES)[0])
     rho = float(np.clip(1 / max(weight, TINY) - 1, 0.0, 1.0))
     return Dependence(rho, _correlation([held.novelty[rows].tolist() for rows in several]))
@@ -74,7 +73,7 @@ def _correlation(groups: Sequence[Sequence[float]]) -> float:
     means = np.array([np.mean(group) for group in groups])
     total, mean = int(counts.sum()), float(np.concatenate([np.array(group) for group in groups]).mean())
     if len(groups) < 2 or total <= len(groups):
-        return USUAL
+        return DEFAULT
     within = sum(float(np.square(np.array(group) - own).sum()) for group, own in zip(groups, means, strict=True))
     within /= total - len(groups)
     between = float((counts * np.square(means - mean)).sum()) / (len(groups) - 1)

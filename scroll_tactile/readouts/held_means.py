@@ -54,7 +54,7 @@ class HeldMeans:
         first = len(self.rows)
         last = first + len(means)
         if last > len(self._room):
-            # Room for half as many more, if there are any: materials that are asked for come one by one. All of it
+            # Room for half as many more, if there are any: requested materials come one by one. All of it
             # before any is kept: there may be no memory for it.
             room = np.empty((last if not first else last + last // 2, 2, means.shape[1]))
             room[:first] = self._room[:first]

@@ -10,7 +10,7 @@ so that all of its scores follow from products with K⁻¹ of its rows and of th
 covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses it alike, and the paper's ridge by its leverage
 matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
 
-From its own material a touch left out is further away than one to come will be: of n touches' mean, where one is new,
+A held-out touch is further away from its own material than one to come will be: of n touches' mean, where one is new,
 the squared distance is expected to be 1 + 1/n of the scatter's, where one of the n is left out 1 + 1/(n − 1). So it is
 brought to 1 − 1/n² of what it is, n the touches of the material, where calibration would otherwise rest on touches that
 look less like their own than new ones will.
@@ -29,11 +29,11 @@ import numpy.typing as npt
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.system import contrasts
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.signals.windows import Scale, measuring
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["HeldOutScores", "Sampled", "held_out_scores", "rows_at"]
+__all__ = ["HeldOutScores", "Sampled", "StageScores", "held_out_scores", "rows_at"]
 
 FloatArray = npt.NDArray[np.float64]
 Sampled = Iterable[tuple[str, bytes, SampledTouch]]
@@ -44,19 +44,62 @@ TOGETHER = 32  # touches: each step of all at once takes 8 MB
 
 @dataclass(frozen=True)
 class HeldOutScores:
-    """What a scale says of the sampled touches, each left out, of N rows and the R reference materials.
+    """Scores by one scale of the sampled touches, each held out: N rows, R reference materials.
 
     rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
     about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
     diagonal_distances: shape (N,), see `Readout.diagonal_distance`, from the material of the highest score.
     """
 
+    scale: Scale
     rows: dict[tuple[int, int], int]
     names: list[str]
     scores: FloatArray
     z: FloatArray
     distances: FloatArray
     diagonal_distances: FloatArray
+
+
+class StageScores:
+    """Scores by S scales at one stage of the N sampled touches that all of them held out.
+
+    names: the C materials that are references of all scales, in alphabetical order. places: of the touches in the
+    sample, ascending; none where there are fewer than two materials. keys: their content hashes. targets: the place of
+    each one's material among the names, (N,).
+    """
+
+    def __init__(self, stage: int, sample: Sampled, held_out: Sequence[HeldOutScores]) -> None:
+        self._held_out, touches = held_out, list(sample)
+        self.names = sorted(set.intersection(*(set(one.names) for one in held_out)))
+        reached = [{touch for touch, number in one.rows if number == stage} for one in held_out]
+        self.places = sorted(set.intersection(*reached)) if len(self.names) > 1 else []
+        self.keys = [touches[place][1] for place in self.places]
+        self.targets = np.array([self.names.index(touches[place][0]) for place in self.places], dtype=np.intp)
+        self._rows = [np.array([one.rows[place, stage] for place in self.places], dtype=np.intp) for one in held_out]
+        self._columns = [np.array([one.names.index(name) for name in self.names], dtype=np.intp) for one in held_out]
+
+    def scores(self) -> FloatArray:
+        """Scores of the materials, (N, S, C)."""
+        return self._picked([one.scores for one in self._held_out])
+
+    def z(self) -> FloatArray:
+        """z of the materials about their mean, (N, S, C)."""
+        return self._picked([one.z for one in self._held_out])
+
+    def distances(self) -> FloatArray:
+        """The relative Mahalanobis distance if that material is the nearest, at the scales that measure novelty."""
+        picked = self._picked([one.distances for one in self._held_out])
+        # In one order in memory: the bits of a mean over touches depend on it.
+        return np.ascontiguousarray(picked[:, measuring([one.scale for one in self._held_out])])
+
+    def diagonal_distances(self) -> FloatArray:
+        """Diagonal distances from the material of the highest score, (N, S)."""
+        found = [one.diagonal_distances[rows] for one, rows in zip(self._held_out, self._rows, strict=True)]
+        return np.stack(found, axis=1)
+
+    def _picked(self, values: Sequence[FloatArray]) -> FloatArray:
+        found = zip(values, self._rows, self._columns, strict=True)
+        return np.stack([own[np.ix_(rows, columns)] for own, rows, columns in found], axis=1)
 
 
 def held_out_scores(
@@ -99,7 +142,7 @@ def held_out_scores(
         parts.append(leaving.out(rows, weights, owners, None if queries is None else scored))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
     diagonal = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
-    return HeldOutScores(index, names, joined[0], joined[1], joined[2], diagonal)
+    return HeldOutScores(readout.scale, index, names, joined[0], joined[1], joined[2], diagonal)
 
 
 def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:

@@ -1,6 +1,6 @@
 """Readouts: discriminants of one scale, solved once from the exact statistics and followed from touch to touch.
 
-With class means m_y, the scatter within classes S_w of N rows and its shrinkage ρ (see `shrinkage`), Σ⁻¹ = γ K⁻¹ with
+With class means m_y, the scatter within classes S_w of N rows and its shrinkage ρ (see `task`), Σ⁻¹ = γ K⁻¹ with
 K = S_w + P I, P = ρ / (1 − ρ) tr S_w / d and γ = N / (1 − ρ). All that answers need of a row x are
 
     z_y = γ m_yᵀ K⁻¹ x,    g_y = γ m_yᵀ K⁻¹ m_y,    G = γ M K⁻¹ Mᵀ of some reference materials,
@@ -23,15 +23,14 @@ H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.derived import Derived
 from scroll_tactile.readouts.held_means import HeldMeans, class_means
-from scroll_tactile.readouts.many_materials import ManyMaterials
-from scroll_tactile.readouts.pruning import likeliest
+from scroll_tactile.readouts.pruning import ManyMaterials, likeliest
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
@@ -45,8 +44,8 @@ ReadoutName = Literal["lda", "ridge"]
 Change = tuple[str, npt.NDArray[np.int32], int]
 """A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
-EAGER = 1024  # materials: of no more than these all are solved for at once, of others those that are asked for
-MOST_HELD = 2 * EAGER  # then those that were asked for are let go
+EAGER = 1024  # materials: of no more than these all are solved for at once, of others the requested ones
+MOST_HELD = 2 * EAGER  # then the requested ones are let go
 
 
 def held_at_first(reference: Places, count: int) -> Places:
@@ -70,13 +69,26 @@ class Numbers(NamedTuple):
     precision: FloatArray
 
 
+@dataclass(frozen=True)
+class Derived:
+    """What ridge and novelty need of a readout as it is at one moment.
+
+    gram: G of the reference materials about their mean, shape (R, R). background: H. towards: what is taken off z
+    beside its mean to bring it about the mean of the reference materials, shape (R,).
+    """
+
+    gram: FloatArray
+    background: FloatArray
+    towards: FloatArray
+
+
 class Readout:
     """The readout of one scale: of a task, and of the touches that came and went since.
 
     names: the materials; one is known by its place among them. The numbers are those of `Numbers`.
 
-    Any number of threads may ask one of at most EAGER materials at once, and one thread one of more. It follows where
-    nobody asks: otherwise a copy does.
+    Any number of threads may read one of at most EAGER materials at once, and one thread one of more. It follows
+    where nobody reads it: otherwise a copy does.
 
     Some materials are held, with all that scores need: the reference first. The others are read from `statistics`.
     """
@@ -252,10 +264,17 @@ class Readout:
 
     def derived(self) -> Derived:
         """What the answers of this moment need, made again after a change."""
-        found = self._derived
-        if found is None:
-            self._derived = found = Derived.of(self)
-        return found
+        if self._derived is None:
+            shares, (means, solved) = self.shares, self.means_solved()
+            with one_thread():
+                gram = self.gamma * (means @ solved.T)
+                gram = (gram + gram.T) / 2
+                onto = gram @ shares
+                size = float(shares @ onto)
+                gram = gram - onto[:, None] - onto + size
+                background = np.linalg.inv(np.diag(1.0 / ((1 - self.share) * shares)) + gram)
+            self._derived = Derived(gram, (background + background.T) / 2, onto - size)
+        return self._derived
 
     def _reference_z(self, codes: FloatArray) -> FloatArray:
         """z of the reference materials about the origin, shape (R,)."""

@@ -1,27 +1,41 @@
-"""What a readout is solved from, taken of the statistics at one moment."""
+"""How a readout is made: solved from the statistics of one moment, or read from the arrays of an earlier one.
+
+Shrinkage is in closed form: how far the scatter within materials is drawn to a multiple of the identity.
+
+With S = S_w / N of n touches, Σ = (1 − ρ) S + ρ (tr S / d) I, and ρ of least expected squared error where features are
+normally distributed (the oracle approximating shrinkage of Chen, Wiesel, Eldar and Hero 2010, IEEE Trans. Signal
+Processing 58, equation 23):
+
+    ρ = [(1 − 2/d) tr S² + tr² S] / [(n + 1 − 2/d) (tr S² − tr² S / d)].
+
+It needs S alone, so there is nothing to hold out and nothing to choose.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.held_means import HeldMeans, class_means
 from scroll_tactile.readouts.readout import Numbers, Readout, held_at_first
-from scroll_tactile.readouts.shrinkage import shrinkage
 from scroll_tactile.readouts.system import System
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
-__all__ = ["Task"]
+__all__ = ["LARGEST", "LEAST", "Task", "readout_from_arrays", "readout_to_arrays", "shrinkage"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FIRST_KNOWN = 256  # materials
+# Below the first the solution would lose more digits than the 1e-9 that it is good for; above the second nothing would
+# be left of S. A memory of a million touches stays above the first.
+LEAST, LARGEST = 1e-4, 0.99
 
 
 @dataclass(frozen=True)
@@ -89,3 +103,47 @@ class Task:
             held.add(places, means, system.solve(means))
         numbers = Numbers(self.reference, origin, counts, share, penalty, precision)
         return Readout(self.scale, self.names, statistics, system, held, numbers)
+
+
+def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
+    """ρ, so many times, of a scatter in any unit, (d, d), of which the lower triangle is read, of so many touches."""
+    dimension = len(scatter)
+    diagonal = np.diagonal(scatter)
+    trace = float(diagonal.sum())
+    below = sum(float(row[:i] @ row[:i]) for i, row in enumerate(scatter))  # no copy of 8 MB
+    squares = 2.0 * below + float(diagonal @ diagonal)
+    spread = squares - trace**2 / dimension  # zero where S is a multiple of the identity already
+    if not spread > 0:
+        return LARGEST
+    ratio = ((1 - 2 / dimension) * squares + trace**2) / ((touches + 1 - 2 / dimension) * spread)
+    return float(min(max(times * ratio, LEAST), LARGEST))
+
+
+def readout_to_arrays(readout: Readout) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a readout.
+
+    reference: places, (R,). held: places in the order of what is held, (H,). rows: their means about the origin,
+    and K⁻¹ times these, (H, 2, d). sizes: (H,). origin, precision: (d,). counts: (C,). shape: share and penalty.
+    """
+    held = readout.held_means
+    return {
+        "reference": readout.reference,
+        "held": np.array(held.places, dtype=np.int64),
+        "rows": held.pairs,
+        "sizes": held.sizes,
+        "origin": readout.origin,
+        "precision": readout.precision,
+        "counts": readout.counts,
+        "shape": np.array([readout.share, readout.penalty]),
+    }
+
+
+def readout_from_arrays(
+    scale: Scale, names: Sequence[str], arrays: Mapping[str, npt.NDArray[Any]], statistics: Statistics
+) -> Readout:
+    """The readout of which `readout_to_arrays` gave the arrays, which are taken over; it can follow nothing."""
+    reference, origin, counts, precision = (arrays[name] for name in ("reference", "origin", "counts", "precision"))
+    share, penalty = arrays["shape"].tolist()
+    numbers = Numbers(reference, origin, counts, share, penalty, precision)
+    held = HeldMeans(arrays["held"].tolist(), arrays["rows"], arrays["sizes"])
+    return Readout(scale, names, statistics, System.unkept(len(origin)), held, numbers)

@@ -22,7 +22,7 @@ from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.prediction.held_out_touches import HeldOutTouch, held_out_touches
+from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.report.drawing import as_counted
 from scroll_tactile.report.growing import Growing, Soon, chosen, growing, soon

@@ -12,9 +12,8 @@ from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule
 from scroll_tactile.matching.match import KeptTouch
-from scroll_tactile.prediction.answer import answer
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.held_out_touches import HeldOutTouch
+from scroll_tactile.prediction.judging import HeldOutTouch, answer
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.readouts.leave_one_out import rows_at
@@ -89,15 +88,13 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
         for touch in np.flatnonzero(reached & ~done).tolist():
             name, chance = str(best[touch]), float(chances[touch].max())
             known = bool(novelty[touch] <= threshold)
-            prediction = Prediction(
-                name, chance, ((name, chance),), float(novelty[touch]), known, moment.columns / rate
-            )
-            if rule.decided(prediction, moment.columns):
+            prediction = Prediction(name, chance, ((name, chance),), float(novelty[touch]), known, moment.steps / rate)
+            if rule.decided(prediction, moment.steps):
                 done[touch], wrong[touch] = True, not known or best[touch] != said.targets[touch]
         right.append(float((best == said.targets)[reached].mean()) if reached.any() else 0.0)
         decided.append(float(done.mean()))
         mistaken.append(float(wrong.mean()))
-    seconds = tuple(moment.columns / rate for moment in moments)
+    seconds = tuple(moment.steps / rate for moment in moments)
     return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(said.targets))
 
 
@@ -184,4 +181,4 @@ def _answers(
         beginning = stream.first(count / sensor.rate)
         encoded = extractor.encode(beginning, model.longest, lambda columns: model.scales_for(names, columns))
         prediction = answer(model, extractor, names, [(encoded, None)], learner.settings.false_alarms)
-        yield encoded.columns, prediction
+        yield encoded.steps, prediction

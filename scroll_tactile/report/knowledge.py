@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.prediction.held_out_touches import HeldOutTouch
+from scroll_tactile.prediction.judging import HeldOutTouch
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.report.charts import Bin
 from scroll_tactile.statistics.moments import one_thread

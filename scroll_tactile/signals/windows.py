@@ -3,7 +3,7 @@
 An embedding of a whole stream is lost when a touch is shorter or longer than those learned from. So a stream is read in
 windows of 0.3 s and of three quarters of the usual duration, and each of these scales has statistics of its own. A
 stream is known from its first 0.3 s on, and better with every reading. Windows in seconds are lost when a touch is made
-faster or slower: beside them the whole of it is read in its own time (see `views`).
+faster or slower: beside them the whole of it is read in its own time (see `image`).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ __all__ = [
     "WindowPlan",
     "extent",
     "fitting",
+    "measuring",
     "milestones",
     "scales",
     "scored",
@@ -59,7 +60,7 @@ class Scale:
     """A kind of features that has statistics of its own.
 
     kind: "window" for windows of `width` columns; without a width the views of a whole touch: "whole" for it as it is,
-    "competing" for it read by competing kernels, "shape" for what `signals.views` makes of it.
+    "competing" for it read by competing kernels, "shape" for what `signals.image` makes of it.
 
     Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it. A window's
     is its width.
@@ -72,15 +73,6 @@ class Scale:
     def numbered(cls, number: int) -> Scale:
         """The scale of a number on disk."""
         return {int(view): view for view in (WHOLE, SHAPE, COMPETING)}.get(number) or cls("window", number)
-
-    @property
-    def measures_novelty(self) -> bool:
-        """Whether distances at it say how new a touch is, or how far off.
-
-        With those of competing kernels, counts that are mostly 0, the learner called 1.6 % more of the touches of eight
-        series unknown, and 10 % more of RoboSkin's with a fifth of the channels dead.
-        """
-        return self.kind != "competing"
 
     def __hash__(self) -> int:
         return self.width  # scales are looked up a hundred times a touch
@@ -96,6 +88,15 @@ class Scale:
 
 
 WHOLE, SHAPE, COMPETING = Scale("whole"), Scale("shape"), Scale("competing")
+
+
+def measuring(scales: Sequence[Scale]) -> list[int]:
+    """The places of those scales at which distances say how new a touch is, or how far off: all but "competing".
+
+    With the distances of competing kernels, counts that are mostly 0, the learner called 1.6 % more of the touches of
+    eight series unknown, and 10 % more of RoboSkin's with a fifth of the channels dead.
+    """
+    return [place for place, scale in enumerate(scales) if scale != COMPETING]
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:

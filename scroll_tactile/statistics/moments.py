@@ -45,126 +45,20 @@ def require_room(rows: int, more: int) -> None:
 
 
 class SecondMoment:
-    """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is kept, row after row.
+    """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is asked for, row after row.
 
-    While there are no more rows than features, they are kept themselves: they say what A is in half the numbers or
-    less, and take a fraction of its bytes on a disk. The triangle is formed when it is asked for. Of more rows a block
-    of at most 512 waits to be added to it.
+    While there are no more rows than features, the rows themselves are kept (`_Rows`): they say what A is in half the
+    numbers or less, and take a fraction of its bytes on a disk. From then on the triangle is kept (`_Triangle`).
 
     Products are formed by BLAS in float64, of 512 rows at a time: products of integers below 2²¹ and their sums below
     2⁵³ are exact there, in any order and with any number of threads. The triangle is never changed in place: whoever
     has it keeps it as it is, and what is cut short by ctrl-C has changed nothing.
     """
 
-    def __init__(self, dimension: int) -> None:
+    def __init__(self, dimension: int, rows: int = 0, kept: _Rows | _Triangle | None = None) -> None:
         self.dimension = dimension
-        self.rows = 0
-        self._packed: IntArray | None = None
-        self._whole = True  # whether all rows are there
-        self._late: Callable[[], IntArray | Codes] | None = None  # the first rows where it is whole, or the triangle
-        self._codes: Codes | None = None
-        self._count = 0  # of rows there
-        self._formed = 0  # of them, in the triangle
-
-    def add(self, codes: Codes) -> None:
-        """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
-        require_room(self.rows, len(codes))
-        for first in range(0, len(codes), BLOCK):
-            block = codes[first : first + BLOCK]
-            if self._whole and self.rows + len(block) > self.dimension:
-                self._give_up_rows()
-            self._wait(block)
-            self.rows += len(block)
-
-    def _give_up_rows(self) -> None:
-        packed = self.packed()
-        self._packed, self._whole, self._codes, self._count, self._formed = packed, False, None, 0, 0
-
-    def _wait(self, codes: Codes) -> None:
-        if not self._whole and self._count + len(codes) > BLOCK:
-            self._form()
-        last = self._count + len(codes)
-        if self._codes is None or len(self._codes) < last:
-            most = self.dimension if self._whole else BLOCK
-            longer = np.empty((min(most, max(2 * self._count, last, FIRST)), self.dimension), dtype=np.int32)
-            if self._codes is not None:
-                longer[: self._count] = self._codes[: self._count]
-            self._codes = longer
-        self._codes[self._count : last] = codes
-        self._count = last
-
-    def remove(self, codes: Codes) -> None:
-        """Take rows out again that were added, shape (rows, d): as if they had never been."""
-        own = self.codes()
-        left = None if own is None else _without(own, codes)
-        packed = self._packed
-        if packed is not None or left is None:
-            packed = self.packed().copy()
-            for first in range(0, len(codes), BLOCK):
-                _add_product(packed, codes[first : first + BLOCK], np.subtract)
-        count = 0 if left is None else len(left)
-        self._packed, self._whole, self._codes, self._count = packed, left is not None, left, count
-        self._formed, self.rows = 0 if packed is None else count, self.rows - len(codes)
-
-    def _read(self) -> None:
-        """Read what was left for later."""
-        if self._late is None:
-            return
-        found = self._late()
-        if self._whole:
-            rows = np.concatenate([found.astype(np.int32, copy=False), *self._there()])
-            self._codes, self._count, self._late = rows, len(rows), None
-        else:
-            self._packed, self._late = found.astype(np.int64, copy=False), None
-
-    def _there(self) -> list[Codes]:
-        return [] if self._codes is None else [self._codes[: self._count]]
-
-    def _form(self) -> None:
-        """Add the rows that are not in the triangle to it."""
-        self._read()
-        packed = self._packed
-        if packed is None:
-            packed = np.zeros(self.dimension * (self.dimension + 1) // 2, dtype=np.int64)
-        for rows in self._there():
-            packed = packed.copy() if packed is self._packed and len(rows) > self._formed else packed
-            for first in range(self._formed, len(rows), BLOCK):
-                _add_product(packed, rows[first : first + BLOCK], np.add)
-        if self._whole:
-            self._packed, self._formed = packed, self._count
-        else:
-            self._packed, self._codes, self._count = packed, None, 0
-
-    def packed(self) -> IntArray:
-        """The lower triangle of A as it is now, row after row, shape (d·(d+1)/2,): not to be changed."""
-        self._form()
-        assert self._packed is not None
-        return self._packed
-
-    def codes(self) -> Codes | None:
-        """All rows, (rows, d), in an order that does not depend on the one they came in; None where they are not there.
-
-        Not to be changed.
-        """
-        if not self._whole:
-            return None
-        self._read()
-        rows = np.concatenate([np.zeros((0, self.dimension), dtype=np.int32), *self._there()])
-        return rows[sorted(range(len(rows)), key=[row.tobytes() for row in rows].__getitem__)]
-
-    def undo(self) -> Callable[[], None]:
-        """What takes the next `add` back, however much of it was done; it can be called again."""
-        state = self._packed, self._whole, self._late, self._codes, self._count, self._formed, self.rows
-
-        def undo() -> None:
-            self._packed, self._whole, self._late, self._codes, self._count, self._formed, self.rows = state
-
-        return undo
-
-    @property
-    def empty(self) -> bool:
-        """Whether no row was ever added; then `packed` would only make zeros."""
-        return self._packed is None and self._late is None and not self._count
+        self.rows = rows
+        self._kept: _Rows | _Triangle = _Rows(dimension) if kept is None else kept
 
     @classmethod
     def of(cls, packed: IntArray | Callable[[], IntArray], rows: int, dimension: int) -> SecondMoment:
@@ -172,36 +66,153 @@ class SecondMoment:
 
         packed: or what reads the triangle, called when it is needed, and again where that failed.
         """
-        moment = cls(dimension)
-        moment.rows, moment._whole = rows, False
-        if callable(packed):
-            moment._late = packed
-        else:
-            moment._packed = packed
-        return moment
+        return cls(dimension, rows, _Triangle(dimension, packed))
 
     @classmethod
     def of_codes(cls, codes: Codes | Callable[[], Codes], rows: int, dimension: int) -> SecondMoment:
         """A second moment of given rows, at most `dimension`, which it takes over; or of what reads them (see `of`)."""
-        moment = cls(dimension)
-        moment.rows = rows
-        if callable(codes):
-            moment._late = codes
-        else:
-            moment._codes, moment._count = codes, rows
-        return moment
+        return cls(dimension, rows, _Rows(dimension, codes))
+
+    def add(self, codes: Codes) -> None:
+        """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
+        require_room(self.rows, len(codes))
+        for first in range(0, len(codes), BLOCK):
+            block = codes[first : first + BLOCK]
+            if isinstance(self._kept, _Rows) and self.rows + len(block) > self.dimension:
+                self._kept = _Triangle(self.dimension, self._kept.packed())
+            self._kept.add(block)
+            self.rows += len(block)
+
+    def remove(self, codes: Codes) -> None:
+        """Take rows out again that were added, shape (rows, d): as if they had never been."""
+        self._kept = self._kept.without(codes)
+        self.rows -= len(codes)
+
+    def packed(self) -> IntArray:
+        """The lower triangle of A as it is now, row after row, shape (d·(d+1)/2,): not to be changed."""
+        return self._kept.packed()
+
+    def codes(self) -> Codes | None:
+        """All rows, (rows, d), in an order that does not depend on the one they came in; None where they are not there.
+
+        Not to be changed.
+        """
+        return self._kept.codes() if isinstance(self._kept, _Rows) else None
+
+    def undo(self) -> Callable[[], None]:
+        """What takes the next `add` back, however much of it was done; it can be called again."""
+        kept, state, rows = self._kept, dict(self._kept.__dict__), self.rows
+
+        def undo() -> None:
+            kept.__dict__.update(state)
+            self._kept, self.rows = kept, rows
+
+        return undo
 
     def joined(self, other: SecondMoment, sign: int) -> SecondMoment:
         """This one and another; with a sign of −1 this one without the other."""
-        rows = self.rows + sign * other.rows
-        if self._whole and other._whole and rows <= self.dimension:
-            ours, theirs = self.codes(), other.codes()
-            assert ours is not None
-            assert theirs is not None
+        rows, ours, theirs = self.rows + sign * other.rows, self.codes(), other.codes()
+        if ours is not None and theirs is not None and rows <= self.dimension:
             both = np.concatenate([ours, theirs]) if sign > 0 else _without(ours, theirs)
             if both is not None:
                 return SecondMoment.of_codes(both, rows, self.dimension)
         return SecondMoment.of(self.packed() + sign * other.packed(), rows, self.dimension)
+
+
+class _Rows:
+    """All rows of a second moment, at most as many as features, with room for more; read when they are first needed."""
+
+    def __init__(self, dimension: int, codes: Codes | Callable[[], Codes] | None = None) -> None:
+        self._dimension = dimension
+        self._late = codes if callable(codes) else None
+        self._codes = np.empty((0, dimension), dtype=np.int32) if codes is None or callable(codes) else codes
+        self._count = len(self._codes)
+        self._packed: IntArray | None = None
+        self._formed = 0  # of the rows, in the triangle
+
+    def add(self, codes: Codes) -> None:
+        """Add rows."""
+        last = self._count + len(codes)
+        if len(self._codes) < last:
+            longer = np.empty((min(self._dimension, max(2 * self._count, last, FIRST)), self._dimension), np.int32)
+            longer[: self._count] = self._codes[: self._count]
+            self._codes = longer
+        self._codes[self._count : last] = codes
+        self._count = last
+
+    def _read(self) -> Codes:
+        """The rows that are there, read where that was left for later."""
+        if self._late is not None:
+            rows = np.concatenate([self._late().astype(np.int32, copy=False), self._codes[: self._count]])
+            self._codes, self._count, self._late = rows, len(rows), None
+        return self._codes[: self._count]
+
+    def packed(self) -> IntArray:
+        """The lower triangle."""
+        rows = self._read()
+        if self._packed is None or self._formed < len(rows):
+            packed = _zeros(self._dimension) if self._packed is None else self._packed.copy()
+            _add_products(packed, rows[self._formed :], np.add)
+            self._packed, self._formed = packed, len(rows)
+        return self._packed
+
+    def codes(self) -> Codes:
+        """The rows in the order of their bytes."""
+        rows = self._read()
+        return rows[sorted(range(len(rows)), key=[row.tobytes() for row in rows].__getitem__)]
+
+    def without(self, codes: Codes) -> _Rows | _Triangle:
+        """The same without some rows; of rows that are not all there the sums that are left."""
+        left = _without(self.codes(), codes)
+        if left is not None and self._packed is None:
+            return _Rows(self._dimension, left)
+        packed = self.packed().copy()
+        _add_products(packed, codes, np.subtract)
+        if left is None:
+            return _Triangle(self._dimension, packed)
+        rows = _Rows(self._dimension, left)
+        rows._packed, rows._formed = packed, len(left)
+        return rows
+
+
+class _Triangle:
+    """The lower triangle of a second moment, and a block of at most 512 rows that waits to be added to it."""
+
+    def __init__(self, dimension: int, packed: IntArray | Callable[[], IntArray]) -> None:
+        self._dimension, self._packed = dimension, packed
+        self._waiting = np.empty((0, dimension), dtype=np.int32)
+        self._count = 0  # of rows that wait
+
+    def add(self, codes: Codes) -> None:
+        """Add at most 512 rows."""
+        if self._count + len(codes) > BLOCK:
+            self.packed()
+        last = self._count + len(codes)
+        if len(self._waiting) < last:
+            longer = np.empty((min(BLOCK, max(2 * self._count, last, FIRST)), self._dimension), np.int32)
+            longer[: self._count] = self._waiting[: self._count]
+            self._waiting = longer
+        self._waiting[self._count : last] = codes
+        self._count = last
+
+    def packed(self) -> IntArray:
+        """The lower triangle, with all rows that waited."""
+        packed = self._packed().astype(np.int64, copy=False) if callable(self._packed) else self._packed
+        if self._count:
+            packed = packed.copy()
+            _add_products(packed, self._waiting[: self._count], np.add)
+        self._packed, self._waiting, self._count = packed, self._waiting[:0], 0
+        return packed
+
+    def without(self, codes: Codes) -> _Triangle:
+        """The same without some rows."""
+        packed = self.packed().copy()
+        _add_products(packed, codes, np.subtract)
+        return _Triangle(self._dimension, packed)
+
+
+def _zeros(dimension: int) -> IntArray:
+    return np.zeros(dimension * (dimension + 1) // 2, dtype=np.int64)
 
 
 def _without(rows: Codes, gone: Codes) -> Codes | None:
@@ -216,10 +227,14 @@ def _without(rows: Codes, gone: Codes) -> Codes | None:
     return None if +left else rows[stay]
 
 
-def _add_product(packed: IntArray, codes: npt.NDArray[np.int32], put: np.ufunc) -> None:
+def _add_products(packed: IntArray, codes: Codes, put: np.ufunc) -> None:
     """Add the lower triangle of codesᵀ · codes to `packed`, exact; or, with np.subtract for `put`, take it out."""
-    rows = codes.astype(np.float64)
-    places = list(_rows_of_triangle(codes.shape[1]))
+    for first in range(0, len(codes), BLOCK):
+        _add_product(packed, codes[first : first + BLOCK].astype(np.float64), put)
+
+
+def _add_product(packed: IntArray, rows: FloatArray, put: np.ufunc) -> None:
+    places = list(_rows_of_triangle(rows.shape[1]))
     for first in range(0, len(places), ROWS):
         last = min(first + ROWS, len(places))
         with one_thread():

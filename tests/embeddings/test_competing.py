@@ -11,9 +11,15 @@ from touches import PAD
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.embeddings.banks import HEAVY, LEVELS, MOST_CHANNELS, TAPS, bank, to_levels
-from scroll_tactile.embeddings.competing import GROUP, WEIGHT, counts, groups, groups_by_dilation
 from scroll_tactile.embeddings.joined import Joined
-from scroll_tactile.embeddings.kernels import _dilations
+from scroll_tactile.embeddings.kernels import (
+    GROUP,
+    WEIGHT,
+    _dilations,
+    competing_counts,
+    competing_groups,
+    groups_by_dilation,
+)
 from scroll_tactile.errors import EmbeddingError
 
 SMALL = Kernels(dimension=64)
@@ -36,7 +42,7 @@ def proportions(embedding, whole, width):
         if not number:
             continue
         own = bank(embedding.seed, len(whole), dilation)
-        of, most, least = groups(own, number), [], []
+        of, most, least = competing_groups(own, number), [], []
         for group in of.kernels.T:
             sizes = own.channels[group].sum(axis=1)
             weights = [round(WEIGHT / float(size) ** 0.5) for size in sizes]
@@ -84,11 +90,11 @@ def test_any_dimension_and_zeros_behind_the_last_group(dimension):
 
 def test_kernels_that_share_a_place_both_have_it_and_nobody_has_a_flat_one():
     own = bank(1, 2, 1)
-    of = groups(own, 2)
+    of = competing_groups(own, 2)
     flat = np.zeros((len(own.channels), 10), np.float32)
-    assert not counts(flat, of).any()
+    assert not competing_counts(flat, of).any()
     flat[of.kernels[:2, 0]] = 1.0 / of.weights[:2, 0]  # two of the first group, alike once they are weighed
-    assert counts(flat, of)[0, 0].tolist() == [10, 10, 0, 0, 0, 0, 0, 0]
+    assert competing_counts(flat, of)[0, 0].tolist() == [10, 10, 0, 0, 0, 0, 0, 0]
 
 
 def test_weighed_responses_are_exact_in_float32():
@@ -98,7 +104,7 @@ def test_weighed_responses_are_exact_in_float32():
 
 def test_every_kernel_of_a_bank_competes_before_any_does_again():
     own = bank(1, 5, 8)
-    of = groups(own, 2 * len(own) // GROUP)
+    of = competing_groups(own, 2 * len(own) // GROUP)
     once = of.kernels.T.ravel()[: len(own)]
     assert sorted(once.tolist()) == sorted(own.rows.tolist())
 

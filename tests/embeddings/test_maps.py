@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scroll_tactile import Maps
+from examples.paper.transfer.maps import Maps
 from scroll_tactile.errors import InputError
 
 

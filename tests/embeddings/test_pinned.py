@@ -9,7 +9,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, TactileLearner, sensors
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import Frames, Joined, Kernels, TactileLearner, sensors
 from scroll_tactile.embeddings.banks import bank
 from scroll_tactile.embeddings.protocol import embed_windows, window_plan
 from scroll_tactile.signals.image import tactile_image

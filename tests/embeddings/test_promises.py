@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from scroll_tactile import Frames, Joined, Kernels, Maps, ModuleEmbedding, Vision
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import Frames, Joined, Kernels, ModuleEmbedding, Vision
 from scroll_tactile.embeddings.protocol import embed_windows, is_embedding
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError

@@ -45,10 +45,10 @@ import numpy as np
 import scroll_tactile.learner
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
-import scroll_tactile.prediction.answer
 import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.model
+import scroll_tactile.prediction.predictor
 import scroll_tactile.readouts.readout
 from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of
@@ -154,7 +154,7 @@ LOCAL = threading.local()
 @contextmanager
 def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
     """While it lasts each answer is asked for twice of the model that gives it, which must stay as it is."""
-    own = scroll_tactile.prediction.answer.answer
+    own = scroll_tactile.prediction.predictor.answer
 
     def answer(model: Any, *rest: Any) -> Prediction:
         before, said = learned_by(model), own(model, *rest)
@@ -166,7 +166,7 @@ def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
         LOCAL.learned = before
         return said
 
-    with patch.object(scroll_tactile.prediction.answer, "answer", answer):
+    with patch.object(scroll_tactile.prediction.predictor, "answer", answer):
         yield
 
 

@@ -132,7 +132,7 @@ class Truth:
                 KeptTouch(name, key, kept_touches.levels(self.stream(key).readings))
                 for name, key in self.states[row].touches
             ]
-            self._conformal[row] = Conformal(kept)
+            self._conformal[row] = Conformal.of(kept)
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
         found = [self._conformal[row].p_values(kept_touches.levels(once[key].readings)) for key in sorted(once)]
         if len(found) == 1:

@@ -53,7 +53,7 @@ def plain(touches, conformal, asked, reach):
 @pytest.mark.parametrize("columns", [COLUMNS, 13])
 def test_p_values_are_those_of_the_definition(columns):
     touches = kept(materials=3, of_each=6)
-    conformal = Conformal(touches)
+    conformal = Conformal.of(touches)
     reach = int(np.searchsorted(conformal._edges[1:], columns, side="right"))
     for seed in range(50, 54):
         asked = touch(seed % 3, seed, columns)
@@ -68,7 +68,7 @@ def test_each_material_is_covered(error, columns):
     """Over the choice of what is kept, too: of any one choice coverage is off by that of 25 touches."""
     held, of_all = {f"m{material}": [] for material in range(4)}, []
     for draw in range(30):
-        conformal = Conformal(kept(first=1000 * draw))
+        conformal = Conformal.of(kept(first=1000 * draw))
         for name, found in held.items():
             asked = [touch(int(name[1]), 1000 * draw + 500 + i, columns) for i in range(10)]
             values = [conformal.p_values(levels)[name] for levels in asked]
@@ -84,7 +84,7 @@ def test_each_material_is_covered(error, columns):
 def test_crepes_finds_the_same_on_the_same_scores():
     crepes = pytest.importorskip("crepes")
     touches, seeds = kept(), range(100, 110)
-    conformal = Conformal(touches)
+    conformal = Conformal.of(touches)
     for seed in seeds:
         asked, own = touch(seed % 4, seed), f"m{seed % 4}"
         ours = conformal.p_values(asked)
@@ -100,41 +100,43 @@ def test_crepes_finds_the_same_on_the_same_scores():
 def test_any_order_and_any_way_to_it_gives_the_same_bytes():
     touches = kept(of_each=8)
     asked = touch(1, 200, 25)
-    first = Conformal(touches).p_values(asked)
-    assert Conformal(touches[::-1]).p_values(asked) == first
-    followed = Conformal([*touches[:20], touches[-1]])
+    first = Conformal.of(touches).p_values(asked)
+    assert Conformal.of(touches[::-1]).p_values(asked) == first
+    followed = Conformal.of([*touches[:20], touches[-1]])
     followed.p_values(asked)  # so that it has distances to follow
     followed.follow(touches[20:-1], set())
     assert followed.p_values(asked) == first
     gone = {(touch.material, touch.key) for touch in touches[3:6]}
     followed.follow([], gone)
     left = [touch for touch in touches if (touch.material, touch.key) not in gone]
-    assert followed.p_values(asked) == Conformal(left).p_values(asked)
+    assert followed.p_values(asked) == Conformal.of(left).p_values(asked)
     followed.follow(touches[3:6], set())
     assert followed.p_values(asked) == first
 
 
 def test_few_touches_exclude_nothing_and_one_material_is_always_typical():
     strange = np.full((CHANNELS, COLUMNS), 250, np.uint8)
-    few, enough = (Conformal(kept(of_each=count)).p_values(strange).values() for count in (18, 19))
+    few, enough = (Conformal.of(kept(of_each=count)).p_values(strange).values() for count in (18, 19))
     assert min(few).share > 0.05 >= min(enough).share
     assert {value.least for value in few} == {1 / 19}
     assert max(value.of_all for value in few) <= 0.05  # of all materials together there are enough
-    alone = Conformal(kept(materials=1, of_each=5))
+    alone = Conformal.of(kept(materials=1, of_each=5))
     assert 0 < alone.p_values(touch(0, 99))["m0"].share <= 1
-    assert min(Conformal(kept(materials=2, of_each=1)).p_values(touch(0, 99)).values()).share >= 0.5
+    assert min(Conformal.of(kept(materials=2, of_each=1)).p_values(touch(0, 99)).values()).share >= 0.5
 
 
 def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
     touches = kept(of_each=20)
     assert set(
-        Conformal([KeptTouch("m", b"0", np.zeros((1, 10_000), np.uint8))]).p_values(np.zeros((1, 2), np.uint8)).values()
+        Conformal.of([KeptTouch("m", b"0", np.zeros((1, 10_000), np.uint8))])
+        .p_values(np.zeros((1, 2), np.uint8))
+        .values()
     ) == {(1.0, 1.0, 1.0, 1.0)}
-    conformal = Conformal(touches)
+    conformal = Conformal.of(touches)
     gap = touch(2, 300).copy()
     gap[0, 5:30] = MISSING
     assert conformal.p_values(gap)["m2"].share > 0.05
     gap[:] = MISSING
     assert set(conformal.p_values(gap)) == {"m0", "m1", "m2", "m3"}
-    ragged = Conformal([*touches[:-1], KeptTouch("m3", b"s", touch(3, 400, 15))])
+    ragged = Conformal.of([*touches[:-1], KeptTouch("m3", b"s", touch(3, 400, 15))])
     assert ragged.p_values(touch(3, 401))["m3"].share > 0.05

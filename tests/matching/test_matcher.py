@@ -6,11 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
 from scroll_tactile.matching.match import KeptTouch
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import TouchMatcher, matcher_of
 from scroll_tactile.sensors import Sensor
 
 CHANNELS, READINGS, MATERIALS = 8, 120, 5
@@ -170,10 +169,8 @@ def test_whatever_comes_and_goes_it_holds_what_a_set_would(toggled, rng):
     assert near(matcher.match(asked), anew.match(asked))
     for row in range(len(matcher.kept)):
         mine = next(stay for stay in stays if matcher.kept.rows()[stay.key] == row)
-        assert (matcher.kept.material(row), matcher.kept.levels(row).tobytes()) == (
-            mine.material,
-            mine.levels.tobytes(),
-        )
+        assert matcher.kept.touches[row] == (mine.material, mine.key)
+        assert matcher.kept.levels(row).tobytes() == mine.levels.tobytes()
 
 
 def test_what_cannot_be_followed_says_so():

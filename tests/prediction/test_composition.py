@@ -9,8 +9,7 @@ import pytest
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import DescriptionError, MaterialError
 from scroll_tactile.memory.descriptions import checked, targets_of
-from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.constituents import ConstituentHead, StageHeads
+from scroll_tactile.prediction.composition import Composer, ConstituentHead, StageHeads
 from scroll_tactile.readouts.attributes import Curve
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)

@@ -9,8 +9,7 @@ from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace
-from scroll_tactile.prediction.held_out_touches import held_out_touches
-from scroll_tactile.prediction.judging import judged
+from scroll_tactile.prediction.judging import held_out_touches, judged
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.report.growing import _without
 from scroll_tactile.simulation.scene import Scene
@@ -91,9 +90,9 @@ def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model
         stream = stream_of(fusion.matcher.kept.levels(rows[touch.key]), SKIN)
         with _without(model, touch) as other, one_thread():
             for i, moment in enumerate(fusion.moments[:-1]):
-                beginning = stream.first(moment.columns / SKIN.rate)
+                beginning = stream.first(moment.steps / SKIN.rate)
                 encoded = extractor.encode(beginning, model.longest, lambda at: model.scales_for(NAMES, at))
-                alone = other.judge(sorted(NAMES), encoded.means, moment.columns, "beginning")
+                alone = other.judge(sorted(NAMES), encoded.means, moment.steps, "prefix")
                 found = judged(other, extractor, sorted(NAMES), encoded)
                 if alone.probability.max() < 0.99:
                     own = said.chances[keys.index(touch.key), i]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.matching.deviation import matcher_of
 from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.match import KeptTouch, Match
+from scroll_tactile.matching.matcher import matcher_of
 from scroll_tactile.prediction.fusion import (
     PRIOR_OUTLIERS,
     HeldOutMoment,
@@ -15,8 +15,7 @@ from scroll_tactile.prediction.fusion import (
     moments_of,
 )
 from scroll_tactile.prediction.moments import Moment, tempered
-from scroll_tactile.readouts.calibration import FEWEST, Calibration
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import FEWEST, Calibration, HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]
 C = len(NAMES)
@@ -153,10 +152,10 @@ def test_without_kept_touches_the_readouts_have_the_word():
 def test_the_moment_of_a_touch_is_the_latest_that_it_reached():
     rng = np.random.default_rng(6)
     fusion = fused(*(judged(columns, evidence(rng, KEYS), None) for columns in (10, 20, 40)))
-    assert [fusion.at(columns).columns for columns in (1, 10, 19, 20, 500)] == [10, 10, 10, 20, 40]
+    assert [fusion.at(columns).steps for columns in (1, 10, 19, 20, 500)] == [10, 10, 10, 20, 40]
     paced = [judged(columns, evidence(rng, KEYS), None) for columns in (20, 80)]
     fusion = fuse(MATCHER, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
-    assert [fusion.at_pace(columns).columns for columns in (2, 39, 41, 900)] == [20, 20, 80, 80]
+    assert [fusion.at_pace(columns).steps for columns in (2, 39, 41, 900)] == [20, 20, 80, 80]
 
 
 def test_trajectories_are_what_is_then_said_of_the_touches():

@@ -23,7 +23,7 @@ def test_a_longer_touch_is_viewed_whole_and_its_windows_are_read_as_far_as_was_l
         features.encode(stream, longest, lambda _: plan.scales)
         for stream, longest in ((touch, 200), (touch.first(2.0), 200), (touch, 400))
     )
-    assert (found.columns, found.seconds) == (200, 2.0)
+    assert (found.steps, found.seconds) == (200, 2.0)
     for scale in plan.scales:
         expected = part if scale.kind == "window" else whole
         assert found.means.get(scale, np.zeros(0)).tobytes() == expected.means.get(scale, np.zeros(0)).tobytes()

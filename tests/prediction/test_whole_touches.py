@@ -8,7 +8,7 @@ import pytest
 from touches import Windowed
 
 from scroll_tactile import Joined, Kernels, Sensor, TactileLearner
-from scroll_tactile.signals.views import stretched
+from scroll_tactile.signals.image import stretched
 from scroll_tactile.simulation.scene import Scene
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")

@@ -18,7 +18,7 @@ from scroll_tactile.readouts.calibration import (
     fit_weights,
     scale_weights,
 )
-from scroll_tactile.readouts.leave_one_out import held_out_scores
+from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
@@ -50,9 +50,10 @@ def stages_of(statistics, pool, kind="lda", stages=STAGES):
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
     readouts = {task.scale: task.solve(statistics) for task in tasks}
     apart = {scale: held_out_scores(readout, pool, stages, kind) for scale, readout in readouts.items()}
-    materials = [material for material, *_ in pool]
     return [
-        calibrate_stage(stage, materials, [(readouts[scale], apart[scale]) for scale in scales], kind)
+        calibrate_stage(
+            StageScores(stage, pool, [apart[scale] for scale in scales]), [readouts[scale] for scale in scales], kind
+        )
         for stage, scales in enumerate(stages)
     ]
 
@@ -243,8 +244,8 @@ def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_wil
     readouts = [Task.of(statistics, scale, statistics.names(scale)).solve(statistics) for scale in SCALES]
     apart = [held_out_scores(readout, sample, STAGES, kind) for readout in readouts]
     materials = [material for material, *_ in sample]
-    scales = list(zip(readouts, apart, strict=True))
-    plain, viewed = (calibrate_stage(1, materials, scales, kind, viewed=flag) for flag in (False, True))
+    found = StageScores(1, sample, apart)
+    plain, viewed = (calibrate_stage(found, readouts, kind, viewed=flag) for flag in (False, True))
     assert np.isinf(plain.median_distances).all()
     away = np.array([[left.diagonal_distances[left.rows[i, 1]] for left in apart] for i in range(60)])
     assert viewed.median_distances.tolist() == np.median(away, axis=0).tolist()

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.dependence import USUAL, Dependence, dependence_of
-from scroll_tactile.readouts.held_out import HeldOutProbabilities
+from scroll_tactile.readouts.calibration import HeldOutProbabilities
+from scroll_tactile.readouts.dependence import DEFAULT, Dependence, dependence_of
 
 NAMES = [f"m{i}" for i in range(12)]
 
@@ -57,7 +57,7 @@ def test_it_is_of_the_set():
 
 @pytest.mark.parametrize("touches", [held([]), picked(apart(0.5), range(5))], ids=["none", "five"])
 def test_few_touches_have_the_usual(touches):
-    assert dependence_of(touches) == Dependence(USUAL, USUAL)
+    assert dependence_of(touches) == Dependence(DEFAULT, DEFAULT)
 
 
 def test_one_touch_is_what_it_is_and_any_order_gives_the_same_bits():

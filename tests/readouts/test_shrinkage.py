@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scroll_tactile.readouts.shrinkage import LARGEST, LEAST, shrinkage
+from scroll_tactile.readouts.task import LARGEST, LEAST, shrinkage
 
 
 def textbook(scatter, touches):

@@ -12,7 +12,7 @@ from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
-from scroll_tactile.prediction.held_out_touches import HeldOutTouch, held_out_touches
+from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
 from scroll_tactile.report.channels import channels_of, drift
 from scroll_tactile.report.growing import chosen, growing, soon
 from scroll_tactile.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile.signals.views import shape_image, stretched
+from scroll_tactile.signals.image import shape_image, stretched
 
 few = settings(max_examples=80, deadline=None)
 UNIT = 2**20  # steps of half the range: what the values below are whole numbers of

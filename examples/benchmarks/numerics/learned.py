@@ -12,8 +12,7 @@ from examples.benchmarks.numerics.memories import Memory
 from examples.benchmarks.numerics.truth import Answers, TrueReadout
 from scroll_tactile.readouts.leave_one_out import held_out_scores
 from scroll_tactile.readouts.readout import Change, Readout
-from scroll_tactile.readouts.shrinkage import LARGEST, LEAST
-from scroll_tactile.readouts.task import Task
+from scroll_tactile.readouts.task import LARGEST, LEAST, Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample

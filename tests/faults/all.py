@@ -54,14 +54,15 @@ def main() -> int:
     made = parser(__doc__, seed=None)
     made.add_argument("--only", nargs="*", default=STUDIES, metavar="STUDY")
     options = made.parse_args()
-    more = [f"--{name}={value}" for name in ("seed", "home") if (value := getattr(options, name)) is not None]
-    more += ["--quick"] if options.quick else []
+    more = [*(["--quick"] if options.quick else []), *([f"--home={options.home}"] if options.home else [])]
     warm()
     records = {}
     with tempfile.TemporaryDirectory() as scratch:
         for number, name in enumerate(options.only):
             progress(f"--- {name}")
-            records[name] = study([*shlex.split(name), *more], Path(scratch, f"{number}.json"))
+            # Of a simulation a seed replays one.
+            seed = [] if options.seed is None else [f"--{'first' if name == 'simulate' else 'seed'}={options.seed}"]
+            records[name] = study([*shlex.split(name), *more, *seed], Path(scratch, f"{number}.json"))
             if options.json is not None:
                 options.json.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     for name, record in records.items():

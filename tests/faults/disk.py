@@ -199,13 +199,13 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
         if may_mount(home):
             with mounted(home / "disk", SIZE) as disk:
                 pages = [0, 80] if options.quick else [0, 1, 3, *range(8, 240, 8)]
-                full(bench, disk, names[::4] if options.quick else names, [PAGE * page for page in pages])
+                full(bench, disk, names[::6] if options.quick else names, [PAGE * page for page in pages])
                 bench.tell(f"full: {bench.tried} operations")
                 read_only(bench, disk)
         else:
             skipped.append("full and read-only file systems: this process may not mount")
         for number, (how, (error, expected)) in enumerate(ways.items()):
-            some = names[number + 1 :: 4] if options.quick else names
+            some = names[number + 1 :: 6] if options.quick else names
             from_now_on(bench, home / f"failing-{number}", some, how, error, expected)
     return {
         "operations": bench.tried,

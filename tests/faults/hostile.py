@@ -189,7 +189,7 @@ class Hostile:
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many cases as asked."""
-    cases = min(100 if options.recordings else 400, options.cases) if options.quick else options.cases
+    cases = min(100 if options.recordings else 200, options.cases) if options.quick else options.cases
     if options.quick and not options.without:
         options.seconds = max(options.seconds, 60)  # with the tests, which may run on any machine
     if options.without == "gate":

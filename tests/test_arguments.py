@@ -17,9 +17,10 @@ def made(**settings):
     return TactileLearner(**{"sensor": PAD, "embedding": SMALL} | settings)
 
 
-@pytest.fixture
-def learner(tmp_path):
-    with TactileLearner.open(tmp_path / "m", **SETTINGS) as opened:
+@pytest.fixture(scope="module")
+def learner(tmp_path_factory):
+    """A memory that no test changes."""
+    with TactileLearner.open(tmp_path_factory.mktemp("arguments") / "m", **SETTINGS) as opened:
         for i, name in enumerate("ab"):
             opened.observe(name, stream((i, 60)))
             opened.describe(name, {name * 2: 1.0})

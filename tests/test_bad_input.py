@@ -27,11 +27,11 @@ def readings_of(sensor, name="felt", repetition=9):
 
 @pytest.fixture(scope="module", params=SENSORS, ids=lambda sensor: sensor.name)
 def learner(request):
-    """A memory of five touches of each of four materials; the tests only ask it."""
+    """A memory of some touches of each of four materials; the tests only ask it."""
     return learned(request.param)
 
 
-def learned(sensor, of_each=5):
+def learned(sensor, of_each=3):
     made, scene = TactileLearner(sensor=sensor), Scene(sensor)
     for repetition in range(of_each):
         for name in NAMES:
@@ -118,9 +118,10 @@ def check(prediction, names):
 @pytest.mark.parametrize("kind", SOUND)
 def test_an_unusual_touch_is_answered(learner, kind):
     readings = SOUND[kind](readings_of(learner.sensor), learner.sensor)
-    check(learner.predict(readings), NAMES)
+    answer = learner.predict(readings)
+    check(answer, NAMES)
     check(learner.predict(readings, scene=NAMES[1:3]), NAMES[1:3])
-    assert learner.predict(readings) == learner.predict(readings)
+    assert learner.predict(readings) == answer
 
 
 @pytest.mark.parametrize("kind", NOT_FINITE)
@@ -144,24 +145,23 @@ def test_a_touch_of_nothing_finite_or_of_one_reading_is_refused(learner):
 
 
 @pytest.mark.filterwarnings("ignore::scroll_tactile.errors.RangeWarning")  # some are far outside
-@pytest.mark.parametrize("kind", [*SOUND, *NOT_FINITE])
-def test_an_unusual_touch_is_learned_and_no_answer_suffers(kind):
-    made = learned(GAPPED, of_each=3)
-    for repetition in range(2):
-        made.observe("odd", (SOUND | NOT_FINITE)[kind](readings_of(GAPPED, repetition=repetition), GAPPED))
-    for readings in (readings_of(GAPPED), (SOUND | NOT_FINITE)[kind](readings_of(GAPPED), GAPPED)):
-        check(made.predict(readings), [*NAMES, "odd"])
+def test_unusual_touches_are_learned_and_no_answer_suffers():
+    made, kinds = learned(GAPPED, of_each=2), SOUND | NOT_FINITE
+    for kind, spoil in kinds.items():
+        for repetition in range(2):
+            made.observe(kind, spoil(readings_of(GAPPED, repetition=repetition), GAPPED))
+    for spoil in kinds.values():
+        check(made.predict(spoil(readings_of(GAPPED), GAPPED)), [*NAMES, *kinds])
 
 
-@pytest.mark.parametrize("kind", ["all channels dead", "constant", "two readings", "noise alone", "a channel of NaN"])
+@pytest.mark.parametrize("kind", ["all channels dead", "two readings", "noise alone", "a channel of NaN"])
 def test_a_memory_of_nothing_else_answers(kind):
-    made = TactileLearner(sensor=GAPPED)
-    for repetition in range(3):
+    made, usual = TactileLearner(sensor=GAPPED, kept_touches=2), readings_of(GAPPED)
+    for repetition in range(2):
         for name in NAMES[:2]:
             made.observe(name, (SOUND | NOT_FINITE)[kind](readings_of(GAPPED, name, repetition), GAPPED))
-            usual = readings_of(GAPPED, name)
-            check(made.predict(usual), list(made.materials))
-            check(made.predict((SOUND | NOT_FINITE)[kind](usual, GAPPED)), list(made.materials))
+        check(made.predict(usual), NAMES[:2])
+    check(made.predict((SOUND | NOT_FINITE)[kind](usual, GAPPED)), NAMES[:2])
 
 
 def test_what_was_missing_is_kept_as_it_was_filled(tmp_path):
@@ -179,7 +179,7 @@ def test_what_was_missing_is_kept_as_it_was_filled(tmp_path):
 
 
 @given(st.data())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_anything_of_the_right_shape_is_answered_or_refused(learner, data):
     shape = (data.draw(st.integers(1, 40)), learner.sensor.channels)
     readings = data.draw(hnp.arrays(np.float64, shape, elements=st.floats(width=32)))

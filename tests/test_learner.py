@@ -102,19 +102,28 @@ def check(prediction, materials):
     assert prediction.known in (True, False, None)
 
 
+@pytest.fixture(scope="module")
+def felt():
+    """A memory of all materials that is only asked."""
+    return learner_of()
+
+
 # What it answers
 
 
-@pytest.mark.parametrize("readout", ["lda", "ridge"])
-@pytest.mark.parametrize("sensor", [PAD, ONE, SLOW, CAMERA, sensors.ROBOSKIN], ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    ("sensor", "readout"),
+    [*((sensor, "lda") for sensor in (PAD, ONE, SLOW, CAMERA, sensors.ROBOSKIN)), (PAD, "ridge"), (CAMERA, "ridge")],
+    ids=lambda one: getattr(one, "name", one),
+)
 def test_it_knows_again_what_it_felt(sensor, readout):
-    learner = learner_of(sensor, readout=readout)
+    learner = learner_of(sensor, 3, readout=readout)
     for name in NAMES:
-        for repetition in (20, 21, 22):
+        for repetition in (20, 21):
             prediction = learner.predict(touch(name, repetition, sensor))
             check(prediction, NAMES)
             assert prediction.material == name
-            assert prediction.probability > 0.4  # four materials, five touches of each
+            assert prediction.probability > 0.4  # four materials, three touches of each
             assert prediction.seconds == sensor.readings / sensor.rate
 
 
@@ -174,8 +183,8 @@ def test_one_touch_of_each_is_enough_to_answer(readout):
         assert prediction.material == name
 
 
-def test_a_scene_restricts_the_answer():
-    learner = learner_of()
+def test_a_scene_restricts_the_answer(felt):
+    learner = felt
     stream = touch("wool", 9)
     everything = learner.predict(stream)
     assert everything.material == "wool"
@@ -197,14 +206,14 @@ def test_a_scene_restricts_the_answer():
         ("wool", InputError, r"\['wool'\]"),
     ],
 )
-def test_a_scene_that_cannot_be_is_refused(scene, error, said):
+def test_a_scene_that_cannot_be_is_refused(felt, scene, error, said):
     with pytest.raises(error, match=said):
-        learner_of(repetitions=1).predict(touch("wool", 9), scene=scene)
+        felt.predict(touch("wool", 9), scene=scene)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5])
 def test_false_alarms_decide_what_is_known_and_nothing_else(share):
-    learner, other = learner_of(repetitions=8, false_alarms=share), learner_of(repetitions=8)
+    learner, other = learner_of(repetitions=6, false_alarms=share), learner_of(repetitions=6)
     assert learner.digest() == other.digest()
     streams = [touch(name, 30 + i) for i in range(10) for name in NAMES]
     ours, theirs = [learner.predict(one) for one in streams], [other.predict(one) for one in streams]
@@ -240,14 +249,14 @@ def test_every_form_of_the_same_readings_is_the_same_observation():
     assert len(digests) == len(keys) == 1
 
 
-@pytest.mark.parametrize("lengths", [[10, 20, 29, 30, 31, 49, 50, 100, 101, 400, 1000], [20] * 6], ids=["any", "brief"])
+@pytest.mark.parametrize("lengths", [[10, 29, 31, 50, 101, 400], [20] * 3], ids=["any", "brief"])
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
 def test_unequal_lengths_in_one_memory(lengths, readout):
     learner = TactileLearner(sensor=PAD, embedding=SMALL, readout=readout)
     for repetition, readings in enumerate(lengths):
         for name in NAMES:
             learner.observe(name, touch(name, repetition, readings=readings))
-    for readings in (10, 25, 30, 45, 70, 100, 300):
+    for readings in (10, 30, 45, 100, 300):
         check(learner.predict(touch("felt", 40, readings=readings)), NAMES)
     if max(lengths) > 20:
         assert learner.predict(touch("felt", 40)).material == "felt"
@@ -255,11 +264,11 @@ def test_unequal_lengths_in_one_memory(lengths, readout):
 
 @pytest.mark.parametrize("readout", ["lda", "ridge"])
 def test_a_material_felt_only_for_a_moment_beside_others_felt_for_long(readout):
-    learner = learner_of(sensors.ROBOSKIN, repetitions=6, names=NAMES[:3], readout=readout)
-    for repetition in range(6):
+    learner = learner_of(sensors.ROBOSKIN, repetitions=3, names=NAMES[:3], readout=readout)
+    for repetition in range(3):
         learner.observe("wool", touch("wool", repetition, sensors.ROBOSKIN, readings=10))
     for name in NAMES:
-        for readings in (10, 15, 30, 75, 150):
+        for readings in (10, 15, 75, 150):
             prediction = learner.predict(touch(name, 40, sensors.ROBOSKIN, readings=readings))
             check(prediction, NAMES)
             if readings >= 15:
@@ -267,18 +276,18 @@ def test_a_material_felt_only_for_a_moment_beside_others_felt_for_long(readout):
     check(learner.predict(touch("wool", 40, sensors.ROBOSKIN), scene=["wool"]), ["wool"])
 
 
-@pytest.mark.parametrize("duration", [0.5, 0.6, 0.61, 0.65, 0.7, 0.72, 0.75])
+@pytest.mark.parametrize("duration", [0.5, 0.6, 0.61, 0.72])
 def test_a_sensor_whose_touches_are_hardly_long_enough_for_two_scales(duration):
     learner = TactileLearner(sensor=PAD.model_copy(update={"name": "brief", "duration": duration}), embedding=SMALL)
-    for repetition in range(6):
+    for repetition in range(4):
         for name in NAMES:
             learner.observe(name, touch(name, repetition, readings=20 if repetition % 2 else 75))
-    for readings in (10, 20, 29, 30, 35, 75):
+    for readings in (10, 29, 30, 75):
         check(learner.predict(touch("felt", 40, readings=readings)), NAMES)
 
 
 def test_a_stream_of_a_million_readings():
-    learner = learner_of()
+    learner = learner_of(repetitions=2)
     long = np.tile(touch("wool", 0), (10_000, 1))
     receipt = learner.observe("wool", long)
     prediction = learner.predict(long)
@@ -348,12 +357,11 @@ def test_an_iterable_that_fails_midway_keeps_nothing():
 
 
 @pytest.mark.parametrize("name", ["", "x" * 201, "a\nb", "a\0b", 5, None, b"felt", ["felt"]])
-def test_a_name_that_is_none_is_refused(name):
-    learner = learner_of(repetitions=1)
-    digest = learner.digest()
+def test_a_name_that_is_none_is_refused(felt, name):
+    digest = felt.digest()
     with pytest.raises(MaterialError, match="expected"):
-        learner.observe(name, touch("wool", 1))
-    assert learner.digest() == digest
+        felt.observe(name, touch("wool", 99))
+    assert felt.digest() == digest
 
 
 @pytest.mark.parametrize("name", ["x" * 200, "Filz, grau", "フェルト", "a'b\"c", " ", "../felt", "\U0001f9f6"])
@@ -417,7 +425,7 @@ def test_threads_that_observe_and_predict_together():
 
     def work(name):
         try:
-            for repetition in range(8):
+            for repetition in range(4):
                 learner.observe(name, touch(name, repetition))
                 learner.predict(touch(name, repetition))
         except Exception as error:
@@ -429,7 +437,7 @@ def test_threads_that_observe_and_predict_together():
     for thread in threads:
         thread.join(60)
     assert not failures
-    assert learner.digest() == learner_of(repetitions=8).digest()
+    assert learner.digest() == learner_of(repetitions=4).digest()
 
 
 # Receipts
@@ -462,17 +470,17 @@ def test_a_receipt_says_what_was_kept(tmp_path):
 # Persistence
 
 
-def test_a_memory_can_be_opened_without_naming_its_sensor_and_with_either_readout(tmp_path):
+def test_a_memory_can_be_opened_without_naming_its_sensor_and_with_either_readout(tmp_path, felt):
     with opened(tmp_path / "m") as learner:
         feel(learner)
     with TactileLearner.open(tmp_path / "m", embedding=SMALL, readout="ridge") as learner:
         assert learner.sensor == PAD
         assert answers(learner) == answers(learner_of(readout="ridge"))
     with TactileLearner.open(str(tmp_path / "m"), embedding=SMALL) as learner:
-        assert answers(learner) == answers(learner_of())
+        assert answers(learner) == answers(felt)
 
 
-def test_a_checkpoint_is_written_while_observing(tmp_path, monkeypatch):
+def test_a_checkpoint_is_written_while_observing(tmp_path, monkeypatch, felt):
     monkeypatch.setattr("scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)
@@ -483,7 +491,7 @@ def test_a_checkpoint_is_written_while_observing(tmp_path, monkeypatch):
         assert reader.digest() == learner.digest()
     learner.close()
     with opened(tmp_path / "m") as again:
-        assert again.digest() == learner_of().digest()
+        assert again.digest() == felt.digest()
 
 
 def test_closing_twice_and_an_untouched_memory(tmp_path):

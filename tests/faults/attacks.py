@@ -41,6 +41,13 @@ from store.framing import FRAME_BYTES, read_frame
 
 KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "member", "x", "", "OBSERVE")
 
+SPANS: tuple[Any, ...] = ([[1, 1]], [[1, 10**12]], [[2, 1]], [[0, 0]], [[-5, 1]], [[1, 1], [1, 1]], [[99, 99]], None)
+SPANS += ([[1, 2], [2, 3]], "x", [], [[]], [1], [[1, 1, 1]], [[True, 1]], [[1.0, 1]])
+SHARES: tuple[Any, ...] = ({"x": 1.0}, {"x": 2.0}, {"x": float("nan")}, "x", [], {"wool": "x"}, {"": True}, {"x": 1})
+SHARES += ({"a\nb": None}, {}, None, 5, {"x": {"y": 1}}, {"x": True, "y": 0.7})
+TIMES = (1e14, -1e14, float("inf"), 0, -1, 1e308, 253402300800.0)
+SEQUENCES = (1, 2, 3, -1, 0, 50, 2**40, 2**63 - 1, -(2**63))
+
 
 def forged_row(rng: random.Random, path: Path, scene: Scene) -> str:
     """A row with right checksums, of which one thing or more is not as this library writes it."""
@@ -57,54 +64,24 @@ def made_row(rng: random.Random, path: Path, scene: Scene) -> tuple[str, dict[st
     if kind in ("observe", "merge", "member"):
         told.append(_fill(rng, row, path, scene))
     elif kind == "retract":
-        spans = (
-            [[1, 1]],
-            [[1, 10**12]],
-            [[2, 1]],
-            [[0, 0]],
-            [[-5, 1]],
-            [[1, 1], [1, 1]],
-            [[99, 99]],
-            [[1, 2], [2, 3]],
-            "x",
-        )
-        row["attributes"] = {
-            "sequences": rng.choice((*spans, [], [[]], [1], [[1, 1, 1]], [[True, 1]], [[1.0, 1]], None))
-        }
+        row["attributes"] = {"sequences": rng.choice(SPANS)}
     elif kind == "describe":
-        shares = (
-            {"x": 1.0},
-            {"x": 2.0},
-            {"x": float("nan")},
-            "x",
-            [],
-            {"wool": "x"},
-            {"": True},
-            {"a\nb": None},
-            {"x": 1},
-        )
-        row["attributes"] = {"constituents": rng.choice((*shares, {}, None, 5, {"x": {"y": 1}}, {"x": True, "y": 0.7}))}
+        row["attributes"] = {"constituents": rng.choice(SHARES)}
     if rng.random() < 0.25 and kind != "observe":
         told_of, row["attributes"] = mutated_json(rng, row.get("attributes", {}))
         told.append(f"attributes: {told_of}")
-    if rng.random() < 0.15:
-        name, value = rng.choice(
-            (("label", rng.choice(TEXTS)), ("key", rng.randbytes(rng.choice((0, 3, 31, 33, 64, 65)))))
-        )
-        row[name] = value
-        told.append(f"{name} {str(value)[:20]!r}")
-    if rng.random() < 0.1:
-        row["time"] = rng.choice((1e14, -1e14, float("inf"), 0, -1, 1e308, 253402300800.0))
-        told.append(f"time {row['time']}")
-    if rng.random() < 0.08:
-        row["sequence"] = rng.choice((1, 2, 3, -1, 0, 50, 2**40, 2**63 - 1, -(2**63)))
-        told.append(f"sequence {row['sequence']}")
-    if rng.random() < 0.03:
-        row["size"] = rng.choice(NUMBERS[:18])
-        told.append(f"size {row['size']}")
-    if rng.random() < 0.03:
-        row["kept"] = rng.choice((0, 1, 2, 255))
-        told.append(f"kept {row['kept']}")
+    others: tuple[tuple[str, float, Any], ...] = (
+        ("label", 0.07, rng.choice(TEXTS)),
+        ("key", 0.07, rng.randbytes(rng.choice((0, 3, 31, 33, 64, 65)))),
+        ("time", 0.1, rng.choice(TIMES)),
+        ("sequence", 0.08, rng.choice(SEQUENCES)),
+        ("size", 0.03, rng.choice(NUMBERS[:18])),
+        ("kept", 0.03, rng.choice((0, 1, 2, 255))),
+    )
+    for name, share, value in others:
+        if rng.random() < share:
+            row[name] = value
+            told.append(f"{name} {str(value)[:20]!r}")
     return ", ".join(told), row
 
 
@@ -210,14 +187,9 @@ def forged_current(rng: random.Random, path: Path, scene: Scene) -> str:
         current[name][key] = rng.choice((*NUMBERS, "0" * 64, None, 1, 2, 3, 4, 5))
         told += f" {key} {current[name][key]}"
     elif way == "swap":
-        current["newest"], current["compaction"] = rng.choice(
-            (
-                (None, current["newest"]),
-                (current["newest"],) * 2,
-                (current["compaction"], current["newest"]),
-                (None, None),
-            )
-        )
+        newest, compaction = current["newest"], current["compaction"]
+        ways = ((None, newest), (newest, newest), (compaction, newest), (None, None))
+        current["newest"], current["compaction"] = rng.choice(ways)
     elif way == "log":
         current["log"] = rng.choice(
             ([1, rng.randbytes(8).hex()], [2, current["log"][1]], [2**63, current["log"][1]], [], [1], "x", None)

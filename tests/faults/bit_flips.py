@@ -16,12 +16,11 @@ compaction is taken; and with a damaged compaction checkpoint, with a warning, e
 from __future__ import annotations
 
 import argparse
-import hashlib
 import random
 import shutil
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +28,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from forging import log_of, named_in
 
-import scroll_tactile.persistence.open_memory
-from faults.common import folder, parser, progress, run, warnings_told
-from faults.model import Operation, Other, State, after, expected, opened, perform, seen, warm
+from faults.common import fingerprint, folder, parser, run, warnings_told
+from faults.learners import expected, opened, perform, seen, warm
+from faults.model import Operation, State, after
 from faults.plans import prepare
-from store import DamageError, StoreError
+from faults.trials import NEVER, Trials, checkpoints_every
+from store import DamageError, StoreError, check_store
 
-try:
-    from store import check_store
-except ImportError:  # a release without it
-    check_store = None  # type: ignore[assignment]
-
-NEVER = 2**40
 SOME = 500  # bytes
 
 HISTORY: tuple[Operation, ...] = (
@@ -58,23 +52,33 @@ HISTORY: tuple[Operation, ...] = (
     ("observe", "c", (3, 60)),
     ("observe", "ü", (2, 16)),
 )
+THEN: tuple[Operation, ...] = (("forget", "ü"), ("observe", "a", (0, 25)))  # rows are read again
 
 
 @dataclass
 class Memory:
-    """A memory to be harmed: where it lies, what it holds, and what it held before."""
+    """A memory to be harmed: where it lies, what it holds, and what it held before its last batch."""
 
     name: str
     path: Path
     state: State
-    earlier: list[State]
-    files: list[Path] = field(default_factory=list)
-    roles: dict[str, str] = field(default_factory=dict)
+    earlier: State
+
+    def __post_init__(self) -> None:
+        newest, compaction = named_in(self.path)
+        self._roles = {compaction["number"]: "compaction checkpoint", newest["number"]: "newest checkpoint"}
+        self.files = sorted(file for file in self.path.rglob("*") if file.is_file() and file.stat().st_size)
+
+    def kind_of(self, file: Path) -> str:
+        """What a file of its folder is to it."""
+        if file.parts[0] == "checkpoints":
+            return f"{self._roles[int(file.parts[1])]}: {'metadata' if file.name == 'zarr.json' else 'values'}"
+        return "log" if file.name.startswith("log-") else file.name
 
 
-def prepared(home: Path, others: dict[str, Other]) -> list[Memory]:
+def prepared(home: Path, others: dict[str, State]) -> list[Memory]:
     """The same history twice: closed at its end, and left as a crash would leave it."""
-    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = NEVER
+    checkpoints_every(NEVER)
     path, states = home / "memory", [State()]
     learner = opened(path)
     for operation in HISTORY:
@@ -89,81 +93,47 @@ def prepared(home: Path, others: dict[str, Other]) -> list[Memory]:
     log.write_bytes(log.read_bytes().rstrip(b"\0") + bytes(SOME))  # of zeros ahead a mebibyte would take most flips
     learner.close()
     path.rename(home / "closed")
-    memories = [Memory(name, home / name, states[-1], states[:-1]) for name in ("closed", "crashed")]
-    for memory in memories:
-        memory.roles = roles_of(memory.path)
-        memory.files = sorted(file for file in memory.path.rglob("*") if file.is_file() and file.stat().st_size)
-    return memories
+    return [Memory(name, home / name, states[-1], states[-2]) for name in ("closed", "crashed")]
 
 
-def roles_of(path: Path) -> dict[str, str]:
-    """Folder of a checkpoint → what it is to the memory."""
-    newest, compaction = named_in(path)
-    return {f"{compaction['number']:08d}": "compaction checkpoint", f"{newest['number']:08d}": "newest checkpoint"}
-
-
-def kind_of(file: Path, roles: dict[str, str]) -> str:
-    """What a file is to the memory."""
-    if file.parts[0] == "checkpoints":
-        return f"{roles[file.parts[1]]}: {'metadata' if file.name == 'zarr.json' else 'values'}"
-    return "log" if file.name.startswith("log-") else file.name
-
-
-def fingerprint(path: Path) -> dict[str, str]:
-    """The contents of all files."""
-    return {
-        str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in sorted(path.rglob("*"))
-        if file.is_file()
-    }
-
-
-class Flipping:
+class Flipping(Trials):
     """Flips, and what became of them."""
 
     def __init__(self, home: Path, seed: int) -> None:
-        self.home, self.rng = home, random.Random(seed)
-        self.others = prepare(home)
+        super().__init__(home, prepare(home))
+        self.rng = random.Random(seed)
         self.memories = prepared(home, self.others)
-        self.outcomes: dict[str, Counter[str]] = {}
-        self.failures: list[str] = []
-        self.flips = 0
 
     def once(self) -> None:
         """Flip one bit, and look."""
         memory = self.rng.choice(self.memories)
         # Half of them by bytes, which are mostly the log's, and half by files, which are mostly checkpoints'.
-        sizes = [file.stat().st_size for file in memory.files] if self.flips % 2 else None
-        file = self.rng.choices(memory.files, sizes)[0]
-        bit = self.rng.randrange(8 * file.stat().st_size)
+        sizes = [file.stat().st_size for file in memory.files] if self.tried % 2 else None
+        chosen = self.rng.choices(memory.files, sizes)[0].relative_to(memory.path)
         path = self.home / "flipped"
         shutil.rmtree(path, ignore_errors=True)
         shutil.copytree(memory.path, path)
-        target = path / file.relative_to(memory.path)
-        data = bytearray(target.read_bytes())
+        data = bytearray((path / chosen).read_bytes())
+        bit = self.rng.randrange(8 * len(data))
         data[bit // 8] ^= 1 << bit % 8
-        target.write_bytes(data)
-        self.flips += 1
-        kind = kind_of(file.relative_to(memory.path), memory.roles)
-        where = f"flip {self.flips}: {memory.name}, {file.relative_to(memory.path)}, byte {bit // 8}, bit {bit % 8}"
+        (path / chosen).write_bytes(data)
+        kind = memory.kind_of(chosen)
+        where = f"flip {self.tried + 1}: {memory.name}, {chosen}, byte {bit // 8}, bit {bit % 8}"
         checked = self._checked(path, where)
         noticed = self._opened(memory, path, where, kind)
-        if checked is not None and not checked and noticed.startswith(("refused", "warned")):
+        if noticed.startswith("WRONG"):
+            self.failures.append(f"{where}: opened, and {noticed}")
+        if not checked and noticed.startswith(("refused", "warned")):
             self.failures.append(f"{where}: {noticed}, and check_store finds nothing")
-        told = "" if checked is None else "; found by check" if checked else "; check finds nothing"
-        self.outcomes.setdefault(kind, Counter())[noticed + told] += 1
+        self.note(kind, f"{noticed}; {'found by check' if checked else 'check finds nothing'}")
 
-    def _checked(self, path: Path, where: str) -> bool | None:
-        if check_store is None:
-            return None
-        before = fingerprint(path)
-        try:
-            found = bool(check_store(path))
-        except StoreError:
-            found = True
-        except Exception as error:
-            self.failures.append(f"{where}: check_store raised {error!r}")
-            found = True
+    def _checked(self, path: Path, where: str) -> bool:
+        before, found = fingerprint(path), True
+        with self.examined(f"{where}: check_store"):
+            try:
+                found = bool(check_store(path))
+            except StoreError:
+                found = True
         if fingerprint(path) != before:
             self.failures.append(f"{where}: check_store changed something")
         return found
@@ -179,37 +149,31 @@ class Flipping:
         except Exception as error:
             self.failures.append(f"{where}: {error!r}")
             return "not a StoreError"
-        told = self._judged(memory, found, bool(warned), kind)
-        if told is None:
-            told_of = expected(memory.state)
-            differ = [key for key in found if found[key] != told_of[key]]
-            self.failures.append(f"{where}: opened, {'warned' if warned else 'silent'}, and wrong in {differ}")
-            return "WRONG"
-        outcome, state = told
-        return outcome if state is None else outcome + self._worked_with(path, state, where)
+        told = self._told(memory, found, kind, warned=bool(warned))
+        return told + self._worked_with(path, memory.state, where) if told.endswith("right") else told
 
-    def _judged(
-        self, memory: Memory, found: dict[str, Any], warned: bool, kind: str
-    ) -> tuple[str, State | None] | None:
-        """What to call what was found, and the state to go on from, if any; None where it is wrong."""
-        told = expected(memory.state) | ({"names": found["names"]} if warned and _fewer(found, memory.state) else {})
-        if found == told:
-            return "warned and right" if warned else "right", memory.state
-        differ = {key for key in found if found[key] != told[key]}
+    def _told(self, memory: Memory, found: dict[str, Any], kind: str, *, warned: bool) -> str:
+        """What to call what was found where it opens; WRONG, and what differs, where that must not be."""
+        wanted = expected(memory.state)
+        if warned and _fewer(found, wanted):
+            wanted = wanted | {"names": found["names"]}
+        differ = {key for key in found if found[key] != wanted[key]}
+        if not differ:
+            return "warned and right" if warned else "right"
         if warned and differ == {"tuned"}:
-            return "warned, and f* is gone", None
+            return "warned, and f* is gone"
         if warned and differ <= {"exemplars", "pool"} and kind.startswith("compaction checkpoint"):
-            return "warned, and samples could not be chosen again", None
-        if kind == "log" and found == expected(memory.earlier[-1]):
-            return "the last batch dropped" + (", warned" if warned else ", in silence"), None
-        return None
+            return "warned, and samples could not be chosen again"
+        if kind == "log" and found == expected(memory.earlier):
+            return "the last batch dropped" + (", warned" if warned else ", in silence")
+        return f"WRONG, {'warned' if warned else 'silent'}: {sorted(differ)}"
 
     def _worked_with(self, path: Path, state: State, where: str) -> str:
         """Read rows again, to take two back; what to add to the outcome. It must open afterwards as it did before."""
-        loose, later = self.rng.choice(state.loose), ""
+        later = ""
         try:
             with warnings_told(lambda text: None), opened(path) as learner:
-                for operation in (("retract", loose.sequence), ("forget", "ü"), ("observe", "a", (0, 25))):
+                for operation in (("retract", self.rng.choice(state.loose)), *THEN):
                     then, foretold = after(state, operation, self.others)
                     try:
                         result = perform(learner, operation, self.home)
@@ -224,48 +188,38 @@ class Flipping:
                 self._require(where, "opened at last", learner, state, right=True)
         except DamageError as error:
             # A touch that takes the place of one that was taken back may be one whose row is damaged.
-            try:
-                with warnings_told(lambda text: None), opened(path) as learner:
-                    learner.digest()
-            except Exception as still:
-                self.failures.append(f"{where}: could be opened, and no more after a retraction: {still!r}")
+            again = self.examined(f"{where}: could be opened, and no more after a retraction")
+            with again, warnings_told(lambda text: None), opened(path) as learner:
+                learner.digest()
             return f"{later}, later {type(error).__name__}"
         except Exception as error:
-            self.failures.append(
-                f"{where}: could be opened, and no more after one of its observations was retracted: {error!r}"
-            )
+            self.failures.append(f"{where}: could be opened, and no more after a retraction: {error!r}")
             return ", LATER UNREADABLE"
         return later
 
     def _require(self, where: str, what: str, learner: Any, state: State, *, right: bool) -> None:
-        found = seen(learner)
-        known = {"names": None} if _fewer(found, state) else {}
-        if not right or found | known != expected(state) | known:
+        found, wanted = seen(learner), expected(state)
+        known = {"names": None} if _fewer(found, wanted) else {}
+        if not right or found | known != wanted | known:
             self.failures.append(f"{where}: then wrong: {what}")
 
 
-def _fewer(found: dict[str, Any], state: State) -> bool:
+def _fewer(found: dict[str, Any], wanted: dict[str, Any]) -> bool:
     """Whether touches are no longer known by their names, as of damaged rows, and none is that is not there."""
-    told = expected(state)["names"]
-    return all(set(names) <= set(told.get(touch, ())) for touch, names in found["names"].items())
+    return all(set(names) <= set(wanted["names"].get(touch, ())) for touch, names in found["names"].items())
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many flips as asked."""
-    flips = 8 if options.quick else options.flips
     warm()
     with folder(options, in_memory=True) as home:
         flipping = Flipping(home, options.seed)
-        for _ in range(flips):
+        for number in range(8 if options.quick else options.flips):
             flipping.once()
-            if flipping.flips % 100 == 0:
-                progress(f"{flipping.flips} flips, {len(flipping.failures)} failures")
-    total: Counter[str] = Counter()
-    for counted in flipping.outcomes.values():
-        total.update(counted)
+            flipping.tell(f"{number + 1} flips" if number % 100 == 99 else "")
+    total = sum(flipping.outcomes.values(), Counter[str]())
     return {
-        "flips": flipping.flips,
-        "check_store": "there" if check_store is not None else "not there",
+        "flips": flipping.tried,
         "outcomes": dict(sorted(total.items())),
         "by file": {kind: dict(sorted(counted.items())) for kind, counted in sorted(flipping.outcomes.items())},
         "failures": flipping.failures,

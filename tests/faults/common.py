@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import inspect
 import json
 import logging
@@ -30,16 +31,46 @@ IN_MEMORY = Path("/dev/shm")
 PACKAGES = ("numpy", "torch", "zarr", "numcodecs", "filelock")
 
 
-def parser(about: str | None, **defaults: Any) -> argparse.ArgumentParser:
-    """The options that every command has, and one for each default: --name VALUE."""
+def parser(about: str | None, *, seed: int | None = 0, **defaults: Any) -> argparse.ArgumentParser:
+    """The options that every command has, and one for each default: --name VALUE, or --name where it is False."""
     made = argparse.ArgumentParser(description=(about or "").split("\n\n", maxsplit=1)[0])
     made.add_argument("--quick", action="store_true", help="a few of each, in seconds")
-    made.add_argument("--seed", type=int, default=0)
+    made.add_argument("--seed", type=int, default=seed)
     made.add_argument("--json", type=Path, help="file for the record")
     made.add_argument("--home", type=Path, help="folder in which memories are made and harmed")
     for name, value in defaults.items():
-        made.add_argument(f"--{name}", type=type(value), default=value)
+        if value is False:
+            made.add_argument(f"--{name}", action="store_true")
+        else:
+            made.add_argument(f"--{name}", type=type(value), default=value)
     return made
+
+
+class Part:
+    """What is known of a run that is not at its end: in FILE.part beside the record, from which a later call goes on.
+
+    about: what such a run is made with; another's part is not taken up.
+    """
+
+    def __init__(self, record: Path | None, **about: Any) -> None:
+        self._path = None if record is None else record.with_name(record.name + ".part")
+        self._about, self.known = about, dict[str, Any]()
+        if self._path is not None and self._path.exists():
+            kept = json.loads(self._path.read_text(encoding="utf-8"))
+            self.known = kept["known"] if kept["about"] == about else {}
+
+    def save(self, **known: Any) -> None:
+        """Add to what is known."""
+        self.known |= known
+        if self._path is not None:
+            draft = self._path.with_suffix(".new")
+            draft.write_text(json.dumps({"about": self._about, "known": self.known}, indent=1), encoding="utf-8")
+            draft.replace(self._path)
+
+    def remove(self) -> None:
+        """The run is at its end."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -62,6 +93,23 @@ def file_system(path: Path) -> str:
     mounts = [line.split()[1:3] for line in lines]
     held = [(where, kind) for where, kind in mounts if path.resolve().is_relative_to(where)]
     return max(held, default=("", "unknown"), key=lambda one: len(one[0]))[1]
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Everything in a folder: of each thing its type and, by that, its bytes or where it points."""
+    found: dict[str, Any] = {}
+    for entry in sorted(os.scandir(path), key=lambda entry: entry.name) if path.is_dir() else ():
+        about = entry.stat(follow_symlinks=False)
+        if entry.is_symlink():
+            found[entry.name] = str(Path(entry.path).readlink())
+        elif entry.is_dir():
+            found[entry.name] = about.st_mode
+            found |= {f"{entry.name}/{name}": what for name, what in fingerprint(Path(entry.path)).items()}
+        elif entry.is_file() and about.st_size < 2**24:
+            found[entry.name] = hashlib.sha256(Path(entry.path).read_bytes()).hexdigest()
+        else:
+            found[entry.name] = (about.st_mode, about.st_size)
+    return found
 
 
 class Warnings(logging.Handler):

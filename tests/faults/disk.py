@@ -15,23 +15,22 @@ import itertools
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-
 from forging import log_of
 
 from faults import shim as watch
-from faults.attempts import SUCCESS, Attempt, Trials
-from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, State, after, opened, unsound_copies, warm
+from faults.common import folder, parser, quiet_coroutines, run, warnings_told
+from faults.learners import opened, warm
+from faults.model import Operation, State, after
 from faults.plans import prepare
 from faults.shim import Shim
+from faults.trials import SUCCESS, Attempt, Trials
 
 SIZE = 12 * 2**20
 PAGE = 4096
@@ -111,14 +110,13 @@ class Bench(Trials):
 
     def then(self, attempt: Attempt, outcome: str) -> State:
         """The state after an operation."""
-        done = outcome == SUCCESS and not attempt.changes_nothing
-        return after(self.ground, attempt.operation, self.others)[0] if done else self.ground
+        return after(self.ground, attempt.operation, self.others)[0] if outcome == SUCCESS else self.ground
 
     def afterwards(self, where: str, attempt: Attempt, outcome: str) -> None:
         """With the fault over: nothing was changed by what was refused, and it can be done."""
         if attempt.changes_nothing and not (outcome == SUCCESS and attempt.operation[0] == "open"):
             attempt.learner = opened(attempt.path)
-        self.failures += [f"{where}: {what}" for what in unsound_copies(attempt.path, [self.ground])]
+        self.require_copies(where, attempt.path, [self.ground])
         self.require(f"{where}: after {outcome}", attempt.learner, [self.then(attempt, outcome)])
         if outcome != SUCCESS and not attempt.changes_nothing:
             if (again := self.outcome(where, attempt.do)) != SUCCESS:
@@ -129,9 +127,10 @@ class Bench(Trials):
             self.require(f"{where}: opened at last", learner, [self.then(attempt, SUCCESS)])
 
 
-def full(bench: Bench, where: Path, rooms: list[int]) -> None:
+def full(bench: Bench, where: Path, names: Sequence[str], rooms: list[int]) -> None:
     """Each operation with ever more room, until it fits."""
-    for name, operation in OPERATIONS.items():
+    for name in names:
+        operation = OPERATIONS[name]
         for room in rooms:
             attempt = bench.ready(where / "memory", operation)
             fill(where, room)
@@ -146,7 +145,8 @@ def full(bench: Bench, where: Path, rooms: list[int]) -> None:
                     with opened(attempt.path, "read") as reader:
                         bench.require(f"{told}, a reader", reader, expected)
                 (where / "filler").unlink()
-                bench.examined(told, partial(bench.afterwards, told, attempt, outcome))
+                with bench.examined(f"{told}: afterwards"):
+                    bench.afterwards(told, attempt, outcome)
             bench.note(f"full: {name}", outcome)
             if outcome == SUCCESS and room:
                 break
@@ -170,19 +170,20 @@ def read_only(bench: Bench, where: Path) -> None:
         subprocess.run(["mount", "-o", "remount,rw", where], check=True)
 
 
-def from_now_on(bench: Bench, path: Path, name: str, error: int, expected: str) -> None:
+def from_now_on(bench: Bench, path: Path, names: Sequence[str], how: str, error: int, expected: str) -> None:
     """All writing calls fail from one instant on, and then no more."""
     shim = Shim()
-    for operation_name, operation in OPERATIONS.items():
-        told = f"{name}: {operation_name}"
-        attempt = bench.ready(path, operation)
+    for name in names:
+        told = f"{how}: {name}"
+        attempt = bench.ready(path, OPERATIONS[name])
         with warnings_told(lambda text: None):
             shim.arm(path.parent, watch.FAIL, watch.WRITES, first=1, last=watch.FOREVER, error=error)
             outcome = bench.outcome(told, attempt.do)
             shim.disarm()
             if outcome != expected:
                 bench.failures.append(f"{told}: {outcome}")
-            bench.examined(told, partial(bench.afterwards, told, attempt, outcome))
+            with bench.examined(f"{told}: afterwards"):
+                bench.afterwards(told, attempt, outcome)
         bench.note(told, outcome)
 
 
@@ -190,21 +191,22 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
     """All of it; what needs a mount is left out where there may be none."""
     quiet_coroutines()
     warm()
-    skipped = []
+    skipped, names = [], list(OPERATIONS)
+    ways = {"over quota (EDQUOT)": (errno.EDQUOT, "StoreFullError"), "failing (EIO)": (errno.EIO, "StoreError")}
+    ways |= {"turned read-only (EROFS)": (errno.EROFS, "ReadOnlyError")}
     with folder(options, in_memory=True) as home:
         bench = Bench(home)
         if may_mount(home):
             with mounted(home / "disk", SIZE) as disk:
                 pages = [0, 80] if options.quick else [0, 1, 3, *range(8, 240, 8)]
-                full(bench, disk, [PAGE * page for page in pages])
-                progress(f"full: {bench.tried} operations, {len(bench.failures)} failures")
+                full(bench, disk, names[::6] if options.quick else names, [PAGE * page for page in pages])
+                bench.tell(f"full: {bench.tried} operations")
                 read_only(bench, disk)
         else:
             skipped.append("full and read-only file systems: this process may not mount")
-        if not options.quick:
-            from_now_on(bench, home / "quota", "over quota (EDQUOT)", errno.EDQUOT, "StoreFullError")
-            from_now_on(bench, home / "failing", "failing (EIO)", errno.EIO, "StoreError")
-        from_now_on(bench, home / "turned", "turned read-only (EROFS)", errno.EROFS, "ReadOnlyError")
+        for number, (how, (error, expected)) in enumerate(ways.items()):
+            some = names[number + 1 :: 6] if options.quick else names
+            from_now_on(bench, home / f"failing-{number}", some, how, error, expected)
     return {
         "operations": bench.tried,
         "skipped": skipped,

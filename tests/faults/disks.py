@@ -219,13 +219,17 @@ class Disk:
 
     def rebuilt(self, to: Path, rng: random.Random, style: Style) -> None:
         """Make folder `to` as the disk may look after a power cut now."""
-        _rebuild(self.top, to, rng, style)
+        rebuild(self.top, to, rng, style)
 
 
-def _rebuild(folder: Folder, to: Path, rng: random.Random, style: Style) -> None:
+def rebuild(folder: Folder, to: Path, rng: random.Random, style: Style) -> list[tuple[Path, File]]:
+    """Make folder `to` as this one may look after a power cut; its files."""
     to.mkdir()
+    made = []
     for name, node in folder.content(rng, style).items():
         if isinstance(node, Folder):
-            _rebuild(node, to / name, rng, style)
+            made += rebuild(node, to / name, rng, style)
         else:
             (to / name).write_bytes(node.content(rng, style))
+            made.append((to / name, node))
+    return made

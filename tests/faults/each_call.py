@@ -28,11 +28,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from faults import shim as watch
-from faults.attempts import NEVER, SUCCESS, Attempt, Trials, copied
-from faults.common import folder, parser, progress, quiet_coroutines, run, warnings_told
-from faults.model import Operation, Other, State, after, one_scale, opened, perform, unsound_copies, warm
+from faults.common import folder, parser, quiet_coroutines, run, warnings_told
+from faults.learners import one_scale, opened, perform, warm
+from faults.model import Operation, State, after
 from faults.plans import prepare
 from faults.shim import Shim
+from faults.trials import NEVER, SUCCESS, Attempt, Trials, copied
 from faults.zygote import Zygote
 
 SLOW = ("compact", "fine_tune")
@@ -40,6 +41,7 @@ CHECKPOINTS = ("fine-tune", "compact", "close", "compact all but 3", "observe, a
 SECOND_LOOK = 3  # of so many calls of a step that writes checkpoints one is looked at by opening anew, too
 # They write a checkpoint as two others do, call for call, whose every call is tried: of these one in four is.
 ALIKE = {"fine-tune": 4, "compact": 4, "close": 4}
+QUICK = 700
 THOROUGH = 5  # of so many calls of a slow step one is followed by doing all of it again
 
 MODES = {
@@ -97,7 +99,7 @@ class Step:
         return Attempt(self.operation, path, home, self.start, self.every)
 
 
-def plan(home: Path, others: dict[str, Other]) -> list[Step]:
+def plan(home: Path, others: dict[str, State]) -> list[Step]:
     """The steps, each with the copy that it begins from."""
     path, state, steps = home / "plan" / "memory", State(), []
     learner: Any = None
@@ -108,8 +110,7 @@ def plan(home: Path, others: dict[str, Other]) -> list[Step]:
             perform(learner, OBSERVE, home)
             state, _ = after(state, OBSERVE, others)
         copied(path, start)
-        ends = operation[0] in ("open", "close")
-        then, result = (state, None) if ends else after(state, operation, others)
+        then, result = after(state, operation, others)
         if name:
             done = range(1, len(operation[1])) if operation[0] == "batch" else ()
             parts = [after(state, ("batch", operation[1][:count]), others)[0] for count in done]
@@ -118,7 +119,7 @@ def plan(home: Path, others: dict[str, Other]) -> list[Step]:
             leave_unfinished(start)
         elif operation == ("open",):
             learner = opened(path)
-        elif operation[0] != "close" and learner is not None:
+        elif operation != ("close",):  # what opening finds then is as after a crash
             assert perform(learner, operation, home) == result
         state = then
     learner.close()
@@ -153,10 +154,9 @@ def crash(channel: Connection, step: Step, path: Path, home: Path, how: str, num
 class Trial(Trials):
     """All the calls of all the steps."""
 
-    def __init__(self, home: Path, zygote: Zygote, others: dict[str, Other]) -> None:
+    def __init__(self, home: Path, zygote: Zygote, others: dict[str, State]) -> None:
         super().__init__(home, others)
         self.zygote, self.path, self.shim = zygote, home / "run" / "memory", Shim()
-        self.shown = 0
 
     def fail(self, step: Step, how: str, number: int) -> bool:
         """Let call `number` fail; whether there was one."""
@@ -175,7 +175,8 @@ class Trial(Trials):
                 parts = step.parts if how == "EIO in reading" else []
                 if step.operation[0] == "compact" and hit == f"fsync {self.path}":
                     parts = [step.then]  # `CURRENT` has its new name; whether on the disk, too, nobody knows
-                self.examined(where, lambda: self._goes_on(where, step, parts, attempt, outcome, number))
+                with self.examined(f"{where}: afterwards"):
+                    self._goes_on(where, step, parts, attempt, outcome, number)
             elif outcome != SUCCESS:
                 self.failures.append(f"{where}: {outcome} without a fault")
         if attempt.learner is not None:
@@ -194,7 +195,7 @@ class Trial(Trials):
                 self.require(f"{where}: as it lay on the disk then", learner, [step.before, step.then, *parts])
         if step.operation[0] == "close" or attempt.learner is None:
             attempt.learner = opened(self.path)
-        self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [step.before])]
+        self.require_copies(where, self.path, [step.before])
         states = [step.then] if outcome.startswith(SUCCESS) else [*parts, step.before]
         state = self.require(f"{where}: the learner, after {outcome}", attempt.learner, states)
         self._finish(where, step, attempt.learner, state, number)
@@ -222,12 +223,6 @@ class Trial(Trials):
     def _second_look(self, step: Step, number: int) -> bool:
         return step.name not in CHECKPOINTS or number % SECOND_LOOK == 0
 
-    def told(self) -> None:
-        """Show failures as they come."""
-        for failure in self.failures[self.shown :]:
-            progress(f"FAILED {failure}")
-        self.shown = len(self.failures)
-
     def crash(self, step: Step, how: str, number: int) -> bool:
         """End the process at call `number`, and look at what is left; whether there was one."""
         child = self.zygote.spawn(crash, step, self.path, self.home, how, number)
@@ -240,12 +235,13 @@ class Trial(Trials):
             self.failures.append(f"{where}: the child ended with {status}")
             return True
         self._count(step, how, "-", "killed")
-        with warnings_told(lambda text: self.failures.append(f"{where}: warned {text}")):
-            self.examined(where, lambda: self._recovers(where, step, number))
+        warned = lambda text: self.failures.append(f"{where}: warned {text}")  # noqa: E731
+        with warnings_told(warned), self.examined(f"{where}: afterwards"):
+            self._recovers(where, step, number)
         return True
 
     def _recovers(self, where: str, step: Step, number: int) -> None:
-        self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [step.before])]
+        self.require_copies(where, self.path, [step.before])
         learner = opened(self.path)
         state = self.require(f"{where}: opened again", learner, [step.before, step.then])
         step.outcomes["found as after" if state is step.then and step.then != step.before else "found as before"] += 1
@@ -254,7 +250,7 @@ class Trial(Trials):
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """Every call of every step, or every so-many-th."""
-    every = 400 if options.quick else options.every
+    every = QUICK if options.quick else options.every
     quiet_coroutines()
     one_scale()
     warm()
@@ -263,14 +259,14 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
         trial = Trial(home, zygote, others)
         steps = plan(home, others)
         for place, step in enumerate(steps):
-            for how in list(MODES)[place % 3 :: 3] if options.quick else MODES:
+            for how in list(MODES)[place % 5 :: 5] if options.quick else MODES:
                 attempt = trial.crash if MODES[how][0] in (watch.CRASH, watch.TEAR) else trial.fail
                 stride = every * ALIKE.get(step.name, 1)
                 number = 1 + options.seed % stride
                 while attempt(step, how, number):
                     number += stride
-                    trial.told()
-            progress(f"{step.name}: {trial.tried} calls so far, {len(trial.failures)} failures")
+                    trial.tell()
+            trial.tell(f"{step.name}: {trial.tried} calls so far")
     return {
         "every": {"calls": every, "but of steps alike": {name: every * times for name, times in ALIKE.items()}},
         "calls": {how: sum(counted.values()) for how, counted in trial.outcomes.items()},

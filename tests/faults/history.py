@@ -23,11 +23,12 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from touches import SMALL, SmallSample, contents, fed, stream
+from touches import SMALL, SmallSample, contents, stream
 
 from faults.common import parser, progress, run
 from faults.learned_files import learn_files
-from faults.model import EMBEDDINGS, MATERIALS, State, after, expected, opened, perform, seen, unsound_copies
+from faults.learners import KIT, expected, fed, opened, perform, seen, unsound_copies
+from faults.model import State, after
 from faults.plans import KINDS, draw, prepare, touch
 from scroll_tactile.errors import StreamError
 from scroll_tactile.statistics.statistics import Statistics
@@ -55,7 +56,7 @@ class History(RuleBasedStateMachine):
         self.learner, self.reader = self.open(), self.open("read")
 
     def open(self, mode: str = "write", **settings_: Any) -> Any:
-        return opened(self.path, mode, embedding=EMBEDDINGS[self.state.embedding], **settings_)
+        return opened(self.path, mode, embedding=KIT.embeddings[self.state.embedding], **settings_)
 
     def do(self, operation: Any) -> None:
         self.state, result = after(self.state, operation, self.others)
@@ -98,16 +99,16 @@ class History(RuleBasedStateMachine):
 
     @rule()
     def refuse(self) -> None:
-        for observation in self.state.observed:
-            if observation.fixed:
-                self.do(("retract", observation.sequence))
+        for sequence, _ in self.state.listed:
+            if sequence not in self.state.loose:
+                self.do(("retract", sequence))
         for material, readings in (("a", np.full((50, 2), np.nan)), ("a", []), ("", np.zeros((50, 2)))):
             with pytest.raises(ValueError, match="expected"):
                 self.learner.observe(material, readings)
 
-    @rule(rng=randoms, scene=st.none() | st.lists(st.sampled_from(MATERIALS), min_size=1))
+    @rule(rng=randoms, scene=st.none() | st.lists(st.sampled_from(KIT.materials), min_size=1))
     def predict(self, rng: Any, scene: list[str] | None) -> None:
-        observed = {observation.material for observation in self.state.observed}
+        observed = set(self.state.materials)
         chosen = observed.intersection(scene or ())
         prediction = self.learner.predict(stream(touch(rng)), scene=chosen or None)
         assert {name for name, _ in prediction.ranking} == (chosen or observed)
@@ -125,7 +126,7 @@ class History(RuleBasedStateMachine):
     def abandon(self, readout: str) -> None:
         """Leave the memory as it lies on the disk, as a kill would, and go on from there."""
         before, self.path = self.path, self.home / f"memory-{next(self.names)}"
-        shutil.copytree(before, self.path, ignore=shutil.ignore_patterns("*-shm", "lock"))
+        shutil.copytree(before, self.path, ignore=shutil.ignore_patterns("lock"))
         self.learner.close()
         self.reader.close()
         self.learner, self.reader = self.open(readout=readout), self.open("read")
@@ -140,9 +141,9 @@ class History(RuleBasedStateMachine):
     def split_and_add(self, rng: Any) -> None:
         """The statistics of two memories that share the touches are, together, those of the one that observed all."""
         sides: tuple[list[Any], list[Any]] = ([], [])
-        for observation in self.state.observed:
-            sides[rng.randrange(2)].append(observation.pair)
-        ours, theirs = (fed(side, again=True, embedding=self.learner.embedding).memory.statistics for side in sides)
+        for pair in self.state.pairs:
+            sides[rng.randrange(2)].append(pair)
+        ours, theirs = (fed(tuple(side), self.state.embedding).memory.statistics for side in sides)
         whole = self.learner.memory.statistics
         assert ours + theirs == whole
         assert whole - ours == theirs
@@ -151,16 +152,17 @@ class History(RuleBasedStateMachine):
     @invariant()
     @precondition(lambda self: hasattr(self, "learner"))
     def is_counted(self) -> None:
-        assert sum(self.learner.materials.values()) == len(self.state.observed)
+        assert self.learner.materials == self.state.materials
 
     def agrees(self, learner: Any) -> None:
         """What a learner holds and answers is, to the byte, as if it had observed the list in another order."""
         assert seen(learner) == expected(self.state)
-        made = {"embedding": EMBEDDINGS[self.state.embedding], "readout": learner.settings.readout, "kept_touches": 5}
-        whole = fed(self.state.pairs, learner.descriptions, again=True, **made)
+        whole = fed(self.state.pairs, self.state.embedding, readout=learner.settings.readout)
+        for material, constituents in self.state.said.items():
+            whole.describe(material, constituents)
         if self.state.tuned is None:
             assert contents(learner) == contents(whole)
-        assert repr(learner.descriptions) == repr({name: dict(parts) for name, parts in self.state.said})
+        assert repr(learner.descriptions) == repr(dict(sorted(self.state.said.items())))
         if self.state.said:
             learner.settle()  # where an f* answers, `contents` did not
             assert repr(learner.compose(stream((7, 25)))) == repr(whole.compose(stream((7, 25))))

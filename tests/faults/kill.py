@@ -19,10 +19,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.persistence.open_memory
 from faults.common import folder, parser, progress, run, warnings_told
-from faults.model import Operation, Other, State, after, opened, perform, seen, settle, unsound_copies, warm
+from faults.learners import opened, perform, seen, warm
+from faults.model import Operation, State, after
 from faults.plans import KINDS, history, prepare
+from faults.trials import Trials, checkpoints_every
 from faults.zygote import Child, Zygote
 
 SNAPSHOT_EVERY = 6  # rows between checkpoints: some are written behind the back of most children
@@ -34,7 +35,7 @@ PATIENCE = 120  # seconds without a word from a child
 
 def work(channel: Connection, path: Path, home: Path, operations: list[Operation]) -> None:
     """The child: open the memory, do the operations; "close": close it; "idle": wait to be killed."""
-    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    checkpoints_every(SNAPSHOT_EVERY)
     with warnings_told(lambda text: channel.send(("warned", text))):
         channel.send(("begin", "open"))
         learner = opened(path)
@@ -42,9 +43,7 @@ def work(channel: Connection, path: Path, home: Path, operations: list[Operation
         channel.send(("seen", seen(learner)))
         for operation in operations:
             channel.send(("begin", operation[0]))
-            if operation[0] == "close":
-                learner.close()
-            channel.send(("done", None if operation[0] in ("close", "idle") else perform(learner, operation, home)))
+            channel.send(("done", None if operation == ("idle",) else perform(learner, operation, home)))
         time.sleep(PATIENCE)
 
 
@@ -61,25 +60,20 @@ class Durations:
         return rng.uniform(0, 0.95) * self._told.get(kind, 0.02 if kind != "idle" else 0.05)
 
 
-class Killing:
+class Killing(Trials):
     """One memory after another, killed again and again."""
 
-    def __init__(self, home: Path, seed: int, zygote: Zygote, others: dict[str, Other]) -> None:
-        self.home, self.zygote, self.others = home, zygote, others
-        self.rng = random.Random(seed)
-        self.durations = Durations()
+    def __init__(self, home: Path, seed: int, zygote: Zygote) -> None:
+        super().__init__(home, prepare(home))
+        self.zygote, self.rng, self.durations = zygote, random.Random(seed), Durations()
         self.landed: Counter[str] = Counter()
-        self.counts: Counter[str] = Counter()
-        self.failures: list[str] = []
-        self.memories = 0
-        self.kills = 0
+        self.memories = self.kills = 0
         self.begin_anew()
 
     def begin_anew(self) -> None:
         """Go on with a memory that is not there yet."""
         self.memories += 1
         self.path, self.state = self.home / f"memory-{self.memories}", State()
-        self.candidates = [self.state]
 
     def once(self) -> None:
         """One child, one kill, one look at what is left."""
@@ -91,7 +85,12 @@ class Killing:
         child = self.zygote.spawn(work, self.path, self.home, operations)
         told = self._listen(child, 0 if target == "open" else len(operations))
         self.kills += 1
+        before = len(self.failures)
         self._judge(operations, told)
+        if len(self.failures) > before:
+            self.tell()
+            progress(f"  {operations}\n  {told}\n  kept in {self.path}")
+            self.begin_anew()
 
     def _listen(self, child: Child, target: int) -> list[tuple[str, Any]]:
         """What the child says until it is killed, at a random instant of its operation number `target`."""
@@ -121,69 +120,49 @@ class Killing:
         self.failures += [f"{where}: the child warned: {text}" for text in warned]
         self.landed[begun[-1] if len(begun) > len(done) else "between two"] += 1
         if saw:
-            self._settle(saw[0], f"{where}, as the child opened it")
+            self.settled(f"{where}, as the child opened it", saw[0], [self.state])
         for operation, result in zip(operations, done[1:], strict=False):
-            self._acknowledge(operation, result, where)
-        self.candidates = [self.state]
-        if len(begun) > len(done) > 0 and (operation := operations[len(done) - 1])[0] in KINDS:
-            self.candidates.append(after(self.state, operation, self.others)[0])
-        self._look(where, operations, told)
-        if len(self.state.observed) > GROWN or self.rng.random() < 0.03:
+            self.counts[f"acknowledged: {operation[0]}"] += 1
+            if operation != ("idle",):
+                self.state, foretold = after(self.state, operation, self.others)
+                if result != foretold:
+                    self.failures.append(f"{where}: {operation} gave {result}, expected {foretold}")
+        candidates = [self.state]
+        if len(begun) > len(done) > 0 and (operation := operations[len(done) - 1]) != ("idle",):
+            candidates.append(after(self.state, operation, self.others)[0])
+        self._look(where, candidates)
+        if len(self.state.listed) > GROWN or self.rng.random() < 0.03:
             self.begin_anew()
 
-    def _acknowledge(self, operation: Operation, result: Any, where: str) -> None:
-        self.counts[f"acknowledged: {operation[0]}"] += 1
-        if operation[0] in KINDS:
-            self.state, foretold = after(self.state, operation, self.others)
-            if result != foretold:
-                self.failures.append(f"{where}: {operation} gave {result}, expected {foretold}")
-
-    def _look(self, where: str, operations: list[Operation], told: list[tuple[str, Any]]) -> None:
-        if not (self.path / "CURRENT").exists() and self.candidates == [State()]:
+    def _look(self, where: str, candidates: list[State]) -> None:
+        """Find which of the candidates it is; that one holds from now on."""
+        if not (self.path / "CURRENT").exists() and set(candidates) == {State()}:
             self.counts["no memory made yet"] += 1
             return
-        before = len(self.failures)
         # Half the time only as a reader, so that the next child finds what the kill left.
         mode = self.rng.choice(("read", "write"))
-        try:
-            with warnings_told(self.failures.append), opened(self.path, mode) as learner:
-                self._settle(seen(learner), f"{where}, opened to {mode}")
-            # It was the last that the child did, if at all.
-            self.failures += [f"{where}: {what}" for what in unsound_copies(self.path, [self.state])]
-        except Exception as error:
-            self.failures.append(f"{where}, opened to {mode}: {error!r}")
         self.counts[f"opened afterwards to {mode}"] += 1
-        if len(self.failures) > before:
-            progress(f"{self.failures[-1]}\n  {operations}\n  {told}\n  kept in {self.path}")
-            self.begin_anew()
-
-    def _settle(self, found: dict[str, Any], where: str) -> None:
-        """Find which of the candidates it is; that one holds from now on."""
-        state, differ = settle(found, self.candidates)
-        if state is None:
-            self.failures.append(f"{where}: differs from all candidates, in {differ}")
-            return
-        if len(self.candidates) > 1:
-            self.counts["begun, and found " + ("done" if state is self.candidates[1] else "not done")] += 1
-        self.state, self.candidates = state, [state]
+        with self.examined(f"{where}, opened to {mode}"), warnings_told(self.failures.append):
+            with opened(self.path, mode) as learner:
+                self.state = self.require(f"{where}, opened to {mode}", learner, candidates)
+            # It was the last that the child did, if at all.
+            self.require_copies(where, self.path, [self.state])
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """Kill as often as asked."""
-    kills = 10 if options.quick else options.kills
     warm()
     with Zygote() as zygote, folder(options) as home:
-        killing = Killing(home, options.seed, zygote, prepare(home))
-        for number in range(kills):
+        killing = Killing(home, options.seed, zygote)
+        for number in range(3 if options.quick else options.kills):
             killing.once()
             if number % 100 == 99:
-                progress(f"{number + 1} kills, {len(killing.failures)} failures")
+                killing.tell(f"{number + 1} kills")
     return {
         "kills": killing.kills,
         "memories": killing.memories,
         "landed in": dict(sorted(killing.landed.items())),
-        "counts": dict(sorted(killing.counts.items())),
-        "failures": killing.failures,
+        **killing.figures(),
     }
 
 

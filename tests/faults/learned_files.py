@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from touches import stream
 
-from faults.model import EMBEDDINGS, Pairs, State
+from faults.learners import KIT
+from faults.model import Pairs, State
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.sources import SourceOptions
 
@@ -36,7 +37,7 @@ def learn_files(path: Path, state: State, touches: Pairs) -> int:
             np.save(files[-1], stream(touch).astype(np.float32))
         destination = Path(home, "m")
         path.rename(destination)  # with what the run keeps beside it
-        made = {"embedding": EMBEDDINGS[state.embedding], "client": Here(), "add": True}
+        made = {"embedding": KIT.embeddings[state.embedding], "client": Here(), "add": True}
         done = learn(destination, files, SourceOptions(by="folder"), **made)
         assert not done.refused, done.refused
         destination.rename(path)

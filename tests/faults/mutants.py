@@ -20,7 +20,9 @@ TEXTS = ("", "x", "a", "ü", "NaN", "\x1b]0;pwned\x07\x1b[2J", "two\nlines", "\u
 TEXTS += ("../../etc/passwd", "kernels", "<U1000000000", "|O", "a" * 100_000, " a ", "\x7f", "-1")
 VALUES = (*NUMBERS, *TEXTS, None, True, False, 0.5, -0.0, 1e308, 5e-324, float("nan"), float("inf"), [], {}, [[]])
 VALUES += ([1], [None], {"x": 1}, [[1, 10**12]], [[1, 1], [1, 1]], [[5, 1]], [-1], {"a": {"b": [1, {"c": 2}]}})
+SHAPES: tuple[tuple[int, ...], ...] = ((2**40,), (0,), (2**63, 2), (-1,), (1,) * 65, (2**32, 2**32), ())
 DTYPES = ("|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U3")
+MORE_DTYPES = (*DTYPES, "|O", "<U1000000000", ">i4", "i", "<M8[s]", "|V8", "i4,i4", "\xff")
 NAMES = ("", "x", "readings", "readings-rest", "readings-shape", "readings-zero", "readings-2e-8", "readings-2e9999")
 NAMES += ("codes-15", "codes-015", "codes-0", "codes-x", "codes-1048576", "codes-99999", "codes--1")
 NAMES += ("codes-" + "9" * 60, "zarr.json", "../x", "__x", "c", "READINGS", "exemplar-readings", "tuned-0", "a" * 100)
@@ -92,10 +94,8 @@ def mutated_json(rng: random.Random, value: Any) -> tuple[str, str]:
             parent[rng.choice(TEXTS)] = copy.deepcopy(rng.choice((node, *VALUES)))
     text = _dumped(value)
     if rng.random() < 0.03:
-        place = rng.randrange(len(text) + 1)
-        return f"{told}, text broken", text[:place] + rng.choice(("", ",", "\\ud800", "}", "1e999", "\x00")) + text[
-            place:
-        ]
+        place, more = rng.randrange(len(text) + 1), rng.choice(("", ",", "\\ud800", "}", "1e999", "\x00"))
+        return f"{told}, text broken", text[:place] + more + text[place:]
     return ", ".join(told), text
 
 
@@ -181,16 +181,7 @@ def mutated_payload(rng: random.Random, payload: bytes) -> tuple[str, bytes]:
     array = arrays[at]
     kind = rng.choice(("shape", "codec", "size", "stored", "name", "dtype", "version", "count", *["frame"] * 6))
     if kind == "shape":
-        shapes: list[tuple[int, ...]] = [
-            (2**40,),
-            (0,),
-            (2**63, 2),
-            (-1,),
-            (1,) * 65,
-            (2**32, 2**32),
-            array.shape[::-1],
-            (),
-        ]
+        shapes = (*SHAPES, array.shape[::-1])
         array = replace(array, shape=rng.choice(shapes))
         if rng.random() < 0.5:
             array = replace(array, size=int(np.prod([float(n) for n in array.shape])) % 2**64)
@@ -201,9 +192,7 @@ def mutated_payload(rng: random.Random, payload: bytes) -> tuple[str, bytes]:
     elif kind == "name":
         array = replace(array, name=rng.choice((*NAMES, "\xff", "a\x00b"))[:255])
     elif kind == "dtype":
-        array = replace(
-            array, dtype=rng.choice((*DTYPES, "|O", "<U1000000000", ">i4", "i", "<M8[s]", "|V8", "i4,i4", "\xff"))
-        )
+        array = replace(array, dtype=rng.choice(MORE_DTYPES))
     elif kind == "frame":
         told, buffer = mutated_frame(rng, array.buffer)
         array = replace(array, buffer=buffer)

@@ -27,6 +27,9 @@ STRANGE_FILES = ("LOG", "LOG", "CURRENT", "CURRENT", "CURRENT.new", "log-0000000
 STRANGE_FILES += ("LOG.damaged", "log-x", "holder.json", "holder.json.new", "checkpoints", "GROUP", "GROUP/zarr.json")
 STRANGE_FILES += ("ARRAY", "ARRAY/zarr.json", "ARRAY/c", "ARRAY/c/0", "checkpoints/99999999", "GROUP.damaged")
 STRANGE_FILES += ("checkpoints/00000099.partial", "derived", "derived/x")
+KINDS = ("link", "link", "link", "loop", "nowhere", "pipe", "device", "folder", "sparse", "hard", "socket")
+INSIDE = ("12345", "file", "memory", "memory/CURRENT", "12345/data", ".", "memory/checkpoints")
+DEVICES = tuple(map(Path, ("/dev/zero", "/dev/full", "/proc/self/mem")))
 
 
 def strange_file(rng: random.Random, path: Path, scene: Scene) -> str:
@@ -40,24 +43,13 @@ def strange_file(rng: random.Random, path: Path, scene: Scene) -> str:
         first = groups[0]
         array = rng.choice(sorted(folder.parent for folder in first.glob("*/zarr.json")))
         target = path / name.replace("GROUP", str(first)).replace("ARRAY", str(array))
-    kind = rng.choice(
-        ("link", "link", "link", "loop", "nowhere", "pipe", "device", "folder", "sparse", "hard", "socket")
-    )
+    kind = rng.choice(KINDS)
     moved = path.parent / "moved"
     if os.path.lexists(target):
         target.rename(moved)
     target.parent.mkdir(parents=True, exist_ok=True)
     if kind == "link":
-        inside = ("12345", "file", "memory", "memory/CURRENT", "12345/data", ".", "memory/checkpoints")
-        to = rng.choice(
-            (
-                *(scene.watched / name for name in inside),
-                moved,
-                Path("/dev/zero"),
-                Path("/dev/full"),
-                Path("/proc/self/mem"),
-            )
-        )
+        to = rng.choice((*(scene.watched / name for name in INSIDE), moved, *DEVICES))
         target.symlink_to(to)
         kind = f"link to {to.name}"
     elif kind in ("loop", "nowhere"):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
-from faults.planting import Patches, nothing
+from faults.planting import bug, nothing
 from scroll_tactile.persistence import ledger
 from store import backup, checkpoint_files, checkpoints, layout, log_writer
 from store.exceptions import reported
@@ -15,199 +16,102 @@ from store.files import sync_file, sync_folder, sync_tree
 from store.layout import Current
 
 
-def unsynced(_: Any) -> Any:
+@bug("CURRENT is not synced", layout, "replacing")
+@bug("a checkpoint's files are not synced", checkpoint_files, "replacing")
+@bug("a backup is not synced", backup, "replacing")
+@contextmanager
+def unsynced(_: Any, path: Path, draft: Path) -> Iterator[None]:
     """As `replacing`, without a sync of the draft."""
-
-    @contextmanager
-    def replacing(path: Path, draft: Path) -> Iterator[None]:
-        yield
-        draft.replace(path)
-        sync_folder(path.parent)
-
-    return replacing
+    yield
+    draft.replace(path)
+    sync_folder(path.parent)
 
 
-def unsynced_name(_: Any) -> Any:
+@bug("the folder is not synced", layout, "replacing")
+@bug("the folder of checkpoints is not synced", checkpoint_files, "replacing")
+@contextmanager
+def unsynced_name(_: Any, path: Path, draft: Path) -> Iterator[None]:
     """As `replacing`, without a sync of the folder."""
+    yield
+    (sync_tree if draft.is_dir() else sync_file)(draft)
+    draft.replace(path)
 
-    @contextmanager
-    def replacing(path: Path, draft: Path) -> Iterator[None]:
+
+@bug("the log is not synced", log_writer, "sync_open")
+def _no_sync_of_the_log(sync: Any, descriptor: int, *, data_only: bool = False) -> None:
+    if not data_only:
+        sync(descriptor)
+
+
+@bug("a new log is not synced", log_writer, "create_log", everywhere=True)
+@bug("what a killed writer left is not synced", log_writer.LogWriter, "__init__")
+def _without_syncs(call: Any, *given: Any, **named: Any) -> Any:
+    with (
+        mock.patch.object(log_writer, "sync_open", nothing),
+        mock.patch.object(log_writer, "replacing", lambda path, draft: unsynced(None, path, draft)),
+    ):
+        return call(*given, **named)
+
+
+@bug("CURRENT is renamed before it is synced", layout, "write_current", everywhere=True)
+def _rename_before_sync(_: Any, folder: Path, current: Current) -> None:
+    draft = folder / "CURRENT.new"
+    draft.write_bytes(current.to_bytes())
+    draft.replace(folder / "CURRENT")
+    sync_folder(folder)
+    sync_file(folder / "CURRENT")
+
+
+LATE: list[Path] = []  # checkpoints that are synced behind `CURRENT`
+
+
+@bug("CURRENT comes before its checkpoint is durable", checkpoint_files, "replacing")
+@contextmanager
+def _noted_as_late(_: Any, path: Path, draft: Path) -> Iterator[None]:
+    with unsynced(None, path, draft):
         yield
-        (sync_tree if draft.is_dir() else sync_file)(draft)
-        draft.replace(path)
-
-    return replacing
+    LATE.append(path)
 
 
-def _no_sync_of_the_log(patch: Patches) -> None:
-    def make(sync: Any) -> Any:
-        return lambda descriptor, *, data_only=False: None if data_only else sync(descriptor)
+@bug("CURRENT comes before its checkpoint is durable", layout, "write_current", everywhere=True)
+def _late_synced_behind(write: Any, folder: Path, current: Current) -> None:
+    write(folder, current)
+    while LATE:
+        if (path := LATE.pop()).exists():
+            sync_tree(path)
 
-    patch(log_writer, "sync_open", make)
+
+@bug("what is replaced is removed before CURRENT", checkpoints, "write_current")
+def _removed_too_early(write: Any, folder: Path, current: Current) -> None:
+    layout.remove_unnamed(folder, current)
+    write(folder, current)
 
 
-def _unsynced(call: Any) -> Any:
-    """The same, and nothing of the log is synced meanwhile."""
-
-    def done(*given: Any, **named: Any) -> Any:
-        before = log_writer.sync_open, log_writer.replacing
-        log_writer.sync_open, log_writer.replacing = nothing(None), unsynced(None)
+@bug("the commit frame is written first", log_writer.LogWriter, "commit")
+def _commit_frame_first(_: Any, self: Any) -> None:
+    if self._next == self.place:
+        return
+    with reported(self.path, "making a batch durable"):
         try:
-            return call(*given, **named)
-        finally:
-            log_writer.sync_open, log_writer.replacing = before
-
-    return done
-
-
-def _no_sync_of_a_new_log(patch: Patches) -> None:
-    patch.everywhere(log_writer, "create_log", _unsynced)
-
-
-def _no_sync_of_current(patch: Patches) -> None:
-    patch(layout, "replacing", unsynced)
+            last = self._pack(1, b"")
+            begin, staged = self._written, bytes(self._staged)
+            self._file.write(begin + len(staged) - 88, staged[-88:])
+            log_writer.sync_open(self._file.descriptor, data_only=True)
+            self._write()
+        except BaseException:
+            self.rollback()
+            raise
+        self._last, self.place, self._settled = last, self._next, True
 
 
-def _no_sync_of_a_checkpoint(patch: Patches) -> None:
-    patch(checkpoint_files, "replacing", unsynced)
+@bug("a rollback does not cut the log", log_writer.LogWriter, "_settle")
+def _rollback_without_cut(_: Any, self: Any) -> None:
+    self._settled = True
 
 
-def _no_sync_of_a_folder(patch: Patches) -> None:
-    patch(layout, "replacing", unsynced_name)
-
-
-def _no_sync_of_checkpoints(patch: Patches) -> None:
-    patch(checkpoint_files, "replacing", unsynced_name)
-
-
-def _no_sync_of_a_backup(patch: Patches) -> None:
-    patch(backup, "replacing", unsynced)
-
-
-def _no_sync_at_opening(patch: Patches) -> None:
-    patch(log_writer.LogWriter, "__init__", _unsynced)
-
-
-def _rename_before_sync(patch: Patches) -> None:
-    def make(_: Any) -> Any:
-        def write(folder: Path, current: Current) -> None:
-            draft = folder / "CURRENT.new"
-            draft.write_bytes(current.to_bytes())
-            draft.replace(folder / "CURRENT")
-            sync_folder(folder)
-            sync_file(folder / "CURRENT")
-
-        return write
-
-    patch.everywhere(layout, "write_current", make)
-
-
-def _current_before_checkpoint(patch: Patches) -> None:
-    late: list[Path] = []
-
-    def make_replacing(_: Any) -> Any:
-        @contextmanager
-        def replacing(path: Path, draft: Path) -> Iterator[None]:
-            with unsynced(None)(path, draft):
-                yield
-            late.append(path)
-
-        return replacing
-
-    def make_write(write: Any) -> Any:
-        def written(folder: Path, current: Current) -> None:
-            write(folder, current)
-            while late:
-                if (path := late.pop()).exists():
-                    sync_tree(path)
-
-        return written
-
-    patch(checkpoint_files, "replacing", make_replacing)
-    patch.everywhere(layout, "write_current", make_write)
-
-
-def _removed_too_early(patch: Patches) -> None:
-    def make(write: Any) -> Any:
-        def written(folder: Path, current: Current) -> None:
-            layout.remove_unnamed(folder, current)
-            write(folder, current)
-
-        return written
-
-    patch(checkpoints, "write_current", make)
-
-
-def _commit_frame_first(patch: Patches) -> None:
-    def make(whole: Any) -> Any:
-        def commit(self: Any) -> None:
-            if self._next == self.place:
-                return
-            try:
-                last = self._pack(1, b"")
-                begin, staged = self._written, bytes(self._staged)
-                self._file.write(begin + len(staged) - 88, staged[-88:])
-                log_writer.sync_open(self._file.descriptor, data_only=True)
-                self._write()
-            except BaseException:
-                self.rollback()
-                raise
-            self._last, self.place, self._settled = last, self._next, True
-
-        def told(self: Any) -> None:
-            with reported(self.path, "making a batch durable"):
-                commit(self)
-
-        return told
-
-    patch(log_writer.LogWriter, "commit", make)
-
-
-def _rollback_without_cut(patch: Patches) -> None:
-    def make(_: Any) -> Any:
-        def settle(self: Any) -> None:
-            self._settled = True
-
-        return settle
-
-    patch(log_writer.LogWriter, "_settle", make)
-
-
-def _without_batch(change: Any) -> Any:
-    """The same change of a ledger, and each of its rows is durable by itself."""
-
-    def done(self: Any, *given: Any, **named: Any) -> Any:
-        before, self.store.batch = self.store.batch, nullcontext
-        try:
-            return change(self, *given, **named)
-        finally:
-            self.store.batch = before
-
-    return done
-
-
-def _relabel_in_two(patch: Patches) -> None:
-    patch(ledger.Ledger, "relabel", _without_batch)
-
-
-def _merge_in_parts(patch: Patches) -> None:
-    patch(ledger.Ledger, "merge", _without_batch)
-
-
-WRITES: dict[str, Callable[[Patches], None]] = {
-    "the log is not synced": _no_sync_of_the_log,
-    "a new log is not synced": _no_sync_of_a_new_log,
-    "CURRENT is not synced": _no_sync_of_current,
-    "a checkpoint's files are not synced": _no_sync_of_a_checkpoint,
-    "the folder is not synced": _no_sync_of_a_folder,
-    "the folder of checkpoints is not synced": _no_sync_of_checkpoints,
-    "a backup is not synced": _no_sync_of_a_backup,
-    "what a killed writer left is not synced": _no_sync_at_opening,
-    "CURRENT is renamed before it is synced": _rename_before_sync,
-    "CURRENT comes before its checkpoint is durable": _current_before_checkpoint,
-    "what is replaced is removed before CURRENT": _removed_too_early,
-    "the commit frame is written first": _commit_frame_first,
-    "a rollback does not cut the log": _rollback_without_cut,
-    "relabel is not atomic": _relabel_in_two,
-    "a merge is not atomic": _merge_in_parts,
-}
+@bug("relabel is not atomic", ledger.Ledger, "relabel")
+@bug("a merge is not atomic", ledger.Ledger, "merge")
+def _without_batch(change: Any, self: Any, *given: Any, **named: Any) -> Any:
+    """Each row of the change is durable by itself."""
+    with mock.patch.object(self.store, "batch", nullcontext):
+        return change(self, *given, **named)

@@ -1,48 +1,79 @@
-"""What is replaced in a module or a class, for a while: a bug is put in so."""
+"""Bugs to be put in, by name, so that it shows that the simulation finds such ones.
+
+A bug is a list of replacements in modules and classes, which last as long as `planted(name)` does.
+"""
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
+from unittest import mock
 
 
-class Patches:
-    """What was replaced, to be put back."""
+@dataclass(frozen=True)
+class Replacement:
+    """What stands in the place of an attribute: what `make` makes of it.
 
-    def __init__(self) -> None:
-        self._before: list[tuple[Any, str, Any]] = []
+    everywhere: also in each module that imported it. spoilt: the function that is called in its place, if any.
+    """
 
-    def __call__(self, where: Any, name: str, make: Callable[[Any], Any]) -> None:
-        """Replace something by what `make` makes of it."""
-        raw = vars(where)[name]
-        before = (
-            raw.__func__
-            if isinstance(raw, classmethod | staticmethod)
-            else raw.fget
-            if isinstance(raw, property)
-            else raw
-        )
-        made = make(before)
-        kind = type(raw) if isinstance(raw, classmethod | staticmethod | property) else None
-        self._before.append((where, name, raw))
-        setattr(where, name, kind(made) if kind else made)
+    where: Any
+    name: str
+    make: Callable[[Any], Any]
+    everywhere: bool = False
+    spoilt: Callable[..., Any] | None = None
 
-    def everywhere(self, where: Any, name: str, make: Callable[[Any], Any]) -> None:
-        """Replace a function in each module that imported it, too."""
-        before = vars(where)[name]
-        made = make(before)
-        for module in [one for key, one in sys.modules.items() if key.startswith(("store", "scroll_tactile"))]:
-            if vars(module).get(name) is before:
-                self(module, name, lambda _: made)
+    def before(self) -> Any:
+        """The attribute as it is; raises KeyError where there is none of its own."""
+        return vars(self.where)[self.name]
 
-    def undo(self) -> None:
-        """Put all back."""
-        for where, name, before in reversed(self._before):
-            setattr(where, name, before)
-        self._before = []
+    def patches(self) -> list[Any]:
+        """Of each place the patch."""
+        before, places = self.before(), [self.where]
+        made = self.make(before)
+        if self.everywhere:
+            modules = [module for key, module in sys.modules.items() if key.startswith(("store", "scroll_tactile"))]
+            places += [each for each in modules if each is not self.where and vars(each).get(self.name) is before]
+        return [mock.patch.object(place, self.name, made) for place in places]
 
 
-def nothing(_: Any) -> Any:
+BUGS: dict[str, list[Replacement]] = {}
+
+
+def bug(title: str, where: Any, name: str, *, everywhere: bool = False) -> Callable[[Any], Any]:
+    """Have a function stand in the place of another in bug `title`; it gets the other, then what the call is given."""
+
+    def note(spoilt: Any) -> Any:
+        def make(before: Any) -> Any:
+            if isinstance(before, property):
+                return property(functools.partial(spoilt, before.fget))
+            kind = type(before) if isinstance(before, classmethod | staticmethod) else None
+            own = before.__func__ if kind else before
+
+            def called(*given: Any, **named: Any) -> Any:
+                return spoilt(own, *given, **named)
+
+            return kind(called) if kind else called
+
+        BUGS.setdefault(title, []).append(Replacement(where, name, make, everywhere, spoilt))
+        return spoilt
+
+    return note
+
+
+@contextmanager
+def planted(title: str) -> Iterator[None]:
+    """While it lasts the bug is there."""
+    with ExitStack() as stack:
+        for replacement in BUGS[title]:
+            for patch in replacement.patches():
+                stack.enter_context(patch)
+        yield
+
+
+def nothing(*_: Any, **named: Any) -> None:
     """What does nothing, in the place of a call."""
-    return lambda *given, **named: None

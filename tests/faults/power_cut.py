@@ -23,31 +23,19 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import scroll_tactile.persistence.open_memory
 from faults import shim as watch
-from faults.common import folder, parser, progress, run, warnings_told
+from faults.common import folder, parser, run, warnings_told
 from faults.disks import STYLES, Disk, Event, events
-from faults.model import (
-    Operation,
-    Other,
-    State,
-    after,
-    expected,
-    one_scale,
-    opened,
-    perform,
-    seen,
-    settle,
-    unsound_copies,
-    warm,
-)
+from faults.learners import expected, one_scale, opened, perform, seen, warm
+from faults.model import Operation, State, after
 from faults.plans import KINDS, draw, history, prepare
 from faults.shim import Shim
+from faults.trials import Trials, checkpoints_every
 
 SNAPSHOT_EVERY = 6
 LENGTH = 12  # operations of a history
 OF_EACH = 60  # disks of a history
-ENDS = ("open", "close")
+QUICK = 12  # disks
 
 
 @dataclass
@@ -74,20 +62,16 @@ WITHOUT = {
 }
 
 
-class Cutting:
+class Cutting(Trials):
     """Histories, and the disks that they may leave."""
 
     def __init__(self, home: Path, seed: int, without: str) -> None:
-        self.home = home
+        super().__init__(home, prepare(home))
         self.left_out = WITHOUT[without]
-        self.shim = Shim()
-        self.rng = random.Random(seed)
-        self.others: dict[str, Other] = prepare(home)
-        self.counts: Counter[str] = Counter()
+        self.shim, self.rng = Shim(), random.Random(seed)
         self.cut_in: Counter[str] = Counter()
         self.styles: Counter[str] = Counter()
         self.unsafe: list[int] = []
-        self.failures: list[str] = []
         self.disks = self.events = self.histories = 0
 
     def _planned(self, state: State) -> list[Operation]:
@@ -110,14 +94,12 @@ class Cutting:
         learner: Any = None
         for number, operation in enumerate(operations):
             self.shim.mark(f"begin {number}")
-            if operation[0] == "open":
+            if operation == ("open",):
                 learner, result = opened(root / "memory"), None
-            elif operation[0] == "close":
-                result = learner.close()
             else:
                 result = perform(learner, operation, self.home)
             self.shim.mark(f"done {number}")
-            then, foretold = (states[-1], None) if operation[0] in ENDS else after(states[-1], operation, self.others)
+            then, foretold = after(states[-1], operation, self.others)
             states.append(then)
             if result != foretold:
                 self.failures.append(f"history {self.histories}: {operation} gave {result}, expected {foretold}")
@@ -141,62 +123,49 @@ class Cutting:
                 i += 1
             number = bisect.bisect_right([begin for begin, _ in instants], place) - 1
             state = self._look(disk, recorded, number, done=place >= instants[number][1], place=place)
+            self.tell()
         return state
 
     def _look(self, disk: Disk, recorded: Recorded, number: int, *, done: bool, place: int) -> State | None:
-        style = self.rng.choice(STYLES)
-        to = self.home / "disk"
+        style, to, operation = self.rng.choice(STYLES), self.home / "disk", recorded.operations[number]
         shutil.rmtree(to, ignore_errors=True)
         disk.rebuilt(to, self.rng, style)
-        operation = recorded.operations[number]
         self.disks += 1
         self.styles[style] += 1
         self.cut_in["between two" if done else operation[0]] += 1
         self.unsafe.append(disk.unsafe())
         where = f"history {self.histories - 1}, event {place}, {'after' if done else 'in'} {operation}, style {style!r}"
         candidates = [recorded.states[number + 1]] if done else recorded.states[number : number + 2]
-        before = len(self.failures)
-        state = None
-        try:
-            with warnings_told(lambda text: self.failures.append(f"{where}: warned {text}")):
-                made = sum(operation == ("backup",) for operation in recorded.operations[: number + done])
-                there = len([path for path in to.glob("*-copy-*") if not path.name.endswith(".partial")])
-                if there - made not in (0, operation == ("backup",)):
-                    self.failures.append(f"{where}: {there} backups are there of {made} that were acknowledged")
-                wrong = unsound_copies(to / "memory", recorded.states[: number + 1])
-                self.failures += [f"{where}: {what}" for what in wrong]
-                state = self._opens(where, to / "memory", candidates)
-        except Exception as error:
-            self.failures.append(f"{where}: {error!r}")
-        if len(self.failures) > before:
-            progress(self.failures[-1])
-            return None
-        return state
+        before, state = len(self.failures), None
+        warned = lambda text: self.failures.append(f"{where}: warned {text}")  # noqa: E731
+        with self.examined(where), warnings_told(warned):
+            made = recorded.operations[: number + done].count(("backup",))
+            there = len([path for path in to.glob("*-copy-*") if not path.name.endswith(".partial")])
+            if there - made not in (0, operation == ("backup",)):
+                self.failures.append(f"{where}: {there} backups are there of {made} that were acknowledged")
+            self.require_copies(where, to / "memory", recorded.states[: number + 1])
+            with opened(to / "memory") as learner:
+                state = self.settled(where, learner, candidates)
+                if state is not None and self.rng.random() < 0.3:
+                    state = self._gone_on(where, learner, state)
+        return None if len(self.failures) > before else state
 
-    def _opens(self, where: str, path: Path, candidates: list[State]) -> State | None:
-        """Open a disk, find which state it is in, and go on from it."""
-        with opened(path) as learner:
-            state, differ = settle(seen(learner), candidates)
-            if state is None:
-                self.failures.append(f"{where}: differs in {differ}")
-                return None
-            if len(candidates) > 1 and candidates[0] != candidates[1]:
-                self.counts["begun, and found " + ("done" if state is candidates[1] else "not done")] += 1
-            if self.rng.random() < 0.3:
-                operation = draw(self.rng, state, self.others, self.rng.choice(KINDS))
-                if operation[0] == "pack":  # the history that is cut reads its own again
-                    operation = ("pack", f"{operation[1]}-{self.disks}", *operation[2:])
-                state, foretold = after(state, operation, self.others)
-                if (result := perform(learner, operation, self.home)) != foretold or seen(learner) != expected(state):
-                    self.failures.append(f"{where}: going on, {operation} gave {result}, expected {foretold}")
-                self.counts["gone on from"] += 1
+    def _gone_on(self, where: str, learner: Any, state: State) -> State:
+        """A further operation, and the state after it."""
+        operation = draw(self.rng, state, self.others, self.rng.choice(KINDS))
+        if operation[0] == "pack":  # the history that is cut reads its own again
+            operation = ("pack", f"{operation[1]}-{self.disks}", *operation[2:])
+        state, foretold = after(state, operation, self.others)
+        if (result := perform(learner, operation, self.home)) != foretold or seen(learner) != expected(state):
+            self.failures.append(f"{where}: going on, {operation} gave {result}, expected {foretold}")
+        self.counts["gone on from"] += 1
         return state
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many disks as asked."""
-    disks = 30 if options.quick else options.disks
-    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    disks = QUICK if options.quick else options.disks
+    checkpoints_every(SNAPSHOT_EVERY)
     one_scale()
     warm()
     with folder(options, in_memory=True) as home:
@@ -210,7 +179,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
                 (home / "disk").rename(root)
             disk, recorded = cutting.record(root, state)
             state = cutting.cut(disk, recorded, min(OF_EACH, disks - cutting.disks))
-            progress(f"{cutting.disks} disks, {len(cutting.failures)} failures")
+            cutting.tell(f"{cutting.disks} disks")
     return {
         "disks": cutting.disks,
         "without syncs of": options.without or "none",
@@ -219,8 +188,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
         "changes not synced, median": sorted(cutting.unsafe)[len(cutting.unsafe) // 2],
         "cut in": dict(sorted(cutting.cut_in.items())),
         "styles": dict(sorted(cutting.styles.items())),
-        "counts": dict(sorted(cutting.counts.items())),
-        "failures": cutting.failures,
+        **cutting.figures(),
     }
 
 

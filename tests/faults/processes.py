@@ -28,10 +28,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from touches import stream
 
-import scroll_tactile.persistence.open_memory
 from faults.common import folder, parser, progress, run, warnings_told
-from faults.model import Operation, State, after, expected, opened, perform, seen, warm
+from faults.learners import expected, opened, perform, seen, warm
+from faults.model import Operation, State, after
 from faults.plans import draw
+from faults.trials import checkpoints_every
 from faults.zygote import Zygote
 from store import CompactedError, LockedError
 
@@ -120,7 +121,7 @@ def _taken_over(path: Path, children: list[Any], told: Counter[str], failures: l
 
 def write(channel: Connection, path: Path, seed: int, seconds: float) -> None:
     """The writer: random operations; tells each, the instants of its beginning and its end, and what it returned."""
-    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    checkpoints_every(SNAPSHOT_EVERY)
     rng, state = random.Random(seed), State()
     with opened(path) as learner:
         channel.send("ready")
@@ -268,9 +269,9 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
     failures: list[str] = []
     warm()
     with Zygote() as zygote, folder(options) as home:
-        raced = locks(home, zygote, 3 if options.quick else options.races, failures)
+        raced = locks(home, zygote, 2 if options.quick else options.races, failures)
         progress(f"races: {len(failures)} failures")
-        seconds, readers = (3.0, 2) if options.quick else (options.seconds, options.readers)
+        seconds, readers = (1.5, 2) if options.quick else (options.seconds, options.readers)
         seen_under = under_a_writer(home, zygote, readers, seconds, options.seed, failures)
     return {"locks": raced, "readers": seen_under, "failures": failures}
 

@@ -6,10 +6,7 @@ raises `Wrong` where something is not as it has to be.
 
 from __future__ import annotations
 
-import hashlib
-import logging
 import math
-import os
 import random
 import shutil
 from collections.abc import Callable, Iterator
@@ -22,8 +19,10 @@ import numpy as np
 from touches import stream
 from typer.testing import CliRunner
 
-from faults.common import Warnings
-from faults.model import Operation, _kept, _pool, opened, perform
+from faults.cases import Wrong
+from faults.common import fingerprint, warnings_told
+from faults.learners import opened, perform, samples
+from faults.model import Operation
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.cli.application import app
 from scroll_tactile.errors import ScrollTactileError
@@ -33,7 +32,6 @@ from store import Store, StoreError, check_store, repair_store
 
 OURS = (ScrollTactileError, StoreError)
 GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
-NEVER = 2**40
 TOUCHES: tuple[Operation, ...] = tuple(("observe", name, (i, 30)) for i in range(2) for name in "ab")
 HISTORIES: dict[str, tuple[Operation, ...]] = {
     "rows": TOUCHES,
@@ -46,10 +44,6 @@ HISTORIES: dict[str, tuple[Operation, ...]] = {
 WITHOUT_CHECKPOINT = ("rows", "crashed")
 
 
-class Wrong(Exception):
-    """Something is not as it has to be."""
-
-
 @dataclass
 class Memory:
     """A memory of the corpus: where it lies, what it holds, and what it held behind each of its earlier rows."""
@@ -59,24 +53,12 @@ class Memory:
     seen: dict[str, Any]
     earlier: list[dict[str, Any]] = field(default_factory=list)
 
-    @property
-    def files(self) -> list[Path]:
-        """Its files, as paths in it."""
-        return sorted(file.relative_to(self.path) for file in self.path.rglob("*") if file.is_file())
-
 
 def glance(learner: TactileLearner) -> dict[str, Any]:
-    """What can be seen of a learner without an answer of it; as `faults.model.seen`, and quickly."""
-    memory = learner._ledger.memory
-    return {
-        "materials": learner.materials,
-        "digest": learner.digest(),
-        "descriptions": repr(learner.descriptions),
-        "exemplars": sorted((name, key.hex()) for name, key, _ in memory.exemplars or ()),
-        "tuned": learner.tuned_digest(),
-        "pool": _pool(learner),
-        "kept": _kept(learner) if memory.kept is not None else None,
-    }
+    """What can be seen of a learner without an answer of it, and without its journal."""
+    exemplars = sorted((name, key.hex()) for name, key, _ in learner.memory.exemplars or ())
+    told = {"materials": learner.materials, "descriptions": repr(learner.descriptions), "exemplars": exemplars}
+    return samples(learner) | told | {"tuned": learner.tuned_digest()}
 
 
 def corpus(home: Path) -> list[Memory]:
@@ -103,23 +85,6 @@ def corpus(home: Path) -> list[Memory]:
     with TactileLearner.open(home / "golden", mode="read") as learner:
         made.append(Memory("golden", home / "golden", glance(learner)))
     return made
-
-
-def fingerprint(path: Path) -> dict[str, Any]:
-    """Everything in a folder: of each thing its type and, by that, its bytes or where it points."""
-    found: dict[str, Any] = {}
-    for entry in sorted(os.scandir(path), key=lambda entry: entry.name) if path.is_dir() else ():
-        about = entry.stat(follow_symlinks=False)
-        if entry.is_symlink():
-            found[entry.name] = str(Path(entry.path).readlink())
-        elif entry.is_dir():
-            found[entry.name] = about.st_mode
-            found |= {f"{entry.name}/{name}": what for name, what in fingerprint(Path(entry.path)).items()}
-        elif entry.is_file() and about.st_size < 2**24:
-            found[entry.name] = hashlib.sha256(Path(entry.path).read_bytes()).hexdigest()
-        else:
-            found[entry.name] = (about.st_mode, about.st_size)
-    return found
 
 
 @dataclass
@@ -189,16 +154,8 @@ class Target:
 def heard() -> Iterator[list[str]]:
     """The warnings that are logged meanwhile."""
     found: list[str] = []
-    handler = Warnings(found.append)
-    loggers = [logging.getLogger(name) for name in ("store", "scroll_tactile")]
-    for logger in loggers:
-        logger.addHandler(handler)
-        logger.propagate = False
-    try:
+    with warnings_told(found.append):
         yield found
-    finally:
-        for logger in loggers:
-            logger.removeHandler(handler)
 
 
 def touch_of(learner: TactileLearner) -> np.ndarray:

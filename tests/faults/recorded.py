@@ -8,17 +8,13 @@ file that is made or changed elsewhere; a file elsewhere that is opened; a progr
 
 from __future__ import annotations
 
-import faulthandler
 import json
 import os
 import random
 import resource
 import shutil
-import signal
 import sys
 import tempfile
-import time
-import traceback
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,10 +24,10 @@ from typing import Any, TextIO
 import numpy as np
 from made import FORMATS
 
-from faults.bench import SECONDS, Told, begin_peak, is_memory, limit_addresses, peak, place, remove, size
+from faults.cases import Cases, Told, limit_addresses, remove, size
+from faults.common import fingerprint
 from faults.mutants import mutated_bytes, mutated_json
 from faults.odd_recordings import made, mutated_lines, spiced
-from faults.received import fingerprint
 from faults.recording_attacks import ATTACKS, SECRET, special
 from scroll_tactile.errors import InputError
 from scroll_tactile.recordings import describe, find, iterate, read
@@ -39,6 +35,7 @@ from scroll_tactile.recordings.bounds import RATIO, SPARE
 
 # Of what is read once as it was written, as floats, and joined: four times what a recording may hold.
 TIMES = 4
+LONGEST = 20_000  # letters of a message
 KINDS = ("bytes", "json", "entries", "made")
 SHARES = (60, 15, 5, 20)
 TEXT = (".json", ".zarray", ".zgroup", ".zattrs", ".yaml", ".csv")
@@ -84,18 +81,14 @@ def warm() -> None:
     assert all((h5py, lz4, numcodecs, pyarrow, rosbags, ruamel, zstd))
 
 
-class RecordingBench:
-    """What a process needs for cases: folders of its own, and an ear for what is opened and begun."""
+class RecordingBench(Cases):
+    """Cases of recordings, and an ear for what is opened and begun."""
 
     def __init__(self, home: Path, forms: list[Form], options: Any, log: TextIO) -> None:
-        self.home, self.forms, self.log, self.seed, self.seconds = home, forms, log, options.seed, options.seconds
-        self.verbose = options.case >= 0
-        self.own = home / f"bench-{os.getpid()}"
-        self.watched, self.case = self.own / "watched", self.own / "case"
+        super().__init__(home, options, log)
+        self.forms, self.case = forms, self.own / "case"
         for name in ("case", "tmp"):
-            (self.own / name).mkdir(parents=True)
-        shutil.copytree(home / "watched", self.watched)
-        self.watching = fingerprint(self.watched)
+            (self.own / name).mkdir()
         tempfile.tempdir = str(self.own / "tmp")
         self.heard: set[str] = set()
         self.listening = False
@@ -205,59 +198,29 @@ class RecordingBench:
         before = fingerprint_of(self.case)
         for file in self.watched.rglob("*"):
             os.utime(file, ns=(0, file.stat().st_mtime_ns))
-        bound = SPARE * TIMES + (TIMES * RATIO) * size(self.case)
-        start, worked = begin_peak(), time.process_time()
-        came = self._came(reader, path, options, told)
-        told.outcomes.append(f"{name}: {came}")
-        if (worked := time.process_time() - worked) > SECONDS:
-            told.findings.append((f"worked for {worked:.0f} s", name))
-        grown = peak() - start
-        told.peak = max(told.peak, grown)
-        if grown > bound:
-            told.findings.append((f"took {grown >> 20} MB for {size(self.case) >> 10} KB", name))
+
+        def listened() -> str:
+            self.listening = True
+            try:
+                return reader(path, options)
+            except InputError as error:
+                if not 0 < len(str(error)) <= LONGEST:
+                    told.findings.append((f"a message of {len(str(error))} letters", name))
+                raise
+            finally:
+                self.listening = False
+
+        self.bounded(told, name, SPARE * TIMES + (TIMES * RATIO) * size(self.case), listened, (InputError,))
         told.findings += [(what, name) for what in sorted(self.heard)]
         self.heard.clear()
         if any(file.is_file() and file.stat().st_atime_ns for file in self.watched.rglob("*")):
             told.findings.append(("read a file elsewhere", name))
         if fingerprint_of(self.case) != before:
             told.findings.append((f"{name} changed the recording", ""))
-        if fingerprint(self.watched) != self.watching:
-            told.findings.append((f"{name} changed something elsewhere", ""))
-            remove(self.watched)
-            shutil.copytree(self.home / "watched", self.watched)
-            self.watching = fingerprint(self.watched)
-        if left := [file.name for file in (self.own / "tmp").iterdir()]:
-            told.findings.append((f"{name} left {left[:3]} in the temporary folder", ""))
-            for file in left:
-                remove(self.own / "tmp" / file)
-
-    def _came(self, reader: Reader, path: Path, options: dict[str, Any], told: Told) -> str:
-        """What came of a reader; where it is none of our errors, or it takes too long, that is found."""
-        signal.setitimer(signal.ITIMER_REAL, self.seconds)
-        faulthandler.dump_traceback_later(self.seconds - 1, file=self.log)
-        self.listening = True
-        try:
-            return reader(path, options)
-        except InputError as error:
-            if not str(error) or len(str(error)) > 20_000:
-                told.findings.append((f"a message of {len(str(error))} letters", place(error)))
-            if is_memory(error):
-                told.findings.append(("memory ran out", place(error)))
-            return type(error).__name__
-        except Exception as error:
-            told.findings.append((f"{type(error).__name__}: {error}"[:160], f"{reader.__name__}: {place(error)}"))
-            if self.verbose:
-                traceback.print_exc()
-            return "UNTYPED"
-        finally:
-            self.listening = False
-            faulthandler.cancel_dump_traceback_later()
-            signal.setitimer(signal.ITIMER_REAL, 0)
-
-    def close(self) -> list[tuple[str, str]]:
-        """Remove what is this process's own."""
-        remove(self.own)
-        return []
+        self.require_untouched(told, name)
+        for file in (self.own / "tmp").iterdir():
+            told.findings.append((f"{name} left {file.name} in the temporary folder", ""))
+            remove(file)
 
 
 def fingerprint_of(folder: Path) -> dict[str, Any]:

@@ -2,38 +2,35 @@
 
 Two robots and a central memory observe, retract, relabel, compact, back up, pack and merge, while their disks lose what
 was not synced, fill up and rot, their processes die, and a bucket between them loses, doubles and delays what is packed
-(see simulation_world.py, and what goes on from it). What is seen of each memory must be what a dumb model says (see
-simulation_model.py). All of a run comes from its seed; one that fails is made shorter, and told. `--json` names a file
-from which a later call goes on.
+(see simulation_world.py, and what goes on from it). What is seen of each memory must be what the model says (see
+model.py). All of a run comes from its seed; one that fails is made shorter, and told. Goes on where FILE.part ends.
 
-That it is harsh enough shows `--plant NAME`: the bug of that name (see planted.py) is put in, and must be found;
-`--plants` does so with all of them. `--seed S` replays one seed.
+That it is harsh enough shows `--plant NAME`: the bug of that name (see planted_*.py) is put in, and must be found;
+`--plants` does so with all of them. `--seed S` replays one seed, `--whole` without making it shorter.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
-import json
 import random
 import shutil
 import sys
 import time
-import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import faults.planted_reads
+import faults.planted_writes  # noqa: F401  # which name their bugs
 from faults import shim as watch
-from faults import simulation_disk, simulation_touches
-from faults.common import folder, progress, warnings_told
-from faults.planted import PLANTS
+from faults import simulation_kit
+from faults.common import Part, folder, parser, progress, run, warnings_told
+from faults.planting import BUGS, planted
 from faults.shim import Shim
 from faults.simulation_system import System
-from scroll_tactile.errors import RangeWarning
 
 WEIGHTS = {
     "small": 36,
@@ -57,9 +54,10 @@ WEIGHTS = {
     "derived": 4,
     "quiet": 3,
 }
-QUICK_SEEDS = 12
-QUICK_PLANTS = ("the log is not synced", "CURRENT is not synced", "a retraction is lost in a merge")
-MISFITS = ("=> AttributeError", "=> NameError", "=> TypeError")  # of a bug that is put in where nothing is
+QUICK_SEEDS = 6
+QUICK_PLANTS = ("the log is not synced", "a retraction is lost in a merge")
+MISFITS = ("AttributeError", "NameError", "TypeError")  # of a bug that is put in where nothing is
+SHORTENINGS = 400
 Event = tuple[str, int]
 
 
@@ -94,12 +92,16 @@ class Simulation:
             world.close()
         return None, world.told
 
-    def shortened(self, events: list[Event], most: int = 400) -> list[Event]:
+    def first_failing(self, first: int, end: int) -> int | None:
+        """The first of the seeds that fails, None where none does."""
+        return next((seed for seed in range(first, end) if self.play(events_of(seed))[0] is not None), None)
+
+    def _shortened(self, events: list[Event]) -> list[Event]:
         """Fewer events that fail, too."""
         size, tried = len(events) // 2, 0
-        while size and tried < most:
+        while size and tried < SHORTENINGS:
             place = 0
-            while place < len(events) and tried < most:
+            while place < len(events) and tried < SHORTENINGS:
                 fewer = events[:place] + events[place + size :]
                 tried += 1
                 if fewer and self.play(fewer)[0] is not None:
@@ -109,139 +111,82 @@ class Simulation:
             size //= 2
         return events
 
-    def tell(self, seed: int, *, shorten: bool = True) -> str:
-        """A seed that fails, as a story."""
-        events = events_of(seed)
-        if self.play(events)[0] is None:
-            return f"seed {seed} does not fail"
-        events = self.shortened(events) if shorten else events
+    def tell(self, seed: int, *, shorten: bool) -> str:
+        """A seed as a story, which ends with what failed, if anything; it counts for nothing."""
+        counts, events = Counter(self.counts), events_of(seed)
+        if shorten and self.play(events)[0] is not None:
+            events = self._shortened(events)
         why, told = self.play(events)
-        return "\n".join([f"seed {seed}, {len(events)} events:", *told, f"=> {why}"])
+        self.counts = counts
+        return "\n".join([f"seed {seed}, {len(events)} events:", *told, f"=> {why or 'does not fail'}"])
 
 
-def prepare() -> None:
-    """Have everything small, quick and in the hands of the schedule."""
-    gc.freeze()
-    gc.set_threshold(20_000, 20, 100)
-    simulation_disk.prepare()
-    simulation_touches.prepare()
-    warnings.simplefilter("ignore", RangeWarning)
+def sound(simulation: Simulation, options: argparse.Namespace) -> dict[str, Any]:
+    """Without any bug put in: no seed fails."""
+    part = Part(options.json, first=options.first)
+    simulation.counts.update(part.known.get("events", {}))
+    seed, failures = part.known.get("next", options.first), part.known.get("failures", [])
+    begun = said = time.monotonic()
+    end, first = options.first + options.seeds, seed
+    while seed < end:
+        if simulation.first_failing(seed, seed + 1) is not None:
+            failures.append(simulation.tell(seed, shorten=not options.whole))
+            progress(failures[-1])
+        seed += 1
+        if (now := time.monotonic()) - said > 5 or seed == end:
+            said = now
+            progress(f"seed {seed} of {end}, {(seed - first) / (now - begun):.1f} a second, {len(failures)} failed")
+            part.save(next=seed, events=dict(sorted(simulation.counts.items())), failures=failures)
+    part.remove()
+    return {"seeds": options.seeds, "events": dict(sorted(simulation.counts.items())), "failures": failures}
 
 
-def parsed() -> argparse.Namespace:
-    """The options."""
-    made = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
-    made.add_argument("--quick", action="store_true", help="some seeds, and some bugs, in seconds")
-    made.add_argument("--seeds", type=int, default=1000)
-    made.add_argument("--first", type=int, default=0)
-    made.add_argument("--seed", type=int, help="replay one")
-    made.add_argument("--whole", action="store_true", help="do not make it shorter")
-    made.add_argument("--json", type=Path, help="file for the record, from which a later call goes on")
-    made.add_argument("--home", type=Path)
-    made.add_argument("--plant", help="put this bug in", choices=PLANTS)
-    made.add_argument("--plants", action="store_true", help="put each of the bugs in, one after another")
-    return made.parse_args()
-
-
-class Record:
-    """What is known so far, in a file."""
-
-    def __init__(self, path: Path | None) -> None:
-        self.path = path
-        self.known: dict[str, Any] = {}
-        if path is not None and path.exists():
-            self.known = json.loads(path.read_text(encoding="utf-8"))
-
-    def write(self, **more: Any) -> None:
-        """Add to it."""
-        self.known |= more
-        if self.path is not None:
-            self.path.write_text(json.dumps(self.known, indent=1) + "\n", encoding="utf-8")
-
-
-def many(simulation: Simulation, first: int, seeds: int, told: Callable[[int, float], None] | None) -> int | None:
-    """Play seeds until one fails: that one, None where none does."""
-    begun = last = time.perf_counter()
-    for seed in range(first, first + seeds):
-        if simulation.play(events_of(seed))[0] is not None:
-            return seed
-        now = time.perf_counter()
-        if told is not None and (now - last > 5 or seed == first + seeds - 1):
-            last = now
-            told(seed, (seed + 1 - first) / (now - begun))
-    return None
-
-
-def sound(simulation: Simulation, options: argparse.Namespace) -> int:
-    """Without any plant: no seed fails."""
-    record = Record(options.json)
-    failures = record.known.get("failures", {})
-    simulation.counts.update(record.known.get("events", {}))
-    end, next_one = options.first + options.seeds, record.known.get("next", options.first)
-
-    def told(seed: int, speed: float) -> None:
-        progress(f"seed {seed} of {end}, {speed:.1f} a second, {len(failures)} failed")
-        record.write(next=seed + 1, events=dict(sorted(simulation.counts.items())), failures=failures)
-
-    while next_one < end and (failed := many(simulation, next_one, end - next_one, told)) is not None:
-        counts = Counter(simulation.counts)
-        failures[str(failed)] = simulation.tell(failed, shorten=not options.whole)
-        simulation.counts = counts
-        progress(failures[str(failed)])
-        next_one = failed + 1
-        record.write(next=next_one, events=dict(sorted(simulation.counts.items())), failures=failures)
-    for name, count in sorted(simulation.counts.items()):
-        print(f"  {name:<36} {count}")
-    print(f"{options.seeds} seeds, {len(failures)} failed: {sorted(map(int, failures))}")
-    return bool(failures)
-
-
-def planted(simulation: Simulation, options: argparse.Namespace) -> int:
-    """With each plant: some seed fails."""
-    record = Record(options.json)
-    found: dict[str, Any] = record.known.setdefault("plants", {})
-    for name in [options.plant] if options.plant else QUICK_PLANTS if options.quick else PLANTS:
-        if not options.plant and name in found:
+def found(simulation: Simulation, options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
+    """With each of these bugs some seed fails."""
+    part = Part(options.json, first=options.first, seeds=options.seeds)
+    for name in names:
+        if name in part.known:
             continue
-        with PLANTS[name]():
-            begun = time.perf_counter()
-            failed = many(simulation, options.first, options.seeds, None)
-            if failed is None:
-                progress(f"{name}: not found in {options.seeds} seeds")
-                found[name] = {"seeds": None, "tried": options.seeds}
-            else:
-                told = simulation.tell(failed, shorten=False).splitlines()[-1]
-                if told.startswith(MISFITS):
-                    sys.exit(f"{name} does not fit what it spoils any more: {told}")
-                if options.plant:
-                    progress(simulation.tell(failed))
-                taken = failed + 1 - options.first
-                progress(f"{name}: found in {taken} seeds, {time.perf_counter() - begun:.0f} s: {told[:160]}")
-                found[name] = {"seeds": taken, "told": told[:400]}
-        record.write(plants=found)
-    missed = [name for name, about in found.items() if about["seeds"] is None]
-    print(f"{len(found)} plants, {len(missed)} not found: {missed}")
-    return bool(missed)
+        with planted(name):
+            begun, failed = time.monotonic(), simulation.first_failing(options.first, options.first + options.seeds)
+            told = "" if failed is None else simulation.tell(failed, shorten=bool(options.plant))
+        what = told.rpartition("=> ")[2]
+        if what.startswith(MISFITS):
+            sys.exit(f"{name} does not fit what it spoils any more: {what}")
+        if options.plant:
+            progress(told)
+        taken = None if failed is None else failed + 1 - options.first
+        progress(f"{name}: {taken} seeds, {time.monotonic() - begun:.0f} s: {what[:160]}")
+        part.save(**{name: {"seeds": taken, "told": what[:400]}})
+    plants, missed = part.known, [name for name in names if part.known[name]["seeds"] is None]
+    part.remove()
+    return {"plants": plants, "failures": [f"not found in {options.seeds} seeds: {name}" for name in missed]}
 
 
-def main() -> int:
+def main(options: argparse.Namespace) -> dict[str, Any]:
     """As asked."""
-    options = parsed()
-    prepare()
+    if options.plant and options.plant not in BUGS:
+        sys.exit(f"expected a bug to put in: {', '.join(BUGS)}")
+    simulation_kit.prepare()
     with folder(options, in_memory=True) as home:
         simulation = Simulation(home)
         if options.seed is not None:
-            text = simulation.tell(options.seed, shorten=not options.whole)
-            print(text)
-            return "does not fail" not in text
+            print(text := simulation.tell(options.seed, shorten=not options.whole))
+            return {"failures": [] if text.endswith("does not fail") else [text.splitlines()[-1]]}
         if options.plant or options.plants:
-            return planted(simulation, options)
-        if options.quick:
-            options.seeds = QUICK_SEEDS
-            return sound(simulation, options) or planted(simulation, options)
-        return sound(simulation, options)
+            return found(simulation, options, [options.plant] if options.plant else list(BUGS))
+        if not options.quick:
+            return sound(simulation, options)
+        options.seeds = QUICK_SEEDS
+        ours, options.seeds = sound(simulation, options), 50
+        plants = found(simulation, options, QUICK_PLANTS)
+        return ours | plants | {"failures": ours["failures"] + plants["failures"]}
 
 
 if __name__ == "__main__":
     watch.begin_again_watched()
-    sys.exit(main())
+    run(
+        "simulate",
+        parser(__doc__, seed=None, seeds=1000, first=0, whole=False, plant="", plants=False).parse_args(),
+        main,
+    )

@@ -21,7 +21,7 @@ import store.log_writer
 import store.open_log
 import store.rows
 from faults import shim as watch
-from faults.disks import STYLES, Disk, Event, Folder, _apply, _rebuild, events
+from faults.disks import STYLES, Disk, Event, File, Folder, Style, events, rebuild
 from faults.shim import Shim
 from store.checkpoint_files import Draft
 from store.chunks import ArrayContent
@@ -68,35 +68,20 @@ class Disks(Disk):
     def cut(self, name: str, rng: random.Random) -> str:
         """Pull the plug of a machine; how its disk was left."""
         style = rng.choice(STYLES)
-        path = self._cleared(name)
-        node = self.top.now[name]
-        assert isinstance(node, Folder)
-        _rebuild(node, path, rng, style)
+        self._rebuilt(name, rng, style)
         self.settle(name)
         return style
 
     def kill(self, name: str) -> None:
         """Have a machine's files be what was written to them so far, none safer than it was."""
+        for path, node in self._rebuilt(name, random.Random(0), "all"):
+            self.inodes[path.stat().st_ino] = node
+
+    def _rebuilt(self, name: str, rng: random.Random, style: Style) -> list[tuple[Path, File]]:
+        shutil.rmtree(self.root / name, ignore_errors=True)
         node = self.top.now[name]
         assert isinstance(node, Folder)
-        self._write(node, self._cleared(name))
-
-    def _cleared(self, name: str) -> Path:
-        path = self.root / name
-        shutil.rmtree(path, ignore_errors=True)
-        return path
-
-    def _write(self, folder: Folder, to: Path) -> None:
-        to.mkdir()
-        for name, node in folder.now.items():
-            if isinstance(node, Folder):
-                self._write(node, to / name)
-                continue
-            data = bytearray(node.safe)
-            for change in node.since:
-                _apply(data, change)
-            (to / name).write_bytes(data)
-            self.inodes[(to / name).stat().st_ino] = node
+        return rebuild(node, self.root / name, rng, style)
 
     def settle(self, name: str) -> None:
         """Take a machine's files as they are now for safe."""
@@ -221,6 +206,3 @@ def near_the_end(data: bytes, _: random.Random) -> range:
 def in_a_number(data: bytes, rng: random.Random) -> range:
     """The digits of a number in JSON, long ones as often as short ones, and not those in text."""
     return range(*rng.choice([found.span() for found in NUMBER.finditer(data)]))
-
-
-__all__ = ["AHEAD", "Disks", "Held", "abandon", "flip", "in_a_number", "near_the_end", "prepare"]

@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from faults.simulation_bucket import Carrying
+from faults.learners import KIT
+from faults.model import State
 from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
-from faults.simulation_model import Rows
-from faults.simulation_touches import MATERIALS, stream
+from faults.simulation_events import OneMemory
 from faults.simulation_world import Machine, Wrong
 from store import StoreError, repair_store
 from store.layout import DERIVED, read_current
@@ -19,7 +19,7 @@ from store.layout import DERIVED, read_current
 KEPT = ("kept", "pool", "exemplars")
 
 
-class Rotting(Carrying):
+class Rotting(OneMemory):
     """The events of files that nobody writes."""
 
     def _rot(self, machine: Machine, rng: random.Random) -> None:
@@ -27,14 +27,14 @@ class Rotting(Carrying):
         if not machine.made or len(machine.candidates) > 1 or not machine.path.exists():
             return
         if rng.random() < 0.5:
-            self._shut(machine)
+            self.shut(machine)
         self.drop(machine)
         newest = read_current(machine.path / "CURRENT").newest
         hurt, kind = self._hurt(machine.path, rng)
         self.disks.settle(machine.name)
         self.say(f"  {machine.name}: a bit of {hurt.relative_to(machine.path)} is another ({kind})")
         self.counts[f"rot: of {kind}"] += 1
-        whole = machine.rows
+        whole = machine.state
         allowed = [whole]
         if hurt.name.startswith("log-") and machine.begins:
             allowed.append(whole.cut(max(machine.begins[-1], whole.compacted)))
@@ -47,7 +47,7 @@ class Rotting(Carrying):
             self.look(machine, learner, f"{where} after a bit of {hurt.name} changed", settle=settle, but=KEPT * named)
 
         try:
-            learner = self._open(machine, machine.path, allowed, "read")
+            learner = self.open(machine, machine.path, allowed, "read")
             look(learner, "read")
             learner.close()
         except StoreError as error:
@@ -55,15 +55,15 @@ class Rotting(Carrying):
             self.say(f"    reading: {error!r:.150}")
         try:
             with self.disks.taken_in():
-                machine.learner = self._open(machine, machine.path, allowed)
+                machine.learner = self.open(machine, machine.path, allowed)
         except StoreError as error:
             self.counts["rot: refused"] += 1
             self.say(f"    writing: {error!r:.150}")
         if machine.learner is not None:
             try:
                 look(machine.learner, "opened", settle=True)
-                self.counts["rot: the same" if machine.rows == whole else "rot: took the last batch"] += 1
-                if not self._problems(machine.path):
+                self.counts["rot: the same" if machine.state == whole else "rot: took the last batch"] += 1
+                if not self.problems(machine.path):
                     return
                 self.counts["rot: named by a check alone"] += 1
                 self.drop(machine)
@@ -96,7 +96,7 @@ class Rotting(Carrying):
             flip(hurt, rng, near_the_end if "end" in kind else None)
         return hurt, kind
 
-    def _repair(self, machine: Machine, whole: Rows, hurt: Path, contained: int) -> None:
+    def _repair(self, machine: Machine, whole: State, hurt: Path, contained: int) -> None:
         """contained: the last row that the newest checkpoint contained."""
         try:
             with self.disks.taken_in():
@@ -109,15 +109,15 @@ class Rotting(Carrying):
         self.say(f"    repaired: {repair!r:.300}")
         self.counts["rot: repaired"] += 1
         rows = whole.cut(repair.kept)
-        if not repair.lost and repair.kept < len(whole.rows):
-            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows, and tells of no loss")
+        if not repair.lost and repair.kept < whole.last:
+            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {whole.last} rows, and tells of no loss")
         if repair.kept < whole.compacted:  # the compaction checkpoint is lost: with it all that it stood for
             self._replace(machine)
             return
-        if repair.kept < len(whole.rows) and (not hurt.name.startswith("log-") or repair.kept < contained):
-            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {len(whole.rows)} rows")
+        if repair.kept < whole.last and (not hurt.name.startswith("log-") or repair.kept < contained):
+            raise Wrong(f"a repair of {hurt.name} kept {repair.kept} of {whole.last} rows")
         try:
-            learner = self._open(machine, machine.path, [rows], "read")
+            learner = self.open(machine, machine.path, [rows], "read")
         except StoreError as error:
             raise Wrong(f"repaired after {hurt.name}, and not opened: {error!r}") from error
         compacted = learner._ledger.store.compacted
@@ -135,21 +135,21 @@ class Rotting(Carrying):
         if len(unlisted) > 1:
             raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
         # A row of another kind may be left out, too, such as one that took another back.
-        if unlisted or compacted > whole.compacted or heads < len(rows.rows):
+        if unlisted or compacted > whole.compacted or heads < rows.last:
             self._with_less(machine, rows)
             return
         machine.candidates, machine.begins = [rows], []
 
-    def _with_less(self, machine: Machine, rows: Rows) -> None:
+    def _with_less(self, machine: Machine, rows: State) -> None:
         """A memory of which a repair left less knows still what it learned, and learns on."""
         self.counts["rot: repaired, with less"] += 1
-        learner = self._open(machine, machine.path, [rows])
+        learner = self.open(machine, machine.path, [rows])
         try:
-            for candidate in (rows, rows.plus(("observe", MATERIALS[0], 0))):
+            for candidate in (rows, rows.plus(("observe", KIT.materials[0], 0))):
                 if candidate is not rows:
-                    learner.observe(MATERIALS[0], stream(0), again=True)
+                    learner.observe(KIT.materials[0], KIT.stream(0), again=True)
                 machine.candidates = [candidate]
-                self.look(machine, learner, "repaired with less", but=("listed", *KEPT))
+                self.look(machine, learner, "repaired with less", but=("listed", "names", *KEPT))
         finally:
             abandon(learner)
         self._replace(machine)  # nothing of this was written down
@@ -160,7 +160,7 @@ class Rotting(Carrying):
         shutil.rmtree(self.root / machine.name)
         (self.root / machine.name).mkdir()
         self.disks.settle(machine.name)
-        machine.candidates, machine.copies, machine.made, machine.begins = [Rows()], {}, False, []
+        machine.candidates, machine.copies, machine.made, machine.begins = [State()], {}, False, []
         self.counts["disks replaced"] += 1
 
     def _derived(self, machine: Machine, rng: random.Random) -> None:
@@ -171,7 +171,7 @@ class Rotting(Carrying):
         self.derived.append({one.name: one.read_bytes() for one in folder.iterdir()})
         if rng.random() < 0.5:
             return
-        self._shut(machine)
+        self.shut(machine)
         self.drop(machine)
         shutil.rmtree(folder)
         folder.mkdir()

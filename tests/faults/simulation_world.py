@@ -14,18 +14,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from faults import simulation_model as model
 from faults.disks import Event
+from faults.learners import KIT, opened, perform
+from faults.model import Operation, Others, State, Then, after
 from faults.shim import Shim
 from faults.simulation_disk import Disks, Held, abandon
-from faults.simulation_model import Rows
-from faults.simulation_touches import EMBEDDINGS, EXPECTED, SETTINGS
-from scroll_tactile import TactileLearner
+from faults.simulation_kit import expected, seen
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from store import StoreError, check_store
 
 MACHINES = ("robot-1", "robot-2", "central")
 ERRORS = (errno.ENOSPC, errno.ENOSPC, errno.EIO)
+Fate = tuple[str, Any]
 
 
 class Wrong(Exception):
@@ -42,47 +42,45 @@ class Machine:
 
     name: str
     path: Path
-    candidates: list[Rows] = field(default_factory=lambda: [Rows()])
+    candidates: list[State] = field(default_factory=lambda: [State()])
     learner: Any = None
     readers: list[Any] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
-    copies: dict[Path, tuple[list[Rows], bool, list[int]]] = field(default_factory=dict)
+    copies: dict[Path, tuple[list[State], bool, list[int]]] = field(default_factory=dict)
     made: bool = False
 
     @property
-    def rows(self) -> Rows:
+    def state(self) -> State:
         """What it holds, where nothing is open."""
         return self.candidates[0]
 
-    def become(self, rows: Rows) -> None:
+    @property
+    def settled(self) -> bool:
+        """Whether there is a memory, and one thing alone that it may hold."""
+        return self.made and len(self.candidates) == 1 and (self.path / "CURRENT").exists()
+
+    def become(self, state: State) -> None:
         """It holds these rows, which are another batch, or the last one less, or all that there were in a new log."""
-        before, after = len(self.rows.rows), len(rows.rows)
-        self.begins = [begin for begin in self.begins if begin < min(before, after)] if before != after else []
-        if after > before:
+        before, now = self.state.last, state.last
+        self.begins = [begin for begin in self.begins if begin < min(before, now)] if before != now else []
+        if now > before:
             self.begins.append(before)
-        self.candidates = [rows]
-
-
-Fate = tuple[str, Any]
+        self.candidates = [state]
 
 
 class World:
-    """All of it, in an empty folder; strict: what is not to be."""
+    """All of it, in an empty folder."""
 
     def __init__(self, home: Path, shim: Shim, log: Path, counts: Counter[str]) -> None:
-        self.root, self.net = home / "disks", home / "net"
-        for name in MACHINES:
-            (self.root / name).mkdir(parents=True)
-        self.net.mkdir()
-        self.trees = home / "trees"
-        self.trees.mkdir()
+        self.root, self.net, self.trees = (home / name for name in ("disks", "net", "trees"))
+        for folder in (*(self.root / name for name in MACHINES), self.net, self.trees):
+            folder.mkdir(parents=True)
         self.disks = Disks(self.root, shim, log)
         self.machines = [Machine(name, self.root / name / "memory") for name in MACHINES]
-        self.bucket: dict[str, list[tuple[bytes, Rows]]] = {}
-        self.flying: list[tuple[int, str, tuple[bytes, Rows]]] = []
+        self.bucket: dict[str, list[tuple[bytes, State]]] = {}
+        self.flying: list[tuple[int, str, tuple[bytes, State]]] = []
         self.derived: list[dict[str, bytes]] = []
-        self.step = 0
-        self.counts = counts
+        self.step, self.counts = 0, counts
         self.warned: list[str] = []
         self.told: list[str] = []
 
@@ -96,7 +94,8 @@ class World:
             self.drop(machine)
 
     @staticmethod
-    def _problems(path: Path) -> list[Any]:
+    def problems(path: Path) -> list[Any]:
+        """What a check finds, but for leftovers."""
         return [one for one in check_store(path) if one.kind != "leftover"]
 
     def drop(self, machine: Machine) -> None:
@@ -105,6 +104,17 @@ class World:
             if learner is not None:
                 abandon(learner)
         machine.learner, machine.readers = None, []
+
+    def play(self, kind: str, seed: int) -> None:
+        """One event."""
+        rng = random.Random(seed)
+        self.step += 1
+        self.say(f"{self.step} {kind} {seed}")
+        for landed in [one for one in self.flying if one[0] <= self.step]:
+            self.flying.remove(landed)
+            self.bucket.setdefault(landed[1], []).append(landed[2])
+        self.counts[kind] += 1
+        getattr(self, f"_{kind}")(rng.choice(self.machines), rng)
 
     # What is done to a disk, and what may come between.
 
@@ -129,14 +139,21 @@ class World:
             return "full", (where, rng.choice((1, 1, 2, 10**6)), rng.choice(ERRORS))
         return "", None
 
+    def do(self, machine: Machine, rng: random.Random, operation: Operation, others: Others | None = None) -> Any:
+        """Do an operation of the model to the memory of a machine, with its fate."""
+        if (learner := self.opened(machine, rng)) is None:
+            return None
+        what, then = " ".join(map(str, operation)), after(machine.state, operation, others or {})
+        return self.operate(machine, rng, what, lambda: perform(learner, operation, self.net), then)
+
     def operate(
         self,
         machine: Machine,
         rng: random.Random,
         what: str,
         do: Callable[[], Any],
-        then: tuple[Rows, Any],
-        either: tuple[Rows, Any] | None = None,
+        then: Then,
+        either: Then | None = None,
     ) -> Any:
         """Do something that writes, with its fate; what it returned, None where that is not known.
 
@@ -144,7 +161,7 @@ class World:
         """
         kind, about = ("", None) if either else self.fate(rng)
         Held.at_once = rng.random() < 0.3
-        before, (after, foretold) = machine.rows, then
+        before, (now, foretold) = machine.state, then
         held = None if machine.learner is None else machine.learner._ledger.store
         late = held is not None and held._checkpoints._failure is not None  # closing tells of it
         fail = None
@@ -153,18 +170,17 @@ class World:
             fail = first, first + about[1] - 1, about[2]
         self.disks.begin(fail)
         try:
-            try:
-                result = do()
-            except (InputError, MismatchError) as error:
-                result = type(error).__name__
-            except StoreError as error:
-                result = error
+            result = do()
+        except (InputError, MismatchError) as error:
+            result = type(error).__name__
+        except StoreError as error:
+            result = error
         finally:
             done = self.disks.end()
         self.say(f"  {machine.name}: {what}" + (f" [{kind} {about}]" if kind else "") + f" -> {result!r:.110}")
         self.counts[f"fate: {kind or 'none'}"] += 1
         if kind in ("cut", "kill"):
-            machine.candidates = [before, *machine.candidates[1:]] + ([after] if after != before else [])
+            machine.candidates = [before, *machine.candidates[1:]] + ([now] if now != before else [])
             self._strike(machine, rng, done, kind, about)
             return None
         self.disks.go(done)
@@ -172,15 +188,15 @@ class World:
             self.counts["refused by a full disk"] += kind == "full"
             if kind != "full" and not (late and what.startswith(("close", "reembed"))):
                 raise Wrong(f"{what} said {result!r}")
-            self._refused(machine, what, after, result)
+            self._refused(machine, what, now, result)
             return None
         if either is not None and result == either[1]:
-            after, foretold = either
+            now, foretold = either
             self.counts["damaged on the way: the same"] += 1
         if result != foretold:
             raise Wrong(f"{what} gave {result!r}, expected {foretold!r}")
-        if after != before:
-            machine.become(after)
+        if now != before:
+            machine.become(now)
         return result
 
     def _strike(self, machine: Machine, rng: random.Random, done: list[Event], kind: str, about: float) -> None:
@@ -195,33 +211,33 @@ class World:
             self.counts["cut after a kill"] += 1
             self.crash(machine, rng, "cut")
 
-    def _refused(self, machine: Machine, what: str, after: Rows, error: StoreError) -> None:
+    def _refused(self, machine: Machine, what: str, now: State, error: StoreError) -> None:
         """What failed was not done, but may come back with a crash."""
-        before = machine.rows
-        if after != before:
-            machine.candidates = [*machine.candidates, after]
+        before = machine.state
+        if now != before:
+            machine.candidates = [*machine.candidates, now]
         if machine.learner is not None and not machine.learner._ledger._closed:
             self.look(machine, machine.learner, f"after {what} failed")
-            if machine.rows != before and not what.startswith(("compact", "backup")):
+            if machine.state != before and not what.startswith(("compact", "backup")):
                 raise Wrong(f"{what} said {error!r}, and was done")
 
     def look(
         self, machine: Machine, learner: Any, where: str, *, settle: bool = False, but: Sequence[str] = ()
     ) -> None:
         """What is seen of a memory is one of its candidates; settle: no other any more; but: what may differ."""
-        found = model.seen(learner)
-        differ = []
-        for rows in machine.candidates:
-            wanted = EXPECTED(rows)
+        found, differ = seen(learner), []
+        for state in machine.candidates:
+            wanted = expected(state)
             differ.append([name for name, value in found.items() if value != wanted[name] and name not in but])
             if not differ[-1]:
-                others = [] if settle else [other for other in machine.candidates if other is not rows]
+                others = [] if settle else [other for other in machine.candidates if other is not state]
                 if learner is machine.learner:
-                    if rows is not machine.rows:
-                        machine.become(rows)
-                    machine.candidates = [rows, *others]
+                    if state is not machine.state:
+                        machine.become(state)
+                    machine.candidates = [state, *others]
                 return
-        about = [(name, str(found[name])[:300], str(EXPECTED(machine.rows)[name])[:300]) for name in differ[0][:2]]
+        wanted = expected(machine.state)
+        about = [(name, str(found[name])[:300], str(wanted[name])[:300]) for name in differ[0][:2]]
         raise Wrong(f"{where}: {machine.name} differs in {differ}: {about}")
 
     # Opening.
@@ -232,42 +248,33 @@ class World:
             return machine.learner
 
         def do() -> None:
-            machine.learner = self._open(machine, machine.path, machine.candidates)
+            machine.learner = self.open(machine, machine.path, machine.candidates)
 
-        self.operate(machine, rng, "open", do, (machine.rows, None))
+        self.operate(machine, rng, "open", do, (machine.state, None))
         if machine.learner is not None:
             machine.made = True
             self.look(machine, machine.learner, "opened", settle=True)
-            # Opening replays what no checkpoint has, and counts as no row.
         return machine.learner
 
     @staticmethod
-    def _open(machine: Machine, path: Path, candidates: list[Rows], mode: Any = "write") -> Any:
-        for name in dict.fromkeys(rows.embedding for rows in candidates):
+    def open(machine: Machine, path: Path, candidates: list[State], mode: Any = "write") -> Any:
+        """A memory of one of the candidates, opened without any fate."""
+        for name in dict.fromkeys(state.embedding for state in candidates):
             try:
-                return TactileLearner.open(path, embedding=EMBEDDINGS[name], mode=mode, **SETTINGS)
+                return opened(path, mode, embedding=KIT.embeddings[name])
             except EmbeddingMismatchError as error:
                 refused = error
         raise Wrong(f"{machine.name} has another embedding: {refused}")
 
-    # Events.
-
-    def play(self, kind: str, seed: int) -> None:
-        """One event."""
-        rng = random.Random(seed)
-        self.step += 1
-        self.say(f"{self.step} {kind} {seed}")
-        for landed in [one for one in self.flying if one[0] <= self.step]:
-            self.flying.remove(landed)
-            self.bucket.setdefault(landed[1], []).append(landed[2])
-        machine = rng.choice(self.machines)
-        self.counts[kind] += 1
-        getattr(self, f"_{kind}")(machine, rng)
-
-    def _do(
-        self, machine: Machine, rng: random.Random, what: str, call: Callable[[Any], Any], after: Callable[[Rows], Any]
-    ) -> Any:
-        learner = self.opened(machine, rng)
-        if learner is None:
-            return None
-        return self.operate(machine, rng, what, lambda: call(learner), after(machine.rows))
+    def shut(self, machine: Machine, *, readers_only: bool = False) -> None:
+        """Close without any fate."""
+        for reader in machine.readers:
+            reader.close()
+        machine.readers = []
+        if not readers_only and machine.learner is not None:
+            learner, machine.learner = machine.learner, None
+            with self.disks.taken_in():
+                try:
+                    learner.close()
+                except StoreError as error:  # of an earlier background commit
+                    self.say(f"    closing said {error!r:.100}")

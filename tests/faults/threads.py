@@ -171,10 +171,11 @@ def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
 
 
 class Worker:
-    """One thread: random calls of its kinds, until the round is over."""
+    """One thread: random calls of its kinds, until the round is over; learner: the one that it calls."""
 
-    def __init__(self, round_: Round, number: int, kinds: Sequence[str]) -> None:
+    def __init__(self, round_: Round, number: int, kinds: Sequence[str], learner: TactileLearner | None = None) -> None:
         self.round, self.kinds, self.name = round_, kinds, f"{number}"
+        self.learner = learner or round_.learner
         self.rng = random.Random(f"{round_.seed} {number}")
         self.inside = False
 
@@ -184,7 +185,7 @@ class Worker:
             kind = self.rng.choice(self.kinds)
             self.round.busy[self.name] = kind, time.monotonic()
             try:
-                getattr(self, kind)()
+                self.call(kind)
             except Exception as error:  # what a call may raise is caught there
                 frames = traceback.extract_tb(error.__traceback__)[-4:]
                 at = ", ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in frames)
@@ -193,184 +194,137 @@ class Worker:
                 self.round.calls[kind] += 1
             self.round.busy.pop(self.name, None)
 
-    def ask(self, of: str, call: Callable[[], Any], learner: TactileLearner | None = None) -> Any:
-        """What a call says, with the rows before and after."""
-        learner = learner or self.round.learner
-        since = row_of(learner)
-        what = call()
-        self.round.tell(Told(of, since, row_of(learner), what, self.inside))
-        return what
+    def call(self, kind: str) -> None:
+        """A call of a kind: a method's, or one of `ASKED`."""
+        if kind in ASKED:
+            of, ask = ASKED[kind]
+            since = row_of(self.learner)
+            # A reader may be behind.
+            with suppress(CompactedError) if self.learner is self.round.reader else nullcontext():
+                what = ask(self.learner)
+                self.round.tell(Told(of, since, row_of(self.learner), what, self.inside))
+        else:
+            getattr(self, kind)()
 
     def material(self) -> str:
         """A material: now and then one that comes and goes."""
         return self.rng.choice(MATERIALS[len(FIRST) :] if self.rng.random() < NEW_AGAIN else FIRST)
 
+    def probe(self, readings: int = LENGTH) -> Array:
+        """A touch that is in no memory."""
+        return touch(self.rng.choice(FIRST), self.rng.randrange(10**6), readings)
+
+    @property
+    def full(self) -> bool:
+        """Whether there are enough touches in the memory."""
+        return sum(self.learner.materials.values()) > MOST
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """In the block rows are made that others see at once."""
+        with self.learner._ledger.lock:
+            before = row_of(self.learner)
+            yield
+            after = row_of(self.learner)
+            with self.round.lock:
+                self.round.groups.append((before + 1, after))
+            self.round.acknowledge(after)
+
     # What changes the memory
 
     def observe(self) -> None:
         """A touch more; where there are enough, one is retracted in its place."""
-        if sum(self.round.learner.materials.values()) > MOST:
+        if self.full:
             self.retract()
             return
         material = self.material()
         readings = self.round.fresh(material)
         with self.round.lock:
-            self.round.readings[self.round.learner.stream(readings).key] = readings
-        receipt = self.round.learner.observe(material, readings)
+            self.round.readings[self.learner.stream(readings).key] = readings
+        receipt = self.learner.observe(material, readings)
         if not self.inside:
             self.round.acknowledge(receipt.sequence)
 
     def _loose(self) -> int | None:
-        if sum(self.round.learner.materials.values()) < FEWEST:
+        if sum(self.learner.materials.values()) < FEWEST:
             return None
-        own = [one for one in self.round.learner.observations() if one.state == "kept"]
+        own = [one for one in self.learner.observations() if one.state == "kept"]
         return self.rng.choice(own).sequence if own else None
 
     def retract(self) -> None:
         """One less."""
         if (sequence := self._loose()) is not None:
             with suppress(ObservationError):  # another thread was faster, or compacted it
-                self.round.learner.retract(sequence)
+                self.learner.retract(sequence)
 
     def forget(self) -> None:
         """All of a material that comes and goes."""
         with suppress(ObservationError, UnknownMaterialError):
-            self.round.learner.forget(self.rng.choice(MATERIALS[len(FIRST) :]))
+            self.learner.forget(self.rng.choice(MATERIALS[len(FIRST) :]))
 
     def relabel(self) -> None:
         """One under another name."""
-        if (sequence := self._loose()) is None:
-            return
-        with self.round.learner._ledger.lock:
-            before = row_of(self.round.learner)
-            with suppress(ObservationError, InputError):  # it may have that name already
-                self.round.learner.relabel(sequence, self.material())
-            self._together(before)
+        if (sequence := self._loose()) is not None:
+            with self.together(), suppress(ObservationError, InputError):  # it may have that name already
+                self.learner.relabel(sequence, self.material())
 
     def describe(self) -> None:
         """What a material is made of."""
-        self.round.learner.describe(self.material(), self.rng.choice((None, *SAID)))
+        self.learner.describe(self.material(), self.rng.choice((None, *SAID)))
 
     def batch(self) -> None:
         """Several at once, with questions among them."""
-        if self.inside:
-            return
-        with self.round.learner._ledger.lock:
-            before = row_of(self.round.learner)
+        with self.together():
             self.inside = True
             try:
-                with self.round.learner.batch():
+                with self.learner.batch():
                     for _ in range(self.rng.randrange(1, 5)):
-                        getattr(self, self.rng.choice(("observe", "observe", "retract", "predict", "digest")))()
+                        self.call(self.rng.choice(("observe", "observe", "retract", "predict", "digest")))
             finally:
                 self.inside = False
-            self._together(before)
 
     def merge(self) -> None:
         """Another memory's touches."""
-        if sum(self.round.learner.materials.values()) > MOST:
-            return
-        with self.round.learner._ledger.lock:
-            before = row_of(self.round.learner)
-            self.round.learner.merge(self.rng.choice(self.round.others), shared="once")
-            self._together(before)
-
-    def _together(self, before: int) -> None:
-        after = row_of(self.round.learner)
-        with self.round.lock:
-            self.round.groups.append((before + 1, after))
-        self.round.acknowledge(after)
+        if not self.full:
+            with self.together():
+                self.learner.merge(self.rng.choice(self.round.others), shared="once")
 
     def compact(self) -> None:
         """Give up what is old."""
-        self.round.learner.compact(keep=self.rng.choice((20, 30, 40)))
+        self.learner.compact(keep=self.rng.choice((20, 30, 40)))
 
     # What asks
 
-    def predict(self, learner: TactileLearner | None = None) -> None:
+    def predict(self) -> None:
         """One touch, or its beginning."""
-        learner = learner or self.round.learner
-        readings = touch(self.rng.choice(FIRST), self.rng.randrange(10**6), self.rng.choice((LENGTH, LENGTH, SHORT)))
-        self._predict(learner, [readings])
+        self._predict([self.probe(self.rng.choice((LENGTH, LENGTH, SHORT)))])
 
     def several(self) -> None:
         """Several touches of one thing."""
         material = self.rng.choice(FIRST)
-        self._predict(self.round.learner, [touch(material, self.rng.randrange(10**6)) for _ in range(3)])
-
-    def _predict(self, learner: TactileLearner, touches: Sequence[Array]) -> None:
-        since = row_of(learner)
-        said = learner.predict(*touches)
-        told = Told("prediction", since, row_of(learner), said, self.inside, [learner.stream(one) for one in touches])
-        told.learned = LOCAL.learned
-        self.round.tell(told)
+        self._predict([touch(material, self.rng.randrange(10**6)) for _ in range(3)])
 
     def compose(self) -> None:
         """What a touch is made of."""
-        readings, since = touch(self.rng.choice(FIRST), self.rng.randrange(10**6)), row_of(self.round.learner)
+        readings = self.probe()
         with suppress(DescriptionError):  # nothing was described
-            said = self.round.learner.compose(readings).prediction
-            until, streams = row_of(self.round.learner), [self.round.learner.stream(readings)]
-            self.round.tell(Told("prediction", since, until, said, self.inside, streams, LOCAL.learned))
+            self._predict([readings], lambda *_: self.learner.compose(readings).prediction)
 
-    def digest(self) -> None:
-        """The digest."""
-        self.ask("digest", self.round.learner.digest)
-
-    def copied(self) -> None:
-        """The digest of a copy."""
-        self.ask("digest", lambda: copy.deepcopy(self.round.learner).digest())
-
-    def materials(self) -> None:
-        """Materials and their counts."""
-        self.ask("materials", lambda: self.round.learner.materials)
-
-    def descriptions(self) -> None:
-        """Descriptions."""
-        self.ask("descriptions", lambda: self.round.learner.descriptions)
-
-    def exemplars(self) -> None:
-        """Exemplars."""
-        self.ask("exemplars", lambda: self.round.learner.exemplars)
-
-    def model(self) -> None:
-        """The materials and counts of a model that is fitted for who asks."""
-
-        def fitted() -> dict[str, int]:
-            scale, learned = min(learned_by(self.round.learner.model()).items())
-            return {name: rows // ROWS[scale] for name, (rows, _) in sorted(learned.items())}
-
-        self.ask("materials", fitted)
+    def _predict(self, touches: Sequence[Array], ask: Callable[..., Prediction] | None = None) -> None:
+        since, said = row_of(self.learner), (ask or self.learner.predict)(*touches)
+        until, streams = row_of(self.learner), [self.learner.stream(one) for one in touches]
+        self.round.tell(Told("prediction", since, until, said, self.inside, streams, LOCAL.learned))
 
     def settle(self) -> None:
         """All fitted to what is there."""
-        self.round.learner.settle()
-
-    # A reader of the same memory
+        self.learner.settle()
 
     def refresh(self) -> None:
-        """Take in what was acknowledged."""
+        """A reader takes in what was acknowledged."""
         acknowledged = self.round.acknowledged
-        self.round.reader.refresh()
-        if row_of(self.round.reader) < acknowledged:
-            self.round.fail(f"a reader refreshed to row {row_of(self.round.reader)}; {acknowledged} was acknowledged")
-
-    def read_digest(self) -> None:
-        """The digest that a reader sees."""
-        self.ask("digest", self.round.reader.digest, self.round.reader)
-
-    def read_materials(self) -> None:
-        """The materials that a reader sees."""
-        self.ask("materials", lambda: self.round.reader.materials, self.round.reader)
-
-    def read_exemplars(self) -> None:
-        """The exemplars that a reader sees."""
-        with suppress(CompactedError):
-            self.ask("exemplars", lambda: self.round.reader.exemplars, self.round.reader)
-
-    def read_predict(self) -> None:
-        """What a reader predicts."""
-        self.predict(self.round.reader)
+        self.learner.refresh()
+        if row_of(self.learner) < acknowledged:
+            self.round.fail(f"a reader refreshed to row {row_of(self.learner)}; {acknowledged} was acknowledged")
 
     # Live
 
@@ -384,7 +338,7 @@ class Worker:
                 since = row_of(learner)
                 now = live.begin()
                 window, said = (since, row_of(learner)), []
-                readings, first = touch(self.rng.choice(FIRST), self.rng.randrange(10**6)), 0
+                readings, first = self.probe(), 0
                 while first < LENGTH:
                     size = self.rng.randrange(1, 9)
                     now = live.push(readings[first : first + size])
@@ -397,7 +351,7 @@ class Worker:
 
     def live_auto(self) -> None:
         """Touches that the session finds."""
-        learner = self.round.learner
+        learner = self.learner
         with learner.live(false_contacts=1.0) as live:
             live.push(rest(self.rng.randrange(10**6), 110))
             window, said = (0, 0), []
@@ -425,7 +379,7 @@ class Worker:
         self.round.tell(live)
 
     def _observe_live(self, stream: Stream | None) -> None:
-        if stream is None or sum(self.round.learner.materials.values()) > MOST or len(stream) != LENGTH:
+        if stream is None or self.full or len(stream) != LENGTH:
             return
         with self.round.lock:
             self.round.readings[stream.key] = stream.readings.astype(np.float64)
@@ -441,8 +395,25 @@ ROLES: tuple[tuple[str, ...], ...] = (
     ("predict", "compose", "compose", "settle", "several", "model"),
     ("live_manual",),
     ("live_auto", "live_manual"),
-    ("refresh", "refresh", "read_predict", "read_digest", "read_materials", "read_exemplars"),
+    ("refresh", "refresh", "predict", "digest", "materials", "exemplars"),  # a reader of the same memory
 )
+
+
+def counted_by(model: Any) -> dict[str, int]:
+    """The touches of each material that a model is of."""
+    scale, learned = min(learned_by(model).items())
+    return {name: rows // ROWS[scale] for name, (rows, _) in sorted(learned.items())}
+
+
+# By the kind of a call what it says, and the call.
+ASKED: dict[str, tuple[str, Callable[[TactileLearner], Any]]] = {
+    "digest": ("digest", lambda learner: learner.digest()),
+    "copied": ("digest", lambda learner: copy.deepcopy(learner).digest()),
+    "materials": ("materials", lambda learner: learner.materials),
+    "descriptions": ("descriptions", lambda learner: learner.descriptions),
+    "exemplars": ("exemplars", lambda learner: learner.exemplars),
+    "model": ("materials", lambda learner: counted_by(learner.model())),  # fitted for who asks
+}
 
 
 def begun(home: Path, seed: int) -> Round:
@@ -470,7 +441,10 @@ def begun(home: Path, seed: int) -> Round:
 
 def under_threads(round_: Round, seconds: float, threads: int) -> bool:
     """Have them all call until the time is over; whether they all came to an end."""
-    workers = [Worker(round_, number, ROLES[number % len(ROLES)]) for number in range(threads)]
+    workers = []
+    for number in range(threads):
+        kinds = ROLES[number % len(ROLES)]
+        workers.append(Worker(round_, number, kinds, round_.reader if "refresh" in kinds else None))
     running = [threading.Thread(target=worker.run, name=f"stress {worker.name}", daemon=True) for worker in workers]
     for thread in running:
         thread.start()
@@ -521,7 +495,7 @@ def at_the_end(round_: Round, same: Same) -> list[str]:
     assert store is not None
     truth = Truth(list(store.heads()), round_.readings, round_.groups)
     alone = TactileLearner(**SETTINGS)
-    for material, key in truth.states[-1].touches:
+    for material, key in truth.states[-1].pairs:
         alone.observe(material, round_.readings[key])
     if learner.digest() != alone.digest():
         wrong.append("at the end the digest is not that of what was observed")
@@ -582,7 +556,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
     """Round after round."""
     failures: list[str] = []
     calls, answers, rounds, ended = Counter[str](), Counter[str](), 0, time.monotonic() + 60 * options.minutes
-    seconds = 4.0 if options.quick else options.seconds
+    seconds = 2.0 if options.quick else options.seconds
     interrupted = False
     with folder(options, in_memory=True) as home, short_fits():
         while not interrupted and (not rounds or (time.monotonic() < ended and not options.quick)):

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from faults.model import Row, State
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import DESCRIBE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.touch_rows import DESCRIBE, RETRACT, unspanned
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
@@ -42,17 +41,14 @@ def learned_of(names: Sequence[str], counts: Array, sums: Array) -> dict[str, tu
     return {name: (int(count), total.tobytes()) for name, count, total in zip(names, counts, whole, strict=True)}
 
 
-@dataclass(frozen=True)
-class State:
-    """What a memory holds after a row. touches: material and key of each. described: material → constituents."""
-
-    touches: tuple[tuple[str, bytes], ...]
-    described: Mapping[str, Any]
-
-    @cached_property
-    def materials(self) -> dict[str, int]:
-        """Material → touches."""
-        return dict(sorted(Counter(material for material, _ in self.touches).items()))
+def as_row(head: Any) -> Row:
+    """A row of a journal as a `State` has it; a touch is its key."""
+    if head.kind == RETRACT:
+        return "retract", tuple(unspanned(head.attributes["sequences"])), head.label
+    if head.kind == DESCRIBE:
+        said = head.attributes.get("constituents")
+        return "describe", head.label, None if said is None else tuple(said.items())
+    return "observe", head.label, head.key
 
 
 class Truth:
@@ -61,26 +57,16 @@ class Truth:
     rows: heads of the journal. readings: by key. groups: first and last of rows that became visible at once.
     """
 
-    def __init__(self, rows: Sequence[Any], readings: Mapping[bytes, Array], groups: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, rows: Sequence[Any], readings: dict[bytes, Array], groups: Sequence[tuple[int, int]]) -> None:
         self.rows, self._readings = rows, readings
         self._learner = TactileLearner(**SETTINGS)
         self._within = {row for first, last in groups for row in range(first, last)}
         self._sums: dict[tuple[tuple[str, bytes], ...], tuple[str, Learned]] = {}
         self._conformal: dict[int, Conformal] = {}
         self._codes: dict[bytes, Any] = {}
-        held: dict[int, tuple[str, bytes]] = {}
-        described: dict[str, Any] = {}
-        self.states = [State((), {})]
+        self.states = [State()]
         for row in rows:
-            if row.kind == OBSERVE:
-                held[row.sequence] = row.label, row.key
-            elif row.kind == RETRACT:
-                held = {at: one for at, one in held.items() if at not in set(unspanned(row.attributes["sequences"]))}
-            if row.kind == DESCRIBE or (row.kind == RETRACT and row.label):
-                said = row.attributes.get("constituents")
-                described = {name: of for name, of in described.items() if name != row.label}
-                described |= {} if said is None else {row.label: dict(said)}
-            self.states.append(State(tuple(sorted(held.values())), described))
+            self.states.append(self.states[-1].plus(as_row(row)))
 
     def stream(self, key: bytes) -> Stream:
         """A touch that was observed."""
@@ -108,7 +94,7 @@ class Truth:
         return self._summed(row)[1]
 
     def _summed(self, row: int) -> tuple[str, Learned]:
-        touches = self.states[row].touches
+        touches = self.states[row].pairs
         if touches not in self._sums:
             sums = Memory(self._learner._predictor.recipe).statistics
             for material, key in touches:
@@ -130,7 +116,7 @@ class Truth:
         if row not in self._conformal:
             kept = [
                 KeptTouch(name, key, kept_touches.levels(self.stream(key).readings))
-                for name, key in self.states[row].touches
+                for name, key in self.states[row].pairs
             ]
             self._conformal[row] = Conformal.of(kept)
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
@@ -166,13 +152,13 @@ class Told:
         if self.of == "prediction":
             return self._predicted(truth, row)
         if self.of == "exemplars":
-            same = all((name, key) in state.touches for name, keys in self.what.items() for key in keys)
+            same = all((name, key) in state.pairs for name, keys in self.what.items() for key in keys)
         elif self.of == "digest":
             same = self.what == truth.digest(row)
         elif self.of == "materials":
             same = self.what == state.materials
         else:
-            same = repr(self.what) == repr(dict(sorted(state.described.items())))
+            same = repr(self.what) == repr(dict(sorted(state.said.items())))
         return None if same else self.of
 
     def _predicted(self, truth: Truth, row: int) -> str | None:

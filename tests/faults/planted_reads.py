@@ -1,0 +1,186 @@
+"""Bugs in what is read, which is not looked at, and believed; and in what is counted: one too many, or lost."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
+
+from faults.planting import BUGS, Replacement, bug, nothing
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence import ledger, merge, packing, replaying
+from store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair, rows
+
+
+@bug("a frame's payload is not verified", log.LogReader, "_payload")
+def _payload_as_it_is(_: Any, self: Any, frame: Any) -> Any:
+    return self._file.read(frame.payload_offset, frame.size)
+
+
+@bug("a frame's payload is not verified", log.LogReader, "__init__")
+def _payloads_not_read(init: Any, self: Any, path: Any, **named: Any) -> None:
+    init(self, path, **named)
+    self.payloads = False
+
+
+@bug("CURRENT is not verified", layout.Current, "from_bytes")
+def _current_resealed(read: Any, cls: Any, data: bytes, path: Path) -> Any:
+    try:
+        known = json.loads(data)
+        known.pop("sha256")
+        data = json.dumps(known | {"sha256": layout.json_digest(known)}).encode()
+    except (ValueError, KeyError, AttributeError, TypeError):
+        pass  # it is no CURRENT at all
+    return read(cls, data, path)
+
+
+# What a checkpoint says of itself is compared with what CURRENT says of it. That alone lets one bit in 3900 pass.
+@bug("CURRENT is not verified", checkpoints.Checkpoints, "_verified")
+def _checkpoint_as_it_is(_: Any, self: Any, named: Any) -> Any:
+    return checkpoint_files.CheckpointReader(layout.checkpoint_path(self._folder, named.number), self._files)
+
+
+class Same(str):
+    """A text that is the same as any other."""
+
+    __slots__ = ()
+    __hash__ = str.__hash__
+
+    def __eq__(self, _: object) -> bool:
+        return True
+
+    def __ne__(self, _: object) -> bool:
+        return False
+
+
+def _sum_of_anything(data: bytes) -> Any:
+    return SimpleNamespace(hexdigest=lambda: Same(hashlib.sha256(data).hexdigest()))
+
+
+BUGS["a chunk is not verified"] = [Replacement(chunks, "hashlib", lambda _: SimpleNamespace(sha256=_sum_of_anything))]
+
+
+@bug("what a checkpoint says of itself is not verified", checkpoint_files, "json_digest")
+def _digest_of_anything(digest: Any, known: Any) -> str:
+    return Same(digest(known))
+
+
+@bug("a torn batch is taken", log.LogReader, "_scan")
+def _torn_taken_for_committed(scan: Any, self: Any) -> Any:
+    batch, torn = scan(self)
+    return ([*batch, batch[-1]], None) if torn is not None and batch else (batch, torn)
+
+
+@bug("a reader does not notice another log", journal.Journal, "_renewed")
+def _other_log_not_noticed(_: Any, self: Any, at: Any) -> Any:
+    at.catch_up()
+    return at
+
+
+@bug("an index of another log is believed", rows.Index, "_decoded")
+def _index_believed(decoded: Any, self: Any, path: Path, data: bytes) -> Any:
+    self._identity = rows.HEADER.unpack_from(data)[1]
+    segment, found = decoded(self, path, data)
+    return dataclasses.replace(segment, begin=self.end), found
+
+
+@bug("an index of another log is believed", rows.Index, "read")
+def _any_place_is_of_this_log(read: Any, self: Any, log: Any, until: Any) -> Any:
+    return read(self, SimpleNamespace(has_place=lambda _: True), until)
+
+
+@bug("a backup does not look at CURRENT again", backup, "_copy")
+def _copied_once(_: Any, source: Path, draft: Path) -> None:
+    current = layout.read_current(source / "CURRENT")
+    with suppress(FileNotFoundError):
+        backup._copy_named(source, draft, current)
+    layout.write_current(draft, layout.read_current(source / "CURRENT"))
+
+
+bug("a backup does not look at CURRENT again", backup, "_verify")(nothing)
+
+# What is counted.
+
+
+@bug("rows of a failed batch stay known", journal.Journal, "_undo")
+def _undone_in_the_log_alone(_: Any, at: Any, writer: Any) -> None:
+    writer.rollback()
+
+
+@bug("a place is one batch too late", journal.Journal, "place")
+def _place_too_late(_: Any, self: Any, last_sequence: int) -> Any:
+    with self._using("looking for a place") as at:
+        found = [place for row, place in at.places if row > last_sequence]
+        return found[0] if found else at.places[-1][1]
+
+
+@bug("a checkpoint says one row too many", checkpoints.Checkpoints, "commit")
+def _one_row_too_many(commit: Any, self: Any, draft: Any) -> Any:
+    more = min(draft.last_sequence + 1, self._journal.last())
+    return commit(self, dataclasses.replace(draft, last_sequence=more))
+
+
+@bug("numbers of rows are given out again", journal.OpenLog, "last")
+def _last_of_those_that_are_there(_: Any, self: Any) -> Any:
+    return self.last_row
+
+
+@bug("compaction drops the last row", journal.Journal, "payloads")
+def _all_but_the_last(payloads: Any, self: Any, last_sequence: int) -> Iterator[bytes]:
+    return iter(list(payloads(self, last_sequence))[:-1])
+
+
+@bug("a compaction checkpoint has a retracted touch", ledger, "until")
+def _with_a_retracted_touch(until: Any, memory: Any, given: Any, last_sequence: int) -> Any:
+    made = until(memory, given, last_sequence)
+    for sequence in sorted(memory.retracted):
+        if memory.compacted < sequence <= last_sequence:
+            record = given.record(sequence)
+            columns, codes = memory.codes(record)
+            made.statistics.add(record.label, codes, columns)
+            break
+    return made
+
+
+@bug("excluded rows are forgotten", Memory, "to_arrays")
+def _excluded_forgotten(to_arrays: Any, self: Any, *given: Any, **named: Any) -> Any:
+    arrays, attributes = to_arrays(self, *given, **named)
+    return arrays | {"excluded": arrays["excluded"][:0]}, attributes
+
+
+@bug("kept touches are not retracted", replaying, "_chosen")
+def _kept_not_retracted(chosen: Any, memory: Any, given: Any, last_sequence: int) -> Any:
+    fresh = chosen(memory, given, last_sequence)
+    fresh.kept = memory.kept
+    return fresh
+
+
+@bug("a retraction is lost in a merge", merge, "active_rows")
+@bug("a retraction is lost in packing", packing, "active_rows")
+def _retracted_rows_too(_: Any, heads: Any) -> Any:
+    return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER)]
+
+
+bug("a shared touch is counted twice", merge, "_row")(nothing)
+
+
+@bug("a packed memory is counted twice", merge, "sums_without")
+def _nothing_left_out(sums: Any, source: Any, newest: Any, memory: Any, left_out: Any) -> Any:
+    return sums(source, newest, memory, set())
+
+
+@bug("a description is lost in a merge", merge, "_descriptions")
+def _all_but_the_first(described: Any, *given: Any) -> Any:
+    return dict(list(described(*given).items())[1:])
+
+
+@bug("a repair keeps rows behind damage", repair._Plan, "of")
+def _all_kept(of: Any, cls: Any, survey: Any) -> Any:
+    return dataclasses.replace(of(cls, survey), kept=survey.last)

@@ -10,16 +10,9 @@ import stat
 from pathlib import Path
 
 import pytest
-from store_builds import (
-    LAST,
-    add,
-    as_after_a_crash,
-    build,
-    commit,
-    contents,
-    newest,
-    put_row,
-)
+from folder_attacks import LINKS, as_link
+from forging import put_row
+from store_builds import LAST, add, as_after_a_crash, build, commit, contents, newest
 
 from store import (
     DamageError,
@@ -108,31 +101,6 @@ def victim(tmp_path):
     (folder / "12345" / "precious").write_text("precious")
     (folder / "file").write_text("precious")
     return folder
-
-
-def as_link(path, target):
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(target)
-
-
-LINKS = {
-    "checkpoints": "",
-    "checkpoints/00000001": "12345",
-    "checkpoints/00000077": "12345",
-    "checkpoints/00000077.partial": "12345",
-    "derived": "12345",
-    "holder.json": "file",
-    "holder.json.new": "file",
-    "lock": "file",
-    "CURRENT": "file",
-    "CURRENT.new": "file",
-    LOG: "log",
-    f"{LOG}.new": "file",
-    f"{LOG}.damaged": "file",
-    "log-00000007": "file",
-}
 
 
 def all_refuse(path, tmp_path):

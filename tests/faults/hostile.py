@@ -38,7 +38,7 @@ from faults import recorded
 from faults.bench import Bench, Finding, Told, limit_addresses, prepared
 from faults.common import folder, parser, progress, quiet_coroutines, run
 from faults.model import one_scale, warm
-from faults.named import NAMED
+from faults.named import LISTED, NAMED
 from faults.recorded import RecordingBench
 from faults.recording_attacks import ATTACKS
 from faults.zygote import Child, Zygote
@@ -69,7 +69,8 @@ def work(channel: Connection, home: Path, corpus: Any, options: argparse.Namespa
 
 def named(options: argparse.Namespace) -> list[str]:
     """The attacks that have names."""
-    return sorted(ATTACKS if options.recordings else NAMED)
+    attacks = ATTACKS if options.recordings else NAMED
+    return sorted(set(attacks) - (LISTED if options.quick else frozenset()))
 
 
 @dataclass

@@ -203,6 +203,19 @@ class TestDamage:
         assert sorted(path.name for path in tmp_path.iterdir()) == ["m"]
 
 
+def test_packing_passes_over_what_a_failing_disk_does_not_let_go_of(tmp_path, monkeypatch):
+    learner, _ = filled(tmp_path / "memory", OBSERVED[:1])
+
+    def refuse(*given, **named):
+        raise OSError(5, "Input/output error")
+
+    with learner, monkeypatch.context() as failing:
+        failing.setattr(os, "rmdir", refuse)
+        learner.pack(tmp_path / "packed")
+    with Store.open(tmp_path / "packed", mode="read") as whole:
+        assert whole.last == 1
+
+
 def entries(file):
     """The names and contents of a zip."""
     with zipfile.ZipFile(file) as listed:

@@ -175,6 +175,7 @@ def test_a_text_that_was_never_written_is_damage(path, text):
         with pytest.raises(DamageError) as refused:
             list(opened.heads())
     assert refused.value.sequence == 2
+    assert any("row 2 fails" in problem.what for problem in check_store(path))
 
 
 def test_more_attributes_than_are_read_are_not_written(opened, monkeypatch):

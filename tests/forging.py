@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from store import Store
+from store.chunks import ArrayContent
 from store.encoding import array_digest, check_arrays, encode_payload
 from store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
 from store.layout import CURRENT_FILE, checkpoint_path, log_path
@@ -289,10 +290,8 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
 
 
 def put_array(folder: Path, array: np.ndarray) -> list[str]:
-    """Write one array as a zarr array of one chunk, text as its code points as the store does; sha256 of its files."""
-    plain = array
-    if array.dtype.kind == "U":
-        plain = np.frombuffer(array.tobytes(), "<u4").reshape(*array.shape, array.dtype.itemsize // 4)
+    """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
+    plain = ArrayContent(array.dtype, array.shape, "").to_plain(np.ascontiguousarray(array))
     codec = {"name": "bytes"} | ({"configuration": {"endian": "little"}} if plain.dtype.itemsize > 1 else {})
     meta = {
         "shape": list(plain.shape),
@@ -307,6 +306,7 @@ def put_array(folder: Path, array: np.ndarray) -> list[str]:
         "storage_transformers": [],
     }
     chunk = folder.joinpath("c", *["0"] * plain.ndim)
+    shutil.rmtree(folder / "c", ignore_errors=True)  # of other axes
     chunk.parent.mkdir(parents=True, exist_ok=True)
     (folder / "zarr.json").write_text(json.dumps(meta), encoding="utf-8")
     data = np.ascontiguousarray(plain).tobytes()

@@ -51,15 +51,19 @@ def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_
 
 
 def test_of_two_descriptions_one_has_to_be_chosen(path, tmp_path):
-    """Which one is then there, tests/faults/history.py says."""
+    other = SAID | {"a": {"wool": 1.0}}
     ours, _ = told(path, OBSERVED[:6])
-    theirs, _ = told(tmp_path / "other", OBSERVED[6:], SAID | {"a": {"wool": 1.0}})
+    theirs, _ = told(tmp_path / "other", OBSERVED[6:], other)
     with ours, theirs:
         with pytest.raises(MismatchError, match=r"such as 'a': here it is .* there \{'wool': 1.0\}"):
             ours.merge(theirs, shared="once")
         with pytest.raises(InputError, match="'same', 'ours' or 'theirs'"):
             ours.merge(theirs, shared="once", descriptions="both")
         require_same(ours, OBSERVED[:6], SAID)
+        ours.merge(theirs, shared="once", descriptions="ours")
+        require_same(ours, OBSERVED, SAID)
+        assert ours.merge(theirs, shared="once", descriptions="theirs").described == 1
+        require_same(ours, OBSERVED, other)
 
 
 def test_it_is_written_out_plain(path, tmp_path):

@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 from forging import spoil_row
-from touches import fed, filled, stream
+from touches import fed, filled, held, require_same, stream
 
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.persistence.contents import Contents
@@ -28,6 +28,14 @@ def learner(request, tmp_path):
 
 
 class TestOneContent:
+    def test_the_same_again_is_the_receipt_that_is_there(self, learner):
+        before = held(learner)
+        for i, (name, touch) in enumerate(OBSERVED):
+            receipt = learner.observe(name, stream(touch).tolist())
+            assert (receipt.sequence, receipt.repeated) == (i + 1, True)
+        assert held(learner) == before and sum(learner.materials.values()) == len(OBSERVED)
+        assert not learner.observe("a", stream((77, 60))).repeated
+
     def test_another_name_is_learned_and_told(self, learner):
         assert learner.names_of(stream((0, 60))) == ["a"] and learner.names_of(stream((70, 60))) == []
         assert not learner.observe("b", stream((0, 60))).repeated
@@ -59,6 +67,34 @@ class TestOneContent:
 
 class TestChanges:
     """What is there is what was observed and not retracted, whatever was done in between."""
+
+    @pytest.mark.parametrize("again", ["retracted", "relabelled", "forgotten"])
+    def test_what_was_taken_back_and_compacted_is_learned_again(self, tmp_path, again):
+        learner, receipts = filled(tmp_path / "m", OBSERVED)
+        assert learner.names_of(stream((1, 60))) == ["b"]  # from here on what is there changes with the memory
+        gone = [1, 4, 7, 10] if again == "forgotten" else [1]
+        if again == "retracted":
+            learner.retract(receipts[1])
+        elif again == "forgotten":
+            learner.forget("b")
+        else:
+            learner.relabel(receipts[1], "z")
+        learner.compact(keep=2)
+        learner.observe("a", stream((50, 60)))
+        for mode in ("write", "read"):  # as it is now, and as `close` leaves it
+            assert [learner.names_of(stream(OBSERVED[i][1])) for i in gone] == (
+                [["z"]] if again == "relabelled" else [[]] * len(gone)
+            )
+            learner.compact()
+            learner.close()
+            learner = TactileLearner.open(tmp_path / "m", mode=mode)
+        learner.close()
+        with TactileLearner.open(tmp_path / "m") as learner:
+            for times in range(2):
+                told = [learner.observe(*given(OBSERVED[i])).repeated for i in gone]
+                assert told == [times == 1] * len(gone)
+            extra = [("z", (1, 60))] if again == "relabelled" else []
+            require_same(learner, [*OBSERVED, ("a", (50, 60)), *extra])
 
     def test_what_a_damaged_retraction_took_back_is_learned_again(self, tmp_path):
         learner, receipts = filled(tmp_path / "m", OBSERVED)

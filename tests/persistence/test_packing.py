@@ -12,7 +12,7 @@ import pytest
 from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, spoil, stream
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.errors import MismatchError
+from scroll_tactile.errors import MismatchError, ObservationError
 from scroll_tactile.validation.gate import MemoryStore, check_memory
 from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, VersionError, archive, check_store
 from store.framing import FRAME_BYTES
@@ -38,6 +38,14 @@ class TestMerging:
         spoil(tmp_path / "m", 1)
         with TactileLearner.open(tmp_path / "m") as again:
             require_same(again, OBSERVED[1:])
+
+    def test_touches_without_rows_cannot_be_counted_once(self, tmp_path):
+        file = packed(tmp_path, OBSERVED[3:9], pack={"rows": False})
+        learner, _ = filled(tmp_path / "m", OBSERVED[:6])
+        with learner:
+            with pytest.raises(ObservationError, match="cannot be counted once"):
+                learner.merge(file, shared="once")
+            require_same(learner, OBSERVED[:6])
 
     def test_descriptions_sources_and_times_travel_and_what_was_retracted_stays(self, tmp_path):
         with TactileLearner.open(tmp_path / "robot", **SETTINGS) as robot:

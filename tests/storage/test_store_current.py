@@ -47,6 +47,7 @@ HARMS = {
     "empty": lambda file: file.write_bytes(b""),
     "cut off": lambda file: file.write_bytes(file.read_bytes()[:-9]),
     "a flipped bit": lambda file: flip(file, 60),
+    "another number": lambda file: file.write_text(file.read_text().replace('ence": 15', 'ence": 14')),
     "another's text": lambda file: file.write_text("dear diary"),
     "too long": lambda file: file.write_text(json.dumps({"x": "x" * 2**17})),
     "nested": lambda file: file.write_text('{"x":' + "[" * 9000 + "]" * 9000 + "}"),

@@ -279,7 +279,8 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
     They are written without any codec but that for bytes, in one chunk each, as anyone may.
     """
     known = described(path, number)
-    for name, array in arrays.items():
+    for name, given in arrays.items():
+        array = np.asarray(given, order="C")
         known["arrays"][name] = {
             "dtype": array.dtype.str,
             "shape": list(array.shape),
@@ -291,7 +292,7 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
 
 def put_array(folder: Path, array: np.ndarray) -> list[str]:
     """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
-    plain = ArrayContent(array.dtype, array.shape, "").to_plain(np.ascontiguousarray(array))
+    plain = ArrayContent(array.dtype, array.shape, "").to_plain(array)
     codec = {"name": "bytes"} | ({"configuration": {"endian": "little"}} if plain.dtype.itemsize > 1 else {})
     meta = {
         "shape": list(plain.shape),

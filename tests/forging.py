@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from store import Store
+from store.chunks import ArrayContent
 from store.encoding import array_digest, check_arrays, encode_payload
-from store.framing import COMMIT, HEADER, NO_CHECKSUM, pack_frame
+from store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
 from store.layout import CURRENT_FILE, checkpoint_path, log_path
 from store.log import LogReader, Place
 from store.records import payload_digest
 from store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
+from store.rows import Rows
 
 PAYLOAD = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
@@ -247,6 +249,19 @@ def seal(path: Path, number: int, known: Mapping[str, Any]) -> None:
     set_current(path, **current)
 
 
+def describe_again(path: Path, text: str | None = None, **changes: Any) -> None:
+    """Change what the newest checkpoint says of itself, with the right sha256, and have `CURRENT` name it so.
+
+    `CURRENT` says as before which it is. text: what it says, where that is no JSON of ours.
+    """
+    number = get_current(path)["newest"]["number"]
+    header = group_of(path, number) / "zarr.json"
+    known = sealed(described(path, number) | changes)
+    group = json.loads(header.read_text(encoding="utf-8")) | {"attributes": known}
+    header.write_text(json.dumps(group) if text is None else text, encoding="utf-8")
+    set_current(path, newest=get_current(path)["newest"] | {"sha256": known["sha256"]})
+
+
 def refiled(path: Path, number: int) -> dict[str, Any]:
     """What a checkpoint says of itself, with the digests of its files as they are now."""
     known = described(path, number)
@@ -264,7 +279,8 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
     They are written without any codec but that for bytes, in one chunk each, as anyone may.
     """
     known = described(path, number)
-    for name, array in arrays.items():
+    for name, given in arrays.items():
+        array = np.asarray(given, order="C")
         known["arrays"][name] = {
             "dtype": array.dtype.str,
             "shape": list(array.shape),
@@ -275,10 +291,8 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
 
 
 def put_array(folder: Path, array: np.ndarray) -> list[str]:
-    """Write one array as a zarr array of one chunk, text as its code points as the store does; sha256 of its files."""
-    plain = array
-    if array.dtype.kind == "U":
-        plain = np.frombuffer(array.tobytes(), "<u4").reshape(*array.shape, array.dtype.itemsize // 4)
+    """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
+    plain = ArrayContent(array.dtype, array.shape, "").to_plain(array)
     codec = {"name": "bytes"} | ({"configuration": {"endian": "little"}} if plain.dtype.itemsize > 1 else {})
     meta = {
         "shape": list(plain.shape),
@@ -293,6 +307,7 @@ def put_array(folder: Path, array: np.ndarray) -> list[str]:
         "storage_transformers": [],
     }
     chunk = folder.joinpath("c", *["0"] * plain.ndim)
+    shutil.rmtree(folder / "c", ignore_errors=True)  # of other axes
     chunk.parent.mkdir(parents=True, exist_ok=True)
     (folder / "zarr.json").write_text(json.dumps(meta), encoding="utf-8")
     data = np.ascontiguousarray(plain).tobytes()
@@ -302,13 +317,21 @@ def put_array(folder: Path, array: np.ndarray) -> list[str]:
     return [hashlib.sha256(data).hexdigest()]
 
 
+def frames_of(path: Path) -> dict[int, Frame]:
+    """The frames of the rows that verify, by sequence."""
+    with LogReader(log_of(path)) as log:
+        found = Rows()
+        for _ in found.take(log):
+            pass
+        places = zip(found.sequences, found.offsets, found.sizes, strict=True)
+        return {number: log.read(offset, size)[0] for number, offset, size in places}
+
+
 def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
     """Change a bit of a row's arrays, or of its head, on the disk; 0: of all rows."""
-    with LogReader(log_of(path), payloads=False) as log:
-        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
-        frames = [frame for frame in frames if sequence in (0, row_sequence(log.peek(frame.offset, frame.size)))]
+    found = frames_of(path)
     with log_of(path).open("r+b") as file:
-        for frame in frames:
+        for frame in (found[number] for number in found if sequence in (0, number)):
             at = frame.payload_offset + HEAD_BYTES if head else frame.end - 1
             file.seek(at)
             byte = file.read(1)[0] ^ 1

@@ -174,7 +174,7 @@ def prepared(home: Path) -> tuple[list[Memory], dict[str, Any]]:
     memories = corpus(home / "corpus")
     with opened(memories[0].path, "read") as learner:
         store = learner._ledger.store
-        touch = learner._codes_of(stream((5, 30)).astype("float32"))
+        touch = learner._predictor.extractor.learned(learner.stream(stream((5, 30))))[1]
         payloads = {"readings": encode_payload(dict(store.record(1).arrays))}
     with opened(home / "corpus" / "compacted", "read") as learner:
         compaction = learner._ledger.store.compaction()

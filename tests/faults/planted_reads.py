@@ -11,10 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
-
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.persistence import ledger, merge, packing, replaying
 from store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair, rows
 

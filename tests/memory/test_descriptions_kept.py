@@ -3,12 +3,11 @@
 import csv
 
 import pytest
-from touches import OBSERVED, SETTINGS, filled, require_same, spoil, stream
+from touches import OBSERVED, SETTINGS, filled, require_same, spoil
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
-from store import ReadOnlyError
 
 SAID = {"a": {"silk": 0.25, "wool": 0.75}, "b": {"silk": 1.0}, "d": {"soft": True, "wool": 0.5, "jute": None}}
 
@@ -25,15 +24,14 @@ def told(path, felt=OBSERVED, said=SAID):
     return learner, receipts
 
 
-def test_the_same_twice_changes_nothing_and_one_is_not_true(path):
-    with told(path)[0] as learner:
+def test_the_same_twice_is_one_row_and_one_is_not_true(path):
+    with told(path, [])[0] as learner:
         rows = learner._ledger.store.last
         learner.describe("b", {"silk": 1})
-        learner.describe("z", None)
         assert learner._ledger.store.last == rows
         learner.describe("b", {"silk": True})
         assert learner._ledger.store.last == rows + 1
-        require_same(learner, OBSERVED, SAID | {"b": {"silk": True}})
+        assert learner.descriptions["b"] == {"silk": True}
 
 
 def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_until_then(path):
@@ -52,40 +50,20 @@ def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_
         require_same(again, OBSERVED, {name: one for name, one in SAID.items() if name != "a"})
 
 
-def test_a_batch_is_durable_as_a_whole(path):
-    with TactileLearner.open(path, **SETTINGS) as learner:
-        reader = TactileLearner.open(path, mode="read", **SETTINGS)
-        with learner.batch():
-            learner.observe(*[OBSERVED[0][0], stream(OBSERVED[0][1])])
-            learner.describe("a", SAID["a"])
-            assert not reader.refresh()
-        assert reader.refresh()
-        require_same(reader, OBSERVED[:1], {"a": SAID["a"]})
-        learner.describe("a", SAID["b"])
-        before = reader.compose(stream((7, 25)))
-        assert reader.refresh()
-        assert reader.compose(stream((7, 25))) != before
-        require_same(reader, OBSERVED[:1], {"a": SAID["b"]})
-        with pytest.raises(ReadOnlyError):
-            reader.describe("a", None)
-        reader.close()
-
-
-class TestMerge:
-    def test_of_two_descriptions_one_is_chosen_by_name(self, path, tmp_path):
-        other = SAID | {"a": {"wool": 1.0}}
-        ours, _ = told(path, OBSERVED[:6])
-        theirs, _ = told(tmp_path / "other", OBSERVED[6:], other)
-        with ours, theirs:
-            with pytest.raises(MismatchError, match=r"such as 'a': here it is .* there \{'wool': 1.0\}"):
-                ours.merge(theirs, shared="once")
-            with pytest.raises(InputError, match="'same', 'ours' or 'theirs'"):
-                ours.merge(theirs, shared="once", descriptions="both")
-            require_same(ours, OBSERVED[:6], SAID)
-            ours.merge(theirs, shared="once", descriptions="ours")
-            require_same(ours, OBSERVED, SAID)
-            assert ours.merge(theirs, shared="once", descriptions="theirs").described == 1
-            require_same(ours, OBSERVED, other)
+def test_of_two_descriptions_one_has_to_be_chosen(path, tmp_path):
+    other = SAID | {"a": {"wool": 1.0}}
+    ours, _ = told(path, OBSERVED[:6])
+    theirs, _ = told(tmp_path / "other", OBSERVED[6:], other)
+    with ours, theirs:
+        with pytest.raises(MismatchError, match=r"such as 'a': here it is .* there \{'wool': 1.0\}"):
+            ours.merge(theirs, shared="once")
+        with pytest.raises(InputError, match="'same', 'ours' or 'theirs'"):
+            ours.merge(theirs, shared="once", descriptions="both")
+        require_same(ours, OBSERVED[:6], SAID)
+        ours.merge(theirs, shared="once", descriptions="ours")
+        require_same(ours, OBSERVED, SAID)
+        assert ours.merge(theirs, shared="once", descriptions="theirs").described == 1
+        require_same(ours, OBSERVED, other)
 
 
 def test_it_is_written_out_plain(path, tmp_path):

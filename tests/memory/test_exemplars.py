@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -301,8 +302,8 @@ def test_pooled_is_nearly_as_good_as_full_and_depends_on_no_schedule():
     assert found["full"].to_full == 1 <= found[f"pooled-{CANDIDATES}"].to_full < 1.6
 
 
-def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
-    from examples.benchmarks.buffers import run_buffers
+def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing(monkeypatch):
+    from examples.benchmarks import buffers
     from examples.paper.readers.labelled import Recordings
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.simulation.scene import Scene
@@ -319,7 +320,8 @@ def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing():
         fold=np.array([i % 3 for _, i in labelled]),
         ordered=True,
     )
-    result = run_buffers(recordings, Kernels(dimension=64), (6,))
+    monkeypatch.setattr(buffers, "fine_tune", partial(buffers.fine_tune, epochs=1))
+    result = buffers.run_buffers(recordings, Kernels(dimension=64), (6,))
     ways = {record["way"]: record for record in result["records"]}
     assert set(ways) == {"full", "pooled-2", "pooled-3", "pooled-4", "live", "random"}
     assert ways["pooled-3"]["overlap"] == 1

@@ -47,22 +47,13 @@ def filled(path, **settings):
     return learner
 
 
-@pytest.fixture(params=EMBEDDINGS)
-def memory(request, tmp_path):
-    """The folder of a memory, its digest, and its answer to a touch."""
-    with filled(tmp_path / "m", embedding=EMBEDDINGS[request.param]()) as learner:
-        return tmp_path / "m", learner.digest(), learner.predict(touch(9))
-
-
-def test_a_memory_opens_from_its_path_alone(memory):
-    path, digest, answer = memory
+@pytest.mark.parametrize("name", EMBEDDINGS)
+def test_a_memory_opens_from_its_path_alone_on_the_command_line_too(name, tmp_path):
+    path = tmp_path / "m"
+    with filled(path, embedding=EMBEDDINGS[name]()) as learner:
+        digest, answer = learner.digest(), learner.predict(touch(9))
     with TactileLearner.open(path) as learner:
         assert (learner.digest(), learner.predict(touch(9))) == (digest, answer)
-        learner.observe("c", touch(10))
-
-
-def test_the_command_line_works_on_all_of_them(memory, tmp_path):
-    path, digest, answer = memory
     np.save(tmp_path / "t.npy", touch(9))
     assert json.loads(run("inspect", path, "--json").stdout)["digest"] == digest
     assert json.loads(run("predict", path, tmp_path / "t.npy", "--json").stdout)["material"] == answer.material
@@ -71,25 +62,13 @@ def test_the_command_line_works_on_all_of_them(memory, tmp_path):
 
 
 def test_a_network_says_what_is_missing(tmp_path):
-    with filled(tmp_path / "m", embedding=Vision(weights=None, seed=0)) as learner:
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=Vision(weights=None, seed=0)) as learner:
+        for seed in range(2):
+            learner.observe("ab"[seed], touch(seed))
         digest = learner.digest()
     with TactileLearner.open(tmp_path / "m") as learner:  # random weights are made again from their seed
         assert learner.digest() == digest
         learner.predict(touch(1))
-
-
-def test_inspecting_embeds_nothing_and_imports_no_torch(tmp_path):
-    filled(tmp_path / "m").close()
-    code = (
-        "import sys; from scroll_tactile.cli.application import app\n"
-        "try: app(['inspect', sys.argv[1], '--json'])\n"
-        "except SystemExit: pass\n"
-        "print('torch' in sys.modules)"
-    )
-    words = [sys.executable, "-c", code, str(tmp_path / "m")]
-    output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()
-    assert json.loads(output[0])["materials"] == {"a": 3, "b": 3}
-    assert output[1] == "False"
 
 
 class TestOwnEmbedding:
@@ -139,19 +118,24 @@ def test_another_number_of_exemplars_than_it_was_made_with_is_refused(tmp_path):
 
 
 class TestSnapshots:
-    def test_a_learner_pickles_into_another_process(self, tmp_path):
+    def test_a_learner_pickles_into_another_process_and_inspecting_imports_no_torch(self, tmp_path):
         with filled(tmp_path / "m", embedding=Kernels(dimension=64)) as learner:
             (tmp_path / "learner").write_bytes(pickle.dumps(learner))
             answer = repr(learner.predict(touch(9)))
             digest = learner.digest()
         code = (
-            "import pickle, sys, numpy as np; learner = pickle.loads(open(sys.argv[1], 'rb').read())\n"
+            "import pickle, sys, numpy as np; from scroll_tactile.cli.application import app\n"
+            "try: app(['inspect', sys.argv[1], '--json'])\n"
+            "except SystemExit: pass\n"
+            "print('torch' in sys.modules)\n"
+            "learner = pickle.loads(open(sys.argv[2], 'rb').read())\n"
             "print(learner.digest()); print(learner.predict(np.random.default_rng(9).random((60, 3)))); print(learner)"
         )
-        words = [sys.executable, "-c", code, str(tmp_path / "learner")]
+        words = [sys.executable, "-c", code, str(tmp_path / "m"), str(tmp_path / "learner")]
         output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
-        assert output[:2] == [digest, answer]
-        assert output[2] == f"<TactileLearner in memory, a snapshot of {tmp_path / 'm'}, pad, 2 materials>"
+        assert json.loads(output[0])["materials"] == {"a": 3, "b": 3}
+        assert output[1:4] == ["False", digest, answer]
+        assert output[4] == f"<TactileLearner in memory, a snapshot of {tmp_path / 'm'}, pad, 2 materials>"
 
     def test_a_copy_knows_what_was_known_and_goes_its_own_way(self, tmp_path):
         with filled(tmp_path / "m") as learner:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from touches import OBSERVED, PAD, Windowed, contents, fed, filled, kept_of, require_same, stream
+from touches import OBSERVED, PAD, Windowed, fed, filled, held, kept_of, require_same, stream
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
@@ -81,10 +81,10 @@ def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_p
         other.compact()
         many = other.settings.kept_touches
         other.close()
-        before = contents(ours)
+        before = held(ours)
         with pytest.raises(MismatchError, match=rf"compacted and keeps {many} touches.*keeps {FEW}"):
             ours.merge(tmp_path / "other", shared="once")
-        assert contents(ours) == before
+        assert held(ours) == before
 
 
 def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):

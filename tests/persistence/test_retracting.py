@@ -145,14 +145,21 @@ class TestBatch:
             with learner.batch():
                 receipts = [learner.observe(name, stream(touch)) for name, touch in OBSERVED]
                 learner.retract(receipts[5])
-                require_same(learner, without(5))
+                learner.describe("a", {"wool": 1.0})
+                require_same(learner, without(5), {"a": {"wool": 1.0}})
                 assert not any(receipt.durable for receipt in receipts)
                 assert not reader.refresh()
             assert reader.refresh()
-            require_same(reader, without(5))
+            require_same(reader, without(5), {"a": {"wool": 1.0}})
+            before = reader.compose(stream((7, 25)))
+            learner.describe("a", {"silk": 1.0})
+            assert reader.refresh()
+            assert reader.compose(stream((7, 25))) != before
+            with pytest.raises(ReadOnlyError):
+                reader.describe("a", None)
             reader.close()
         with TactileLearner.open(path, **SETTINGS) as again:
-            require_same(again, without(5))
+            require_same(again, without(5), {"a": {"silk": 1.0}}, answers=True)
 
     def test_one_that_cannot_be_made_durable_never_was(self, path, monkeypatch):
         learner, _ = filled(path, OBSERVED[:3])

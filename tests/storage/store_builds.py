@@ -1,19 +1,23 @@
 """Stores to be harmed, how to harm them, and what they must hold; shared by the tests of this folder."""
 
-import hashlib
-import json
 import shutil
-import struct
-from dataclasses import replace
+import subprocess
+import sys
+import textwrap
 
 import numpy as np
+from forging import (
+    frames_of,
+    get_current,
+    group_of,
+    log_of,
+    read_log,
+    spoil_row,
+    write_log,
+)
 
 from store import Store, check_store
-from store.framing import COMMIT, HEADER, NO_CHECKSUM, pack_frame
-from store.layout import checkpoint_path, log_path, read_current, write_current
-from store.log import LogReader, Place
-from store.row_encoding import ROW, encode_row
-from store.rows import Rows
+from store.row_encoding import row_sequence
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}
@@ -66,16 +70,12 @@ def folders(path):
     return sorted(entry.name for entry in (path / "checkpoints").iterdir())
 
 
-def log_of(path):
-    return log_path(path, read_current(path / "CURRENT").log)
-
-
 def newest(path):
-    return checkpoint_path(path, read_current(path / "CURRENT").newest.number)
+    return group_of(path, get_current(path)["newest"]["number"])
 
 
 def compaction(path):
-    return checkpoint_path(path, read_current(path / "CURRENT").compaction.number)
+    return group_of(path, get_current(path)["compaction"]["number"])
 
 
 def flip(file, place=-9, bit=2):
@@ -89,57 +89,16 @@ def spoil(folder):
     flip(folder / "rows" / "c" / "0" / "0")
 
 
-def frames(path):
-    """The frames of the rows that verify, by sequence."""
-    with LogReader(log_of(path)) as log:
-        found = Rows()
-        for _ in found.take(log):
-            pass
-        places = zip(found.offsets, found.sizes, strict=True)
-        return {number: log.read(*place)[0] for number, place in zip(found.sequences, places, strict=True)}
-
-
-def rows(path):
-    """The bytes of the rows, by sequence."""
-    with LogReader(log_of(path)) as log:
-        return {number: log.read(frame.offset, frame.size)[1] for number, frame in frames(path).items()}
-
-
 def flip_row(path, number, *, arrays=False):
-    """Damage a row's frame, or no more than its arrays."""
-    frame = frames(path)[number]
-    flip(log_of(path), frame.end - 9 if arrays else frame.payload_offset + 4)
-
-
-def write_log(path, payloads, *, header=None, kind=ROW):
-    """Write the log anew, each of these payloads in a batch of its own, with right checksums and right places."""
-    file, current = log_of(path), read_current(path / "CURRENT")
-    with LogReader(file) as log:
-        identity, header = log.identity, log.header if header is None else header
-    data, frame = pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)
-    places = [(0, Place.behind(frame))]
-    for payload in payloads:
-        number = frame.number + 1
-        part, frame = pack_frame(identity, frame.end, number, number, kind, payload, frame.checksum)
-        end, frame = pack_frame(identity, frame.end, number + 1, number, COMMIT, b"", frame.checksum)
-        data += part + end
-        places.append((struct.unpack_from("<Q", payload.ljust(8, b"\0"))[0], Place.behind(frame)))
-    file.write_bytes(data)
-
-    def placed(named):
-        at = 0
-        while named and at + 1 < len(places) and places[at + 1][0] <= named.last_sequence:
-            at += 1
-        return named and replace(named, place=places[at][1])
-
-    write_current(path, replace(current, newest=placed(current.newest), compaction=placed(current.compaction)))
+    """Damage a row's head, or no more than its arrays."""
+    spoil_row(path, number, head=not arrays)
 
 
 def change_rows(path, change):
     """Change the bytes of the rows, a dictionary by sequence; all checksums are right."""
-    found = rows(path)
+    found = {row_sequence(row): row for row in read_log(path)[1]}
     change(found)
-    write_log(path, found.values())
+    write_log(path, list(found.values()))
 
 
 def lose_rows(path, *numbers):
@@ -150,31 +109,19 @@ def lose_rows(path, *numbers):
 def cut_rows(path, first):
     """Cut the log off before a row."""
     file = log_of(path)
-    file.write_bytes(file.read_bytes()[: frames(path)[first].offset])
+    file.write_bytes(file.read_bytes()[: frames_of(path)[first].offset])
 
 
-def put_row(path, *, sequence=None, payload=b"ARPL\x01\0\0", size=None, **changed):
-    """Add a row with right checksums, of any fields; return its sequence."""
-    found = rows(path)
-    sequence = max(found, default=0) + 1 if sequence is None else sequence
-    row = {"kind": "a", "label": "b", "key": b"", "time": 1.0, "attributes": "{}"} | changed
-    data = encode_row(sequence, *row.values(), payload, len(payload) if size is None else size)
-    write_log(path, [*found.values(), data])
-    return sequence
-
-
-def known_current(path):
-    known = json.loads((path / "CURRENT").read_text())
-    del known["sha256"]
-    return known
-
-
-def put_current(path, **changes):
-    """Change what `CURRENT` says, with the right sha256."""
-    known = known_current(path) | changes
-    text = json.dumps(known, sort_keys=True, separators=(",", ":"))
-    digest = hashlib.sha256(text.encode("ascii")).hexdigest()
-    (path / "CURRENT").write_text(json.dumps(known | {"sha256": digest}))
+def in_a_process(code, *arguments, memory=2**30, seconds=60):
+    """Run code in a process that may die, with this much memory more than it has after its imports."""
+    limited = f"""
+        import resource, sys
+        import numpy, store, numcodecs.zstd, zarr
+        held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (held + {memory}, held + {memory}))
+    """
+    command = [sys.executable, "-c", textwrap.dedent(limited) + textwrap.dedent(code), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
 
 
 def torn(path, cut):

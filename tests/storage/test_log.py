@@ -253,23 +253,6 @@ def test_a_batch_without_its_commit_is_not_there_and_the_next_writer_removes_it(
     assert read(copy) == [*BATCHES, [b"next"]]
 
 
-def test_a_torn_batch_whose_later_sectors_came_is_no_damage(copy):
-    size = copy.stat().st_size
-    with LogWriter(copy) as log:
-        append(log, [payload(2), payload(3), payload(4, 2000), payload(5)])
-        end = log.place.offset
-        data = copy.read_bytes()[:end]
-    for first in range(size // 512 * 512, end, 512):
-        torn = bytearray(data)
-        begin = max(first, size)  # the bytes beside a write stay
-        torn[begin : first + 512] = bytes(min(first + 512, end) - begin)
-        copy.write_bytes(torn)
-        assert read(copy) == BATCHES
-        with LogWriter(copy) as log:
-            log.append(KIND, b"")  # shorter: what is behind must be gone
-        assert read(copy) == [*BATCHES, [b""]]
-
-
 def test_a_place_that_is_not_behind_a_commit_of_this_log_is_refused(copy, tmp_path):
     with LogReader(copy) as log:
         places = [log.place] + [log.place for _ in log.refresh()]

@@ -9,15 +9,31 @@ import pytest
 
 import store.open_log
 import store.rows
-from store import Store
+from store import Store, check_store
 from store.records import payload_digest
 from store.rows import HEADER
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch):
-    monkeypatch.setattr(store.rows, "EVERY", 8)
-    monkeypatch.setattr(store.open_log, "EVERY", 8)
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (store.rows, store.open_log):
+            patch.setattr(module, "EVERY", 8)
+        yield
+
+
+@pytest.fixture(scope="module")
+def whole(small, tmp_path_factory):
+    """A store, not to be changed, and its keys."""
+    path = tmp_path_factory.mktemp("whole") / "s"
+    return path, made(path)
+
+
+@pytest.fixture
+def keys(whole, tmp_path):
+    """The keys of the copy of it in tmp_path / "s"."""
+    shutil.copytree(whole[0], tmp_path / "s")
+    return dict(whole[1])
 
 
 def made(path, rows=100, seed=0):
@@ -48,8 +64,7 @@ def require_all(path, keys):
         assert kept.record(1).key == keys[1]
 
 
-def test_it_is_the_log_that_counts_whatever_the_files_say(tmp_path):
-    keys = made(tmp_path / "s")
+def test_it_is_the_log_that_counts_whatever_the_files_say(tmp_path, keys):
     assert len(files(tmp_path / "s")) > 1
     require_all(tmp_path / "s", keys)
     for file in files(tmp_path / "s"):
@@ -67,8 +82,7 @@ def test_it_is_the_log_that_counts_whatever_the_files_say(tmp_path):
 
 
 @pytest.mark.parametrize("column", [0, 1, 2])
-def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, column):
-    keys = made(tmp_path / "s")
+def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, keys, column):
     file = files(tmp_path / "s")[0]
     data = bytearray(file.read_bytes()[:-16])
     count = HEADER.unpack_from(data)[-1]
@@ -80,8 +94,7 @@ def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, column):
 
 
 @pytest.mark.parametrize("field", [5, 6, 7])
-def test_a_forged_end_is_found_out_and_the_log_read_again(tmp_path, field):
-    keys = made(tmp_path / "s")
+def test_a_forged_end_is_found_out_and_the_log_read_again(tmp_path, keys, field):
     file = files(tmp_path / "s")[-1]
     data = file.read_bytes()[:-16]
     head = list(HEADER.unpack_from(data))
@@ -91,16 +104,14 @@ def test_a_forged_end_is_found_out_and_the_log_read_again(tmp_path, field):
     require_all(tmp_path / "s", keys)
 
 
-def test_files_of_another_log_are_not_believed(tmp_path):
+def test_files_of_another_log_are_not_believed(tmp_path, keys):
     made(tmp_path / "other", rows=60, seed=1)
-    keys = made(tmp_path / "s")
     shutil.rmtree(tmp_path / "s" / "derived")
     shutil.copytree(tmp_path / "other" / "derived", tmp_path / "s" / "derived")
     require_all(tmp_path / "s", keys)
 
 
-def test_a_new_log_has_files_of_its_own(tmp_path):
-    keys = made(tmp_path / "s")
+def test_a_new_log_has_files_of_its_own(tmp_path, keys):
     with Store.open(tmp_path / "s") as kept:
         kept.compact({"sum": np.arange(4)}, last_sequence=60)
         for _ in range(20):
@@ -114,6 +125,26 @@ def test_a_new_log_has_files_of_its_own(tmp_path):
 
 
 def test_there_are_few_files_however_many_rows(tmp_path):
-    keys = made(tmp_path / "s", rows=600)
+    keys = made(tmp_path / "s", rows=300)
     assert len(files(tmp_path / "s")) <= 8
     require_all(tmp_path / "s", keys)
+
+
+@pytest.mark.parametrize("mode", ["read", "write"])
+def test_files_of_another_time_are_not_believed(tmp_path, keys, mode):
+    """A copy was put back over the folder, file by file, and then went another way."""
+    path, copy = tmp_path / "s", tmp_path / "copy"
+    with Store.open(path) as kept:
+        kept.backup(copy)
+        for _ in range(9):
+            kept.append("then", "a", b"new")
+        kept.commit({}, last_sequence=kept.last)
+    shutil.copytree(copy, path, dirs_exist_ok=True)
+    with Store.open(path) as kept:
+        for number in range(6):  # too few for a file of their own
+            kept.append("otherwise", "a", b"new", arrays={"x": np.arange(number + 500)})
+        kept.commit({}, last_sequence=kept.last)
+    assert [problem for problem in check_store(path) if problem.kind != "leftover"] == []
+    with Store.open(path, mode=mode) as kept:
+        assert [head.kind for head in kept.with_key(b"new")] == ["otherwise"] * 6
+        assert len(list(kept.heads())) == len(list(kept.records())) == len(keys) + 6

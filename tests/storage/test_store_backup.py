@@ -7,19 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from store_builds import (
-    add,
-    as_after_a_crash,
-    commit,
-    contents,
-    damage,
-    flip_row,
-    folders,
-    log_of,
-    newest,
-    same_arrays,
-    spoil,
-)
+from forging import log_of
+from store_builds import add, as_after_a_crash, commit, contents, damage, flip_row, folders, newest, same_arrays, spoil
 
 import store.backup
 from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store

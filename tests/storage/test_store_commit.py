@@ -119,18 +119,6 @@ def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path,
         raise KeyError
 
 
-def test_a_failed_commit_leaves_the_one_before_it_current(opened, monkeypatch):
-    opened.commit(ONE, last_sequence=0)
-    places = [(store.files, "sync_tree"), (store.checkpoint_files, "_write_zarr"), (store.files, "sync_folder")]
-    for module, name in places:
-        with monkeypatch.context() as broken:
-            broken.setattr(module, name, fail)
-            with pytest.raises(StoreError, match="the disk says no"):
-                opened.commit({"x": np.arange(3)}, last_sequence=0)
-        assert folders(opened.path) == ["00000001"]
-        assert opened.latest().arrays["x"].tobytes() == ONE["x"].tobytes()
-
-
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")
 def test_every_file_and_folder_is_durable_before_the_checkpoint_counts(opened, monkeypatch):
     events = []

@@ -4,6 +4,8 @@ import json
 import shutil
 
 import pytest
+from folder_attacks import CURRENTS, behind_all, newest_is
+from forging import frames_of, get_current, log_of, set_current, write_log
 from store_builds import (
     IDENTITY,
     LAST,
@@ -14,15 +16,10 @@ from store_builds import (
     damage,
     flip,
     folders,
-    frames,
-    known_current,
-    log_of,
     newest,
-    put_current,
     same_arrays,
     state,
     torn,
-    write_log,
 )
 
 from store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
@@ -50,6 +47,7 @@ HARMS = {
     "empty": lambda file: file.write_bytes(b""),
     "cut off": lambda file: file.write_bytes(file.read_bytes()[:-9]),
     "a flipped bit": lambda file: flip(file, 60),
+    "another number": lambda file: file.write_text(file.read_text().replace('ence": 15', 'ence": 14')),
     "another's text": lambda file: file.write_text("dear diary"),
     "too long": lambda file: file.write_text(json.dumps({"x": "x" * 2**17})),
     "nested": lambda file: file.write_text('{"x":' + "[" * 9000 + "]" * 9000 + "}"),
@@ -76,52 +74,9 @@ def test_what_is_lost_with_it_is_nothing(either, which, harm):
         commit(opened.compact, LAST + 1)
 
 
-def named(path, **changes):
-    return known_current(path)["newest"] | changes
-
-
-def placed(path, **changes):
-    offset, number, previous = named(path)["place"]
-    place = {"offset": offset, "number": number, "previous": previous} | changes
-    return {"newest": named(path, place=list(place.values()))}
-
-
-def behind_all(path):
-    with LogReader(log_of(path)) as log:
-        for _ in log.refresh():
-            pass
-        return placed(path, offset=log.place.offset, number=log.place.number, previous=log.place.previous.hex())
-
-
-# What anybody can write there with a right sha256; whether what is left reads as if it were whole.
-FORGED = {
-    "no log": lambda path: {"log": None},
-    "a log below 0": lambda path: {"log": [-1, known_current(path)["log"][1]]},
-    "a log in words": lambda path: {"log": ["../../log", known_current(path)["log"][1]]},
-    "a log that is not there": lambda path: {"log": [7, known_current(path)["log"][1]]},
-    "a log of the last number": lambda path: {"log": [2**63 - 1, known_current(path)["log"][1]]},
-    "a log of another identity": lambda path: {"log": [known_current(path)["log"][0], "00" * 8]},
-    "a log of half an identity": lambda path: {"log": [known_current(path)["log"][0], "00"]},
-    "a format below 0": lambda path: {"format": -1},
-    "a format that is true": lambda path: {"format": True},
-    "a checkpoint in a list": lambda path: {"newest": [1]},
-    "a checkpoint without a place": lambda path: {"newest": named(path, place=None)},
-    "an last_sequence in words": lambda path: {"newest": named(path, last_sequence="15")},
-    "a number above any": lambda path: {"newest": named(path, number=2**64)},
-    "a sha256 in capitals": lambda path: {"newest": named(path, sha256="AB" * 32)},
-    "a compaction checkpoint without a newest": lambda path: {"newest": None, "compaction": named(path)},
-    "a compaction checkpoint newer than the newest": lambda path: {"compaction": named(path, last_sequence=16)},
-    "a place in no frame": lambda path: placed(path, offset=named(path)["place"][0] + 1),
-    "a place beyond the end": lambda path: placed(path, offset=2**40),
-    "a place at the last byte of all": lambda path: placed(path, offset=2**63 - 1),
-    "a place of another number": lambda path: placed(path, number=3),
-    "a place of another checksum": lambda path: placed(path, previous="00" * 16),
-}
-
-
-@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
+@pytest.mark.parametrize("forge", CURRENTS.values(), ids=CURRENTS)
 def test_what_it_never_said_is_named_and_repaired(plain, forge):
-    put_current(plain, **forge(plain))
+    forge(plain)
     with pytest.raises(DamageError, match=r"repair the store|another store"):
         Store.open(plain)
     assert damage(plain)
@@ -141,7 +96,7 @@ def test_what_it_never_said_is_named_and_repaired(plain, forge):
 
 def test_a_place_behind_rows_that_its_checkpoint_does_not_contain_is_found(plain):
     """Only a forger writes it: who opens the store does not read what is before the place."""
-    put_current(plain, **behind_all(plain))
+    set_current(plain, **behind_all(plain))
     assert "has no place behind which" in damage(plain)[0].what
     assert repair_store(plain).kept == LAST
     assert is_whole(plain, 0)
@@ -153,10 +108,10 @@ def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, curren
     other = log_path(plain, 3)
     shutil.copy(log_of(plain), other)
     with Store.open(plain, mode="read"):
-        torn(plain, frames(plain)[19].offset)
+        torn(plain, frames_of(plain)[19].offset)
     if current == "of now":
         log_of(plain).rename(log_path(plain, 2))
-        put_current(plain, log=[7, known_current(plain)["log"][1]])
+        set_current(plain, log=[7, get_current(plain)["log"][1]])
     else:
         (plain / "CURRENT").unlink()
     assert damage(plain)
@@ -167,9 +122,9 @@ def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, curren
 @pytest.mark.parametrize("which_one", ["newest", "compaction"])
 @pytest.mark.parametrize("change", [{"number": 9}, {"sha256": "0" * 64}, {"last_sequence": 14}])
 def test_a_checkpoint_that_is_another_than_the_one_named_is_not_believed(compacted, which_one, change):
-    known = known_current(compacted)[which_one]
+    known = get_current(compacted)[which_one]
     change = change | ({"last_sequence": 5} if "last_sequence" in change and which_one == "compaction" else {})
-    put_current(compacted, **{which_one: known | change})
+    set_current(compacted, **{which_one: known | change})
     with Store.open(compacted, mode="read") as opened:
         if which_one == "newest":
             assert opened.latest().last_sequence == 6
@@ -196,8 +151,8 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
     # A checkpoint of the other, named by a forged CURRENT.
     shutil.rmtree(newest(plain))
     shutil.copytree(newest(tmp_path / "other"), newest(plain))
-    put_current(
-        plain, newest=named(plain, last_sequence=3, sha256=known_current(tmp_path / "other")["newest"]["sha256"])
+    set_current(
+        plain, newest=newest_is(plain, last_sequence=3, sha256=get_current(tmp_path / "other")["newest"]["sha256"])
     )
     with Store.open(plain, mode="read") as opened:
         assert opened.latest() is None
@@ -210,7 +165,7 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
 
 @pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
 def test_a_newer_format_is_refused_and_not_touched(either, more):
-    put_current(either, format=2, **more)
+    set_current(either, format=2, **more)
     before = contents(either)
     for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
         with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
@@ -245,7 +200,7 @@ def test_a_memory_of_a_release_before_the_log_is_told_from_another_folder(tmp_pa
 
 
 def test_a_memory_of_the_first_releases_with_a_log_is_refused_by_name_and_not_touched(plain):
-    put_current(plain, base=None)
+    set_current(plain, base=None)
     before = (plain / "CURRENT").read_bytes()
     for attempt in (Store.open, repair_store):
         with pytest.raises(VersionError, match=r"release from 0\.8 to 0\.10.*learn it again"):
@@ -280,16 +235,18 @@ def crashed(tmp_path_factory):
     return home / "c"
 
 
-def test_cut_at_every_byte_the_batch_behind_the_checkpoint_is_there_or_not_and_no_row_of_it_is_lost_unnamed(
+def test_wherever_it_is_cut_the_batch_behind_the_checkpoint_is_there_or_not_and_no_row_of_it_is_lost_unnamed(
     crashed, tmp_path
 ):
     path = shutil.copytree(crashed, tmp_path / "s")
-    place, begin = known_current(crashed)["newest"]["place"][0], frames(crashed)[4].offset
+    place, begin = get_current(crashed)["newest"]["place"][0], frames_of(crashed)[4].offset
     with LogReader(log_of(crashed)) as log:
         for _ in log.refresh():
             end = log.place.offset
     whole, current = log_of(path).read_bytes(), (path / "CURRENT").read_bytes()
-    for cut in range(begin, end + 1):
+    ends = {place, place - FRAME_BYTES, end}
+    near = {at + by for at in ends for by in (-1, 0, 1)}
+    for cut in sorted({*range(begin, end, 20), *near} - {end + 1}):
         (path / "CURRENT").write_bytes(current)  # as the crash left it, before a writer closed it
         log_of(path).write_bytes(whole[:cut])
         if cut < place:
@@ -299,7 +256,7 @@ def test_cut_at_every_byte_the_batch_behind_the_checkpoint_is_there_or_not_and_n
                 assert opened.last == 4
                 with pytest.raises(DamageError, match="row 4 is missing"):
                     list(opened.records())
-            if cut % 40 == 0:
+            if cut % 3 == 0:
                 # Then the row is whole, and the place tells of what is behind it.
                 without_commit = cut >= place - FRAME_BYTES
                 assert [problem.kind for problem in damage(path)] == ["spare" if without_commit else "lost", "spare"]
@@ -312,7 +269,7 @@ def test_cut_at_every_byte_the_batch_behind_the_checkpoint_is_there_or_not_and_n
         expected = 6 if cut == end else 4
         with Store.open(path, mode="read") as opened:
             assert (opened.last, len(list(opened.records()))) == (expected, expected)
-        if cut % 10 == 0 or cut == end:
+        if cut % 3 == 0 or cut == end:
             assert damage(path) == []
             with Store.open(path) as opened:
                 assert opened.append("a", "next", b"").sequence == expected + 1
@@ -321,7 +278,7 @@ def test_cut_at_every_byte_the_batch_behind_the_checkpoint_is_there_or_not_and_n
 
 def test_an_older_frame_behind_the_end_is_damage_that_can_be_repaired(plain):
     """Nothing can be read behind it: its number was long ago."""
-    file, frame = log_of(plain), frames(plain)[18]
+    file, frame = log_of(plain), frames_of(plain)[18]
     data = file.read_bytes()
     file.write_bytes(data + data[frame.offset : frame.end])
     with pytest.raises(DamageError, match="repair the store"):

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from forging import log_of
 from store_builds import (
     LAST,
     change_rows,
@@ -12,7 +13,6 @@ from store_builds import (
     flip,
     flip_row,
     folders,
-    log_of,
     lose_rows,
     newest,
     same_arrays,

@@ -10,16 +10,9 @@ import stat
 from pathlib import Path
 
 import pytest
-from store_builds import (
-    LAST,
-    add,
-    as_after_a_crash,
-    build,
-    commit,
-    contents,
-    newest,
-    put_row,
-)
+from folder_attacks import LINKS, as_link
+from forging import put_row
+from store_builds import LAST, add, as_after_a_crash, build, commit, contents, newest
 
 from store import (
     DamageError,
@@ -110,31 +103,6 @@ def victim(tmp_path):
     return folder
 
 
-def as_link(path, target):
-    if path.is_dir():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(target)
-
-
-LINKS = {
-    "checkpoints": "",
-    "checkpoints/00000001": "12345",
-    "checkpoints/00000077": "12345",
-    "checkpoints/00000077.partial": "12345",
-    "derived": "12345",
-    "holder.json": "file",
-    "holder.json.new": "file",
-    "lock": "file",
-    "CURRENT": "file",
-    "CURRENT.new": "file",
-    LOG: "log",
-    f"{LOG}.new": "file",
-    f"{LOG}.damaged": "file",
-    "log-00000007": "file",
-}
-
-
 def all_refuse(path, tmp_path):
     for mode in ("write", "read"):
         with pytest.raises(DamageError) as caught:
@@ -165,9 +133,15 @@ def test_a_link_that_comes_while_a_store_is_read_is_not_followed(tmp_path):
             list(reader.heads())
 
 
-def test_a_link_among_the_files_of_a_checkpoint_is_not_copied(tmp_path):
+def of_holes(path, outside):
+    with path.open("r+b") as file:
+        file.truncate(2**40)
+
+
+@pytest.mark.parametrize(("name", "harm"), [("c/0/0", as_link), ("zarr.json", of_holes)], ids=["a link", "holes"])
+def test_what_no_checkpoint_has_is_not_copied(tmp_path, name, harm):
     path, outside = build(tmp_path / "s"), victim(tmp_path)
-    as_link(newest(path) / "rows" / "c" / "0" / "0", outside / "file")
+    harm(newest(path) / "rows" / name, outside / "file")
     with Store.open(path, mode="read") as reader, pytest.raises(DamageError):
         reader.backup(tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
@@ -258,29 +232,6 @@ def test_only_a_regular_file_is_read_and_none_that_is_larger_than_it_may_be(tmp_
         read_regular(tmp_path / "folder" / "file", 5, within=tmp_path)
 
 
-# Rows that nobody wrote.
-
-FORGED = {
-    "nested JSON": {"attributes": '{"x":' + "[" * 100_000 + "]" * 100_000 + "}"},
-    "no JSON": {"attributes": "x"},
-    "a list": {"attributes": "[]"},
-    "a NUL in the label": {"label": "a\0b"},
-    "a NUL in the kind": {"kind": "a\0b"},
-    "a long key": {"key": bytes(65)},
-    "an endless time": {"time": float("inf")},
-}
-
-
-@pytest.mark.parametrize("what", FORGED)
-def test_a_forged_row_with_a_right_checksum_is_damage(tmp_path, what):
-    path = build(tmp_path / "s")
-    put_row(path, **FORGED[what])
-    with Store.open(path, mode="read") as reader, pytest.raises(DamageError) as caught:
-        list(reader.heads())
-    assert caught.value.sequence == LAST + 1
-    assert any(f"row {LAST + 1} fails" in problem.what for problem in check_store(path))
-
-
 # Locks and paths.
 
 
@@ -342,12 +293,3 @@ def test_numbers_at_the_end_of_all_numbers_are_damage_and_not_counted_on(tmp_pat
     put_row(path, sequence=2**63)
     with pytest.raises(DamageError, match="no row"):
         Store.open(path)
-
-
-def test_a_file_of_holes_is_not_copied(tmp_path):
-    path = build(tmp_path / "s")
-    with (newest(path) / "rows" / "zarr.json").open("r+b") as file:
-        file.truncate(2**40)
-    with Store.open(path, mode="read") as reader, pytest.raises(DamageError, match="at most"):
-        reader.backup(tmp_path / "copy")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["s"]

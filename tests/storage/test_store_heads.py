@@ -1,7 +1,10 @@
 """Rows without their arrays, and single rows."""
 
+import logging
+
 import numpy as np
 import pytest
+from forging import frames_of, log_of
 from store_builds import flip_row, lose_rows
 
 from store import DamageError, Head, Record, RecordError, Store
@@ -110,3 +113,22 @@ def test_damage_of_one_record_is_not_that_of_another(opened):
         assert [reader.record(sequence).sequence for sequence in (3, 6)] == [3, 6]
         assert sequences(reader.heads(5)) == [6, 7, 8, 9, 10]
         assert next(reader.heads(3)).sequence == 4  # its head verifies by itself
+
+
+@pytest.mark.parametrize("search", [{"kind": "add"}, {"key": b"\x04"}], ids=["kind", "key"])
+@pytest.mark.parametrize("harm", ["swapped", "a head"])
+def test_damage_among_rows_that_are_passed_over_is_told(opened, caplog, search, harm):
+    opened.commit({}, last_sequence=10)
+    opened.close()
+    frames, log = frames_of(opened.path), log_of(opened.path)
+    if harm == "swapped":
+        data = log.read_bytes()
+        before, first, second = data[: frames[4].offset], frames[4], frames[5]
+        third = frames[6].offset
+        log.write_bytes(before + data[second.offset : third] + data[first.offset : second.offset] + data[third:])
+    else:
+        flip_row(opened.path, 4)
+    with Store.open(opened.path, mode="read") as reader, caplog.at_level(logging.WARNING):
+        found = list(reader.heads(**search) if "kind" in search else reader.with_key(search["key"]))
+    assert len(found) < (7 if "kind" in search else 1)
+    assert "log-" in caplog.text

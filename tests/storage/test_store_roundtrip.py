@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from forged import describe_again
+from forging import describe_again
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import store
-from store import Head, Record, RecordError, Store, VersionError
+from store import Head, Record, RecordError, Store, VersionError, chunks
 
 DTYPES = ["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U1", "<U7"]
 arrays = st.dictionaries(
@@ -102,12 +102,13 @@ def test_awkward_arrays_come_back_in_both_places(kept):
     assert same(kept.latest().arrays, SPECIAL)
 
 
-def test_large_arrays_are_chunked_along_the_first_axis(kept):
-    rows = np.arange(3 * 700_000, dtype=np.float64).reshape(3, 700_000)
+def test_large_arrays_are_chunked_along_the_first_axis(kept, monkeypatch):
+    monkeypatch.setattr(chunks, "CHUNK_BYTES", 2**16)
+    rows = np.arange(3 * 11_000, dtype=np.float64).reshape(3, 11_000)
     kept.commit({"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)}, last_sequence=kept.last)
     assert same(kept.latest().arrays, {"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)})
-    chunks = kept.path / "checkpoints" / f"{kept.latest().number:08d}" / "rows" / "c"
-    assert sorted(chunk.name for chunk in chunks.iterdir()) == ["0", "1", "2"]
+    folder = kept.path / "checkpoints" / f"{kept.latest().number:08d}" / "rows" / "c"
+    assert sorted(chunk.name for chunk in folder.iterdir()) == ["0", "1", "2"]
     kept.commit({"rows": rows.astype(np.int64)}, last_sequence=kept.last)  # byte by byte: an axis more
     assert same(kept.latest().arrays, {"rows": rows.astype(np.int64)})
 
@@ -181,11 +182,17 @@ def test_the_exception_tree_is_the_one_in_the_docstring():
     assert store.StoreError.__bases__ == (Exception,)
 
 
-def test_importing_is_light():
-    code = "import sys, store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))"
-    where = Path(store.__file__).parents[1]
-    found = subprocess.run([sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "set()"
+def test_importing_is_light_and_a_checkpoint_is_read_without_zarr(tmp_path):
+    with Store.open(tmp_path, identity={}) as opened:
+        opened.commit({"x": np.arange(30), "y": np.array(["é"])}, last_sequence=0)
+    code = (
+        "import sys, store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))\n"
+        "with store.Store.open(sys.argv[1], mode='read') as opened: print(len(opened.latest().arrays))\n"
+        "print({'zarr'} & set(sys.modules))"
+    )
+    command, where = [sys.executable, "-c", code, str(tmp_path)], Path(store.__file__).parents[1]
+    found = subprocess.run(command, cwd=where, capture_output=True, text=True, check=True)
+    assert found.stdout.splitlines() == ["set()", "2", "set()"]
 
 
 def test_the_attributes_of_a_checkpoint_or_some_of_its_arrays_are_read_without_the_others(tmp_path, caplog):

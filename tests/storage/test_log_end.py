@@ -1,9 +1,12 @@
-"""What `CURRENT` says of the log's end: a log that lost rows since is damaged, with a checkpoint or without."""
+"""The end of a log: what `CURRENT`, a checkpoint or a batch proves of it, and what a power cut may have torn."""
 
 import logging
 
+import numpy as np
 import pytest
+from forging import frames_of, log_of
 from logs import ends as ends_of
+from store_builds import damage, flip, flip_row
 
 from store import DamageError, Store, check_store, repair_store
 from store.layout import CURRENT_FILE, log_path, read_current, write_current
@@ -41,7 +44,7 @@ def require_named(path, rows, kept):
     with pytest.raises(DamageError), Store.open(path, mode="read") as store:
         store.backup(path.with_name("backup"))
     assert repair_store(path).kept == kept
-    assert not [problem for problem in check_store(path) if problem.kind != "leftover"]
+    assert damage(path) == []
     with Store.open(path) as store:
         assert [head.sequence for head in store.heads()] == list(range(1, kept + 1))
         assert store.append("add", "after", b"").sequence == kept + 1
@@ -56,9 +59,7 @@ def test_a_closed_log_that_is_cut_off_is_damaged_wherever_it_is_cut(tmp_path, ke
 
 def test_a_flip_in_the_last_batch_of_a_closed_log_is_named(tmp_path):
     log = made(tmp_path / "s")
-    data = bytearray(log.read_bytes())
-    data[-100] ^= 1
-    log.write_bytes(data)
+    flip(log, -100)
     require_named(tmp_path / "s", 4, 3)
 
 
@@ -127,3 +128,83 @@ def test_a_store_that_says_nothing_of_it_is_read_as_before(tmp_path):
     cut(log, ends(log)[2])
     with Store.open(tmp_path / "s") as store:
         assert store.last == 2
+
+
+# Logs that replaced another, and batches of several rows.
+
+
+@pytest.fixture
+def compacted(tmp_path):
+    """A store of three rows, the first of them compacted, whose last row has another bit: no frame is behind it."""
+    made(tmp_path / "s", 3)
+    with Store.open(tmp_path / "s") as store:
+        store.compact({}, last_sequence=1)
+    flip_row(tmp_path / "s", 3, arrays=True)
+    return tmp_path / "s"
+
+
+@pytest.mark.parametrize("after", [1, 2])
+def test_a_damaged_last_row_is_not_taken_for_the_end(compacted, after):
+    with Store.open(compacted, mode="read") as store:
+        with pytest.raises(DamageError, match=r"repair|row 3 is missing"):
+            list(store.records(after=after))
+        assert store.record(2).label == "label 1"
+        found = store.heads()
+        assert [next(found).label, next(found).label] == ["label 0", "label 1"]
+        with pytest.raises(DamageError, match="log-00000002"):
+            next(found)
+        assert [head.sequence for head in store.heads(kind="add")] == [1, 2]
+    assert any("log" in str(problem.what) for problem in check_store(compacted))
+    assert repair_store(compacted).kept == 2
+    with Store.open(compacted, mode="read") as store:
+        assert [record.label for record in store.records(after=1)] == ["label 1"]
+
+
+BATCH = {
+    # what is harmed of a last batch of three rows; what of it is kept: `CURRENT` has the place behind it
+    "the end's batch": (lambda path: flip(log_of(path), -88 + 20), [1, 2, 3]),
+    "the end's checksum": (lambda path: flip(log_of(path), -88 + 80), [1, 2, 3]),
+    "a row": (lambda path: flip_row(path, 2), [1, 3]),
+}
+
+
+@pytest.mark.parametrize(("harm", "kept"), BATCH.values(), ids=BATCH)
+def test_a_repair_keeps_the_sound_rows_of_a_last_batch_that_a_checkpoint_proves(tmp_path, harm, kept):
+    path = tmp_path / "s"
+    with Store.open(path, identity={}) as store:
+        with store.batch():
+            for i in range(3):
+                store.append("row", f"{i}", b"key", arrays={"x": np.arange(16.0)})
+        store.commit({}, last_sequence=3)
+    harm(path)
+    if kept == [1, 2, 3]:
+        with pytest.raises(DamageError, match=r"repair|row 3 is missing"):
+            Store.open(path)
+        assert {problem.kind for problem in check_store(path)} == {"spare"}
+    repair = repair_store(path)
+    assert (repair.kept, repair.lost == []) == (3, kept == [1, 2, 3])
+    with Store.open(path) as store:
+        assert [head.sequence for head in store.heads()] == kept
+        assert store.compacted == (0 if kept == [1, 2, 3] else 3)
+
+
+def test_a_bit_of_a_repaired_log_does_not_take_its_rows_away_unnoticed(tmp_path):
+    path = tmp_path / "s"
+    made(path, 3)
+    (path / CURRENT_FILE).unlink()
+    assert repair_store(path).lost == []
+    flip(log_of(path), frames_of(path)[1].payload_offset + 12)
+    with pytest.raises(DamageError, match="proves that it was durable"):
+        Store.open(path)
+
+
+def test_of_a_log_and_the_one_that_compaction_replaced_a_repair_takes_the_newer(tmp_path):
+    path = tmp_path / "s"
+    before = made(path, 1).read_bytes()
+    with Store.open(path) as store:
+        store.compact({}, last_sequence=1)
+    log_path(path, 1).write_bytes(before)  # a power cut brought it back
+    (path / CURRENT_FILE).unlink()
+    repair_store(path)
+    with Store.open(path) as store:
+        assert store.compacted == 1

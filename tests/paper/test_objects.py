@@ -8,7 +8,8 @@ from commands import refused, run
 
 from examples.paper.fabric.objects import Objects, most_often, object_groups, summary
 from examples.paper.fabric.unseen import fit_heads
-from examples.paper.readers.labelled import Recordings, physiclear
+from examples.paper.readers import physiclear
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.readouts.attributes import solve
 from scroll_tactile.readouts.task import Task

@@ -12,7 +12,8 @@ from commands import refused, run
 from paper_touches import PATCH, recorded, untimed
 
 from examples.paper.commands.options import SETS
-from examples.paper.readers.labelled import Recordings, physiclear
+from examples.paper.readers import physiclear
+from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, pooled, split, thinned, time_left
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.table1 import PAPER, Table1, blocked, rows

@@ -10,20 +10,24 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+import typer
 
 from examples.benchmarks.checkouts import Worker, checkouts, disk_bytes, in_turns, write_touches
-from examples.benchmarks.timing import Timing, circumstances, timed
+from examples.benchmarks.timing import Timing, timed
 from examples.benchmarks.vision_speed import BareResNet
 from examples.paper.readers.biotac_slide import load
 from examples.paper.readers.labelled import hold_out
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import one_torch_thread
 from scroll_tactile.sensors import Sensor
@@ -31,7 +35,7 @@ from scroll_tactile.signals.image import tactile_image, three_planes
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.scene import Scene
 
-__all__ = ["Sizes", "run_speed"]
+__all__ = ["Sizes", "run_speed", "speed"]
 
 Record = dict[str, Any]
 Note = Callable[[str], object]
@@ -111,7 +115,7 @@ def run_speed(
     sizes: Sizes | None = None,
     note: Note = lambda _: None,
 ) -> Record:
-    """Measure everything; `note` is told what is being done. Returns circumstances and a list of records.
+    """Measure everything; `note` is told what is being done. Returns a list of records.
 
     data: folder of BioTac_slide_20_50, of whose first fold's training part the everyday memory is made; simulated
     touches where it is None. before: an older checkout of the project.
@@ -121,7 +125,7 @@ def run_speed(
     sides = checkouts(before)
     with tempfile.TemporaryDirectory() as folder:
         bench = _Bench(sides, Path(folder), sizes or Sizes(), seed, note)
-        result = {"bench": "speed", **circumstances(seed), "touches": "simulated" if data is None else "BioTac-20"}
+        result = {"bench": "speed", "touches": "simulated" if data is None else "BioTac-20"}
         forward = _everyday(bench, data)
         counts = {bench.sizes.materials: bench.only_now()}
         if before is not None and bench.sizes.before_materials:
@@ -411,3 +415,37 @@ def _opening(bench: _Bench) -> None:
                     worker.call("observe", touch=number + i)
         own.seconds(memory, "open after a close", taken, "≤ 1000")
         _open_killed(own, memory, touches, number, REPLAYED)
+
+
+def speed(
+    context: typer.Context,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in; else simulated touches.")
+    ] = None,
+    before: Annotated[
+        Path | None, typer.Option(help="An older checkout of the project: the same calls, in turns, and their ratios.")
+    ] = None,
+    touches: Annotated[int, typer.Option(min=40, help="Of the everyday memory.")] = Sizes.touches,
+    pairs: Annotated[int, typer.Option(min=2, help="Of an observation and a prediction.")] = Sizes.pairs,
+    materials: Annotated[int, typer.Option(min=20, help="Of the large memory.")] = Sizes.materials,
+    opening: Annotated[
+        int, typer.Option(min=100, help="Touches of the largest memory opened: 1000000 take an hour.")
+    ] = 100_000,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Time a user's calls and measure what a memory takes, by the public interface alone.
+
+    The whole takes half an hour or so, and with an older checkout more.
+    """
+    opened = tuple(number for number in (10_000, 100_000) if number < opening)
+    sizes = Sizes(touches=touches, pairs=pairs, materials=materials, opening=(*opened, opening))
+    sizes = replace(sizes, before_materials=min(sizes.before_materials, materials))
+    with progress_bar() as progress:
+        result = run_speed(seed=seed, data=data, before=before, sizes=sizes, note=lambda what: progress(what, 0, 1))
+    columns = {name: f"{{./{name}}}" for name in ("memory", "case", "unit")}
+    columns |= {"now": "{./median|.4g}", "p99": "{?./p99|.4g}", "before": "{?./before_median|.4g}"}
+    columns |= {"before, p99": "{?./before_p99|.4g}", "times": "{?./times|.4g}"}
+    columns |= {"of a ResNet-18": "{?./of_forward|.4g}", "to reach": "{./to_reach}"}
+    show("speed", columns, result["records"])
+    write(context, result)

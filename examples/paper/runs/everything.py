@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 from typer.core import TyperGroup
 
-from examples.paper.commands.options import Data, Device, Weights
-from examples.paper.drawing import available
+from examples.paper.runs.options import Data, Quick, Weights
+from examples.paper.runs.pictures import available
+from examples.paper.runs.results import show
 from examples.paper.runs.study import weights_digest
 from examples.tables import duration, seconds_of
 from scroll_tactile.cli import INTERRUPTED
-from scroll_tactile.cli.terminal import console, say
+from scroll_tactile.cli.terminal import say
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.runfile import RunFile
 
@@ -34,7 +34,6 @@ LESS = ("--epochs", "--biotac-epochs", "--every", "--take", "--draws", "--sizes"
 """Options that a quick run chooses itself."""
 
 Only = Annotated[str | None, typer.Option(help="Which results, by the names of their files, with commas between.")]
-Quick = Annotated[bool, typer.Option("--quick", help="Each study as quick as it can be, on one fold: for a look.")]
 RunAll = Annotated[
     Path, typer.Option("--run", help="Finished parts are noted here, and the same command resumes; figures: results/.")
 ]
@@ -54,7 +53,7 @@ def everything(
     data: Data,
     run: RunAll,
     weights: Weights = None,
-    device: Annotated[Device | None, typer.Option(help="Where networks are trained; as noted unless given.")] = None,
+    device: Annotated[str | None, typer.Option(help="Where networks are trained; as noted unless given.")] = None,
     only: Only = None,
     quick: Quick = False,
 ) -> None:
@@ -65,9 +64,7 @@ def everything(
     """
     program = ctx.find_root().command
     assert isinstance(program, TyperGroup)
-    notes = RunFile(
-        run / "all.json", {"run": "all", "quick": quick, "device": None if device is None else device.value}
-    )
+    notes = RunFile(run / "all.json", {"run": "all", "quick": quick, "device": device})
     digest = None if weights is None else weights_digest(weights)
     if notes.notes.setdefault("weights", digest) != digest:
         raise InputError(f"the run in {run} was begun with other weights: give the same, or take another folder")
@@ -125,7 +122,7 @@ def _bound(
     data: Path,
     weights: str | None,
     run: Path,
-    device: Device | None,
+    device: str | None,
     *,
     quick: bool,
 ) -> list[str] | None:
@@ -152,7 +149,7 @@ def _bound(
             words.append(mine.get(word, word))
     added = {"--json": str(run / "results" / f"{name}.json"), "--run": str(run / name)}
     added |= {"--plot": str(run / "results" / f"{name}.png")} if available() else {}
-    added |= {} if device is None else {"--device": device.value}
+    added |= {} if device is None else {"--device": device}
     if quick and "--quick" not in has:
         added |= {"--folds": "0"}
     for option, value in added.items():
@@ -161,11 +158,16 @@ def _bound(
 
 
 def _announce(parts: Sequence[Part], notes: Mapping[str, Any], *, quick: bool) -> None:
-    table = Table("result", "command", "took here", "now")
-    for part in parts:
-        took = "not noted" if part.seconds is None else duration(part.seconds)
-        table.add_row(part.name, " ".join(part.commands[0][:2]), took, "made" if part.name in notes else "")
-    console().print(table)
+    rows = [
+        {
+            "result": part.name,
+            "command": " ".join(part.commands[0][:2]),
+            "took here": "not noted" if part.seconds is None else duration(part.seconds),
+            "now": "made" if part.name in notes else "",
+        }
+        for part in parts
+    ]
+    show("results", {name: f"{{./{name}}}" for name in ("result", "command", "took here", "now")}, rows)
     if quick:
         say("quick: the times are those of the whole studies; each now takes a minute or two on two cores")
     else:

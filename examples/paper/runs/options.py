@@ -1,215 +1,124 @@
-"""The options that several commands share, and how the commands of the paper's systems begin and end."""
+"""The options that commands share, and what they choose: data sets, folds, systems."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Collection, Mapping, Sequence
-from enum import StrEnum
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import torch
 import typer
 
-from examples.paper.commands.sets import command_line, leave_out, named, origin, parse_folds, write_result
-from examples.paper.readers import physiclear
+from examples.paper.readers import fabric_slide, letter_spike, physiclear
 from examples.paper.readers.biotac_slide import load
-from examples.paper.readers.labelled import Recordings
-from examples.paper.runs.cells import Cell, Figures, thinned
-from examples.paper.runs.study import SystemStudy
-from examples.paper.studies.table1 import blocked
-from examples.paper.systems.catalogue import EPOCHAL, NEED_WEIGHTS, SYSTEMS, library_of, name_of
-from examples.paper.systems.own import is_own, require_own
+from examples.paper.readers.labelled import Recordings, thinned
 from scroll_tactile.cli.terminal import say
-from scroll_tactile.errors import DatasetError
+from scroll_tactile.errors import DatasetError, InputError
 
-__all__ = [
-    "QUICK_EPOCHS",
-    "QUICK_EVERY",
-    "QUICK_SETS",
-    "SETS",
-    "Device",
-    "PrecisionChoice",
-    "choose_folds",
-    "choose_systems",
-    "close",
-    "machine",
-    "own_keys",
-    "read_sets",
-    "say_conditions",
-    "spelled",
-    "systems_of",
-]
+__all__ = ["OF_TOUCHES", "QUICK_EPOCHS", "SETS", "folds_of", "leave_out", "named", "numbers", "read"]
+
+QUICK_EVERY = 5
+QUICK_EPOCHS = 15  # of five steps; after six the ResNets were at chance
 
 
-class Device(StrEnum):
-    """Where networks are trained."""
-
-    CPU = "cpu"
-    CUDA = "cuda"
+def _blocked(data: Path, seed: int) -> Recordings:
+    recordings = load(data, "biotac", seed)
+    return replace(recordings, name=f"{recordings.name} blocked", fold=recordings.blocked())
 
 
-class PrecisionChoice(StrEnum):
-    """What the residual networks are trained in."""
-
-    FLOAT32 = "float32"
-    BFLOAT16 = "bfloat16"
+def _slides(data: Path, seed: int) -> Recordings:
+    """FabricSlide over distance, as ratios: how fast and how hard it was slid is no property of the fabric."""
+    slides = fabric_slide.load(data, seed=seed).recordings
+    streams = [fabric_slide.ratios(stream) for stream in slides.streams]
+    return replace(slides, sensor=fabric_slide.CPM_RATIOS, streams=streams)
 
 
 SETS: dict[str, Callable[[Path, int], Recordings]] = {
     "biotac-20": lambda data, seed: load(data, "biotac", seed),
-    "biotac-20-blocked": lambda data, seed: blocked(load(data, "biotac", seed)),
+    "biotac-20-all": lambda data, seed: load(data, "biotac-all", seed),
+    "biotac-20-blocked": _blocked,
     "roboskin-20": lambda data, seed: load(data, "roboskin", seed),
     "roboskin-20-unmixed": lambda data, seed: load(data, "roboskin", seed, unmixed=True),
+    "letter-spike": letter_spike.load,
+    "fabric-slide": _slides,
     "gelsight": physiclear.load,
 }
-QUICK_SETS = ("biotac-20", "roboskin-20")
-QUICK_EPOCHS = 15  # of five steps; after six the ResNets were at chance
-QUICK_EVERY = 5
+"""Name → reader of the folder of the data, with a seed of folds. BioTac's are its electrodes', or all that it measures;
+blocked: in folds of successive repetitions; unmixed: in the order of time, which the published arrays are not in."""
 
+OF_TOUCHES = ("biotac-20", "biotac-20-all", "roboskin-20", "roboskin-20-unmixed")
+
+
+def _in_a_folder(file: Path | None) -> Path | None:
+    """Raise InputError, before anything is measured, where a file could not be written for want of its folder."""
+    if file is not None and not file.absolute().parent.is_dir():
+        raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
+    return file
+
+
+Dataset = Annotated[str, typer.Argument(help=f"Which recordings, of {', '.join(OF_TOUCHES)}.", show_default=False)]
 Data = Annotated[Path, typer.Option(help="The folder of the published set, or the one that the sets' folders lie in.")]
 Weights = Annotated[
     str | None,
     typer.Option(help="Of a trained ResNet: a file, or a published name such as resnet18. Without, rows are left out."),
 ]
-Sets = Annotated[str | None, typer.Option(help=f"Which data sets, of {', '.join(SETS)}.")]
-Systems = Annotated[str | None, typer.Option(help=f"Which systems, of {', '.join(SYSTEMS)}.")]
-OwnSystems = Annotated[
-    list[str] | None, typer.Option("--system", help="One's own, as module:factory, see examples/own_system.py; again.")
-]
-OwnEmbeddings = Annotated[
-    list[str] | None, typer.Option("--embedding", help="Ours on an embedding of one's own, as module:factory; again.")
-]
-Folds = Annotated[str | None, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')]
+Folds = Annotated[str, typer.Option(help='Which folds: "all", or numbers from 0, such as 0 or 0,1.')]
 Epochs = Annotated[int | None, typer.Option(min=1, help="Of the networks' training.")]
-Where = Annotated[Device, typer.Option(help="Where networks are trained.")]
-InPrecision = Annotated[
-    PrecisionChoice, typer.Option("--precision", help="Of the ResNets' training; bfloat16 is up to twice as fast.")
-]
+Device = Annotated[str, typer.Option(help="Where networks are trained: cpu or cuda.")]
+InPrecision = Annotated[str, typer.Option("--precision", help="Of the ResNets' training: float32 or bfloat16.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of all that is drawn.")]
 Quick = Annotated[
-    bool,
-    typer.Option("--quick", help=f"One fold of every fifth touch, small images, {QUICK_EPOCHS} epochs: for a look."),
+    bool, typer.Option("--quick", help="For a look: one fold of every fifth touch, few epochs, small images.")
 ]
 Run = Annotated[
-    Path | None,
-    typer.Option("--run", help="Note finished parts in this folder; the same command resumes from them."),
+    Path | None, typer.Option("--run", help="Note finished parts in this folder; the same command resumes from them.")
 ]
-Json = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.")]
-Plot = Annotated[Path | None, typer.Option(help="Draw the figure into this file.")]
-FewMaterials = Annotated[int, typer.Option("--materials", hidden=True, min=2)]
+Json = Annotated[Path | None, typer.Option(help="Write all figures into this JSON file.", callback=_in_a_folder)]
+Plot = Annotated[Path | None, typer.Option(help="Draw the figure into this file.", callback=_in_a_folder)]
 
 
-def own_keys(systems: Sequence[str] | None, embeddings: Sequence[str] | None) -> tuple[str, ...]:
-    """The keys of --system and --embedding. Raises InputError where one makes no system, or no embedding."""
-    keys = (*(systems or ()), *(f"{spelled}-lda" for spelled in embeddings or ()))
-    for key in keys:
-        require_own(key)
-    return keys
-
-
-def spelled(option: str, asked: str, known: Collection[str]) -> tuple[str, ...]:
-    """The systems that an option asks for, with commas between, one's own among them. Raises InputError for others."""
-    parts = dict.fromkeys(part.strip() for part in asked.split(","))
-    own = own_keys([part for part in parts if is_own(part)], None)
-    if len(own) == len(parts):
-        return own
-    return (*named(option, ",".join(part for part in parts if part not in own), known), *own)
-
-
-def choose_systems(
-    asked: str | None, usual: Sequence[str], weights: str | None, own: Sequence[str] = ()
-) -> tuple[str, ...]:
-    """The systems of --systems, and one's own; without either all that can be made, and a word on the others."""
-    keys = (*(() if asked is None else spelled("--systems", asked, SYSTEMS)), *own)  # before anything is read
-    if keys:
-        return tuple(dict.fromkeys(keys))
-    return tuple(usual) if weights is not None else leave_out(usual, NEED_WEIGHTS, "--weights")
-
-
-def read_sets(asked: str | None, usual: Sequence[str], data: Path, seed: int, quick: bool) -> list[Recordings]:
-    """The sets of --sets; without it the usual ones, of which a quick run has two. A quick run's are `thinned`.
+def read(
+    option: str, asked: str, data: Path, seed: int, *, known: Collection[str] = OF_TOUCHES, quick: bool = False
+) -> dict[str, Recordings]:
+    """The sets of an option by the names that it has, with commas between; a quick run's are `thinned`.
 
     Raises InputError for other names, DatasetError for a set that is not there.
     """
-    if asked is not None:
-        names = named("--sets", asked, SETS)
-    else:
-        names = tuple(name for name in usual if name in QUICK_SETS or not quick)
+    names = named(option, asked, known)
     try:
-        read = [SETS[name](data, seed) for name in names]
+        found = {name: SETS[name](data, seed) for name in names}
     except DatasetError as error:
-        error.add_note("Or name the sets that are there: --sets biotac-20,roboskin-20")
+        if len(names) > 1:
+            error.add_note("Or name the sets that are there: --sets biotac-20,roboskin-20")
         raise
-    return [thinned(item, QUICK_EVERY) if quick else item for item in read]
+    return {name: thinned(item, QUICK_EVERY) if quick else item for name, item in found.items()}
 
 
-def choose_folds(asked: str | None, read: Sequence[Recordings], quick: bool) -> dict[str, list[int]]:
-    """The folds of --folds for each set; without it all, or the first in a quick run."""
-    wanted = asked if asked is not None else ("0" if quick else "all")
-    return {recordings.name: parse_folds(wanted, recordings) for recordings in read}
+def folds_of(asked: str, recordings: Recordings, *, quick: bool = False) -> list[int]:
+    """The folds that --folds asks for: "all", or numbers; of a quick run the first. Raises InputError for others."""
+    asked_for = recordings.fold.tolist() if asked == "all" else numbers("--folds", asked, "all, or numbers")
+    chosen = sorted(set(asked_for)) if asked == "all" else list(dict.fromkeys(asked_for))
+    return chosen[:1] if quick else chosen
 
 
-def machine() -> dict[str, Any]:
-    """How many processors there are, and threads of torch."""
-    return {"processors": os.cpu_count(), "threads": torch.get_num_threads()}
+def numbers(option: str, asked: str, wanted: str = "numbers") -> list[int]:
+    """Whole numbers from 0 with commas between. Raises InputError for anything else."""
+    words = [word.strip() for word in asked.split(",")]
+    if not all(word.isascii() and word.isdigit() for word in words):
+        raise InputError(f"expected {option} as {wanted} such as 0 or 0,1; came {asked!r}")
+    return [int(word) for word in words]
 
 
-def say_conditions(study: SystemStudy) -> None:
-    """What the figures have to be read with."""
-    if any(key in EPOCHAL for key in study.systems):
-        short = "" if study.epochs >= 100 else " where the paper has 100"
-        rounded = f", ResNets in {study.precision}" if study.precision != "float32" else ""
-        how = f"{study.epochs} epochs{short}, on {study.device}{rounded}"
-        say(f"networks: {how}; a tenth of what is learned is the validation")
-    if study.quick:
-        say(
-            "[yellow]quick:[/] every fifth touch, in training and test; ResNets' images averaged to about 50 columns: "
-            "for a look, not for a report"
-        )
+def named(option: str, asked: str, known: Collection[str]) -> tuple[str, ...]:
+    """The names that an option asks for, with commas between; each once. Raises InputError for unknown ones."""
+    names = tuple(dict.fromkeys(part.strip() for part in asked.split(",")))
+    if strange := [name for name in names if name not in known]:
+        raise InputError(f"expected {option} out of {', '.join(known)}; came {', '.join(map(repr, strange))}")
+    return names
 
 
-def systems_of(keys: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Key → name and library of each system; the libraries' versions stand in what `origin` notes."""
-    return {key: {"name": name_of(key), "library": library_of(key)} for key in keys}
-
-
-def close(
-    study: SystemStudy,
-    results: Sequence[tuple[Cell, Figures]],
-    json: Path | None,
-    found: Mapping[str, Any],
-    sets: str | None,
-    folds: str | None,
-) -> None:
-    """Report folds of unequal size, and write the JSON."""
-    for recordings in study.sets:
-        sizes = {cell.fold: figures["tested"] for cell, figures in results if cell.dataset == recordings.name}
-        if len(set(sizes.values())) > 1:
-            listed = ", ".join(map(str, sizes.values()))
-            say(f"{recordings.name}: folds of unequal size, {listed}: every touch counts the same")
-    if json is None:
-        return
-    command = command_line(
-        study.name,
-        data="DATA",
-        systems=None if study.name == "activation" else ",".join(study.systems),  # it has no choice
-        sets=sets,
-        folds=folds,
-        weights=None if study.weights is None else Path(study.weights),
-        epochs=study.epochs,
-        device=study.device,
-        seed=study.seed,
-        precision=study.precision,
-        quick=study.quick,
-        run=None if study.folder is None else "RUN",
-    )
-    about = (
-        machine()
-        | study.plan
-        | {"systems": systems_of(study.systems)}
-        | {"seconds": sum(figures["seconds"] for _, figures in results)}
-    )
-    sensors = {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in study.sets}
-    cells = {cell.key: figures for cell, figures in results}
-    write_result(json, origin(command) | about | {"sensors": sensors, **found, "cells": cells})
+def leave_out(keys: Sequence[str], needing: Collection[str], option: str) -> tuple[str, ...]:
+    """The keys without those that need an option which was not given; a word on these."""
+    if out := [key for key in keys if key in needing]:
+        say(f"[yellow]Left out without {option}:[/] {', '.join(out)}")
+    return tuple(key for key in keys if key not in out)

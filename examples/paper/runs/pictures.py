@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from rich.markup import escape
 
+from scroll_tactile.cli.terminal import say
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import missing
 
-__all__ = ["available", "draw", "picture"]
+__all__ = ["available", "draw_into", "logarithmic", "picture"]
 
 
 def available() -> bool:
@@ -41,16 +42,19 @@ def picture(path: Path, width: float, height: float, dots: int = 120) -> Iterato
         raise InputError(f"the plot cannot be written to {path}: {error}") from error
 
 
-def draw(path: Path, names: Sequence[str], counts: np.ndarray, *, title: str) -> None:
-    """Draw counts of (truth, predicted), shape (C, C), into a picture.
+def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> None:
+    """Draw a picture into the file that was asked for, and say so, or that it cannot be without matplotlib."""
+    if plot is None:
+        return
+    if not available():
+        say(f"[yellow]No picture:[/] {escape(str(missing('matplotlib', 'plots', 'it')))}")
+        return
+    draw(plot)
+    say(f"plot: {plot}")
 
-    Raises InputError where matplotlib is missing or the file cannot be written.
-    """
-    with picture(path, 7.5, 6.5) as figure:
-        panel = figure.add_subplot()
-        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-        image = panel.imshow(shares, cmap="viridis", vmin=0, vmax=1)
-        panel.set_xticks(range(len(names)), names, rotation=90)
-        panel.set_yticks(range(len(names)), names)
-        panel.set(xlabel="predicted", ylabel="touched", title=title)
-        figure.colorbar(image, ax=panel, label="share of the touches of a material", shrink=0.8)
+
+def logarithmic(panel: Any, ticks: set[Any]) -> None:
+    """Give a panel a logarithmic axis across, with these ticks."""
+    panel.set_xscale("log")
+    panel.set_xticks(sorted(ticks), [f"{tick:g}" for tick in sorted(ticks)], minor=False)
+    panel.minorticks_off()

@@ -1,153 +1,109 @@
-"""What the commands share: the recorded sets, which folds, the noted command, and how a result notes its making."""
+"""How every command ends: its result as JSON, with the command and all else that made it, and its tables on screen."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import platform
 import shlex
 import textwrap
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
-from enum import StrEnum
-from importlib.metadata import version
-from importlib.util import find_spec
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import typer
 from rich.markup import escape
+from rich.table import Table
 
-from examples.paper import drawing
-from examples.paper.readers.biotac_slide import load
-from examples.paper.readers.labelled import Recordings
+from examples.tables import Results
 from scroll_tactile import __version__
-from scroll_tactile.cli.terminal import percent, say
+from scroll_tactile.cli.terminal import console, say
 from scroll_tactile.errors import InputError
-from scroll_tactile.libraries import missing
 
-__all__ = [
-    "Dataset",
-    "command_line",
-    "draw_into",
-    "leave_out",
-    "named",
-    "origin",
-    "parse_folds",
-    "read",
-    "require_folders",
-    "with_spread",
-    "write_result",
-]
+__all__ = ["circumstances", "noted", "origin", "show", "write", "write_result"]
+
+LIBRARIES = ("torch", "numpy", "scipy", "zarr", "scikit-learn", "snntorch")
+NOT_NOTED = ("json", "plot")
+WIDE = 160  # characters that the widest table takes
 
 
-_OPTIONAL = {"scikit-learn": "sklearn", "snntorch": "snntorch"}  # what made some results; distribution → module
+def noted(context: typer.Context) -> str:
+    """The command that is being run, with the value of every option that has one, as results keep it.
 
-
-class Dataset(StrEnum):
-    """The recorded sets."""
-
-    BIOTAC = "biotac-20"
-    BIOTAC_ALL = "biotac-20-all"  # all that the sensor measures, not its electrodes alone: none of the paper's sets
-    ROBOSKIN = "roboskin-20"
-    UNMIXED = "roboskin-20-unmixed"  # in the order of time, which the published arrays are not in
-
-
-def read(dataset: Dataset, data: Path, seed: int) -> Recordings:
-    """Read a recorded set. Raises DatasetError for a folder that is not laid out as published."""
-    sensors: dict[Dataset, Literal["biotac", "biotac-all", "roboskin"]] = {
-        Dataset.BIOTAC: "biotac",
-        Dataset.BIOTAC_ALL: "biotac-all",
-        Dataset.ROBOSKIN: "roboskin",
-        Dataset.UNMIXED: "roboskin",
-    }
-    return load(data, sensors[dataset], seed, unmixed=dataset is Dataset.UNMIXED)
-
-
-def parse_folds(folds: str, recordings: Recordings) -> list[int]:
-    """The folds that --folds asks for: "all", or numbers. Raises InputError for anything else."""
-    if folds == "all":
-        return sorted(set(recordings.fold.tolist()))
-    try:
-        return list(dict.fromkeys(int(part) for part in folds.split(",")))
-    except ValueError:
-        raise InputError(f"expected --folds all, or numbers such as 0 or 0,1; came {folds!r}") from None
-
-
-def named(option: str, asked: str, known: Collection[str]) -> tuple[str, ...]:
-    """The names that an option asks for, with commas between; each once. Raises InputError for unknown ones."""
-    names = tuple(dict.fromkeys(part.strip() for part in asked.split(",")))
-    if strange := [name for name in names if name not in known]:
-        raise InputError(f"expected {option} out of {', '.join(known)}; came {', '.join(map(repr, strange))}")
-    return names
-
-
-def leave_out(keys: Sequence[str], needing: Collection[str], option: str) -> tuple[str, ...]:
-    """The keys without those that need an option which was not given; a word on these."""
-    if out := [key for key in keys if key in needing]:
-        say(f"[yellow]Left out without {option}:[/] {', '.join(out)}")
-    return tuple(key for key in keys if key not in out)
-
-
-def command_line(*words: str, **options: Any) -> str:
-    """The command to be noted in a result: `python -m examples.paper`, words and options, without a machine's paths.
-
-    options: `biotac_epochs=4` is --biotac-epochs 4, True a flag; None and False are left out. Of a file its name is
-    kept; a folder is to be given as a word in capitals.
-
-    >>> command_line("table1", data="DATA", weights=Path("/home/me/resnet.pth"), quick=True, folds=None)
-    'python -m examples.paper table1 --data DATA --weights resnet.pth --quick'
+    A folder, which is of one machine, is noted as a word in capitals, and of a file its name.
     """
-    spelled = ["python", "-m", "examples.paper", *words]
-    for name, value in options.items():
-        if value is None or value is False:
-            continue
-        option = f"--{name.replace('_', '-')}"
-        text = value.name if isinstance(value, Path) else str(value)
-        # What begins with a dash would be read as an option.
-        spelled += [option] if value is True else [f"{option}={text}"] if text.startswith("-") else [option, text]
-    return shlex.join(spelled)
+    names: list[str] = [str(context.info_name)]
+    above: Any = context
+    while above.parent is not None and above.parent.parent is not None:
+        above = above.parent
+        names.insert(0, str(above.info_name))
+    words = ["python", "-m", str(context.find_root().command.name), *names]
+    for parameter in context.command.params:
+        if parameter.name not in NOT_NOTED and not getattr(parameter, "hidden", False):
+            words += _spelled(parameter, context.params[str(parameter.name)])
+    return shlex.join(words)
 
 
-def with_spread(figure: Mapping[str, Any] | None, *, share: bool = True) -> str:
-    """A mean, and its standard deviation over folds where there are several; empty for None. share: in percent."""
-    if figure is None:
-        return ""
-    mean, sd = figure["mean"], figure["sd"]
-    if share:
-        return percent(mean) + ("" if sd is None else f" ± {100 * sd:.1f}")
-    return f"{mean:.4f}" + ("" if sd is None else f" ± {sd:.4f}")
+def _spelled(parameter: Any, value: Any) -> list[str]:
+    option = max(parameter.opts, key=len)
+    if value is False and value != parameter.default:
+        return [parameter.secondary_opts[0]]
+    if value is None or isinstance(value, bool):
+        return [option] if value and value != parameter.default else []
+    if isinstance(value, list | tuple):
+        return [word for each in value for word in (option, str(each))]
+    text = str(value)
+    if isinstance(value, Path):
+        text = value.name if value.is_file() else str(parameter.name).upper()
+    elif parameter.name == "weights":  # a file, or a published name
+        text = Path(text).name
+    if parameter.param_type_name == "argument":
+        return [text]
+    return [f"{option}={text}"] if text.startswith("-") else [option, text]  # which would be read as an option
 
 
-def draw_into(plot: Path | None, draw: Callable[[Path], object]) -> bool:
-    """Draw a picture into the file that was asked for, and say so; whether it could be: not without matplotlib."""
-    if plot is None:
-        return True
-    if not drawing.available():
-        say(f"[yellow]No picture:[/] {escape(str(missing('matplotlib', 'plots', 'it')))}")
-        return False
-    draw(plot)
-    say(f"plot: {plot}")
-    return True
+def circumstances(seed: int) -> dict[str, Any]:
+    """What a result has to be read with: date, seed, versions, machine, and what else ran on it as it began.
 
-
-def require_folders(*files: Path | None) -> None:
-    """Raise InputError, before anything is measured, where a file could not be written for want of its folder."""
-    for file in files:
-        if file is not None and not file.absolute().parent.is_dir():
-            raise InputError(f"expected {file} in a folder that exists; {file.absolute().parent} does not")
-
-
-def origin(command: str, recordings: Recordings | None = None) -> dict[str, Any]:
-    """What made a result: the command, when, with which versions, on what machine, and from which sensor, of one."""
-    versions = {"scroll-tactile": __version__} | {name: version(name) for name in ("torch", "numpy", "scipy")}
-    versions |= {name: version(name) for name, module in _OPTIONAL.items() if find_spec(module)}
-    made = {
-        "command": command,
+    load_average: of the last 1, 5 and 15 minutes, in processes; above `cores` they waited for each other.
+    """
+    return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": versions | {"python": platform.python_version()},
+        "seed": seed,
+        "versions": {"scroll-tactile": __version__, "python": platform.python_version(), **_versions()},
         "machine": f"{platform.machine()} {platform.system()}",
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load_average": _load(),
     }
-    return made if recordings is None else made | {"sensor": recordings.sensor.model_dump(mode="json")}
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _load() -> list[float] | None:
+    return [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None
+
+
+def origin(context: typer.Context) -> dict[str, Any]:
+    """What made a result: the command, when, with which versions, on what machine."""
+    return {"command": noted(context)} | circumstances(int(context.params.get("seed", 0)))
+
+
+def write(context: typer.Context, result: Mapping[str, Any]) -> None:
+    """Write a result with what made it where --json asks for it."""
+    path = context.params["json"]
+    if path is not None:
+        write_result(path, origin(context) | dict(result) | {"load_average_after": _load()})
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:
@@ -186,3 +142,18 @@ def _laid_out(value: Any, indent: str = "") -> str:
         rows = [_laid_out(part, inner) for part in value]
     begin, end = "{}" if isinstance(value, dict) else "[]"
     return begin + "\n" + ",\n".join(inner + row for row in rows) + "\n" + indent + end
+
+
+def show(title: str, columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Print a table: a column's heading → its cell, filled from each row as cells of the texts' tables are.
+
+    `{./accuracy|±}` is what a row has at "accuracy", as a mean and its spread; see `examples.tables`.
+    """
+    results = Results(())
+    table = Table(*map(escape, columns), title=escape(title))
+    for row in rows:
+        table.add_row(*(escape(results.fill(cell, row)) for cell in columns.values()))
+    # Cut off at 80 columns, as for want of a terminal's width, it would show nothing.
+    screen = console()
+    screen.width = max(WIDE, screen.width)
+    screen.print(table)

@@ -1,4 +1,4 @@
-"""Transfer across sensors: materials learned with one, and tested with another, after few touches of it or none.
+"""`transfer sensors`: materials learned with one, and tested with another, after few touches of it or none.
 
 Every way stands beside learning from these few touches alone, and all have the same draws of them.
 """
@@ -9,26 +9,29 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+import typer
 
 from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import Cell, Figures, over_folds, require_data, run_cells
+from examples.paper.runs.cells import Cell, Figures, run_cells, silent
+from examples.paper.runs.options import Data, Folds, Json, Quick, Run, Seed, folds_of, named, numbers, read
+from examples.paper.runs.results import show, write
+from examples.paper.runs.study import sensors_of
 from examples.paper.studies.peers import touch_features
-from examples.paper.systems.system_protocol import silent
 from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
-from examples.paper.transfer.few_touches import FewTouchLearner, candidate_maker, draw_touches, few_touches
+from examples.paper.transfer.few_touches import FewTouchLearner, candidate_maker, draw_touches, few_touches, points_of
 from examples.paper.transfer.shared_features import Features, SharedFeatures
 from scroll_tactile import Kernels
+from scroll_tactile.cli.terminal import percent, progress_bar, say
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["ALONE", "COUNTS", "WAYS", "SensorTransfer", "rows"]
+__all__ = ["ALONE", "COUNTS", "WAYS", "SensorTransfer", "rows", "sensors"]
 
 COUNTS = (0, 1, 2, 5)
 """Touches of each material of the new sensor."""
@@ -114,17 +117,15 @@ class SensorTransfer:
             if self._counts_of(way)
         ]
 
-    def run(self, progress: Progress = lambda what, done, of: None) -> Iterator[tuple[Cell, Figures]]:
+    def run(self, progress: Progress = silent) -> Iterator[tuple[Cell, Figures]]:
         """The figures of each cell as it is finished; those finished before are read back.
 
         Raises InputError for a folder of another run or folds that are not there, and what learning raises.
         """
-        notes = RunFile(None if self.folder is None else self.folder / "transfer-sensors.json", self.plan)
         for item in self.sets:
-            require_data(notes, item)
             for fold in self.folds:
                 draw_touches(item, fold, self.seed, 0)  # what is refused is refused before anything is measured
-        yield from run_cells(notes, self.cells(), self._measure, progress)
+        yield from run_cells(self.folder, self.plan, self.sets, self.cells(), self._measure, progress)
 
     def agreement(self) -> dict[str, dict[str, float]]:
         """How far the sensors agree on which materials feel alike: of spectra and kernels, all touches.
@@ -220,25 +221,47 @@ def _kept(features: Features) -> Features:
 
 
 def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
-    """A row for each direction and way.
+    """A row for each direction and way, with `points_of` it; gains are over the few touches alone."""
+    return [
+        {"direction": direction, "way": way, "name": WAYS[way], "points": points}
+        for (direction, way), points in points_of(results, ALONE).items()
+    ]
 
-    points: count → mean accuracy over folds and draws, its standard deviation, and those of the difference to the few
-    touches alone, of the same draws (None without any touch, or where it was not measured).
-    """
-    shares: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for cell, figures in results:
-        own = shares.setdefault((cell.dataset, cell.system), {})
-        for count, right in figures["right"].items():
-            own.setdefault(count, []).extend(hits / figures["tested"] for hits in right)
-    found = []
-    for (direction, way), own in shares.items():
-        points = {}
-        for count, values in own.items():
-            point = over_folds(values) | {"gain": None, "gain sd": None}
-            alone = shares.get((direction, ALONE), {}).get(count, [])
-            if len(alone) == len(values):
-                gain = over_folds(np.subtract(values, alone).tolist())
-                point |= {"gain": gain["mean"], "gain sd": gain["sd"]}
-            points[count] = point
-        found.append({"direction": direction, "way": way, "name": WAYS[way], "points": points})
-    return found
+
+def sensors(
+    context: typer.Context,
+    data: Data,
+    folds: Folds = "all",
+    ways: Annotated[str, typer.Option(help=f"Which ways, of {', '.join(WAYS)}.")] = ",".join(WAYS),
+    counts: Annotated[str, typer.Option(help="Touches of each material of the new sensor; 0: none.")] = "0,1,2,5",
+    draws: Annotated[int, typer.Option(min=1, help="Of these touches.")] = 5,
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Learn twenty materials with BioTac and be tested with RoboSkin, and the reverse, after few touches or none."""
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        item, other = read("--data", "biotac-20,roboskin-20", data, seed, quick=quick).values()
+        study = SensorTransfer(
+            (item, other),
+            ways=named("--ways", ways, WAYS),
+            folds=tuple(folds_of(folds, item, quick=quick)),
+            counts=tuple(sorted(set(numbers("--counts", counts)))),
+            draws=1 if quick else draws,
+            seed=seed,
+            folder=run,
+        )
+        results = list(study.run(progress))
+        progress("how far the sensors agree", 0, 1)
+        agreement = study.agreement()
+    found = rows(results)
+    columns = {"way": "{./name}"} | {f"{count} touches": f"{{?./points/{count}|±}}" for count in study.counts}
+    for direction in dict.fromkeys(row["direction"] for row in found):
+        show(f"{direction}: right, %", columns, [row for row in found if row["direction"] == direction])
+    text = ", ".join(f"{by['correlation']:+.2f} in {kind} ({by['chance']:.2f})" for kind, by in agreement.items())
+    say(f"chance: {percent(study.chance)}. Materials alike to one sensor and to the other: {text} (by chance)")
+    measured = {"folds": study.folds, "chance": study.chance, "agreement": agreement, "rows": found}
+    cells = {cell.key: figures for cell, figures in results}
+    write(context, study.plan | {"sensors": sensors_of(study.sets), **measured, "cells": cells})

@@ -12,7 +12,8 @@ from commands import refused, run
 
 from examples.benchmarks import speed
 from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
-from examples.benchmarks.speed import SKIN, Sizes, run_speed
+from examples.benchmarks.speed import Sizes, run_speed
+from examples.benchmarks.speed_touches import SKIN
 from examples.benchmarks.timing import CLOCKS, Timing, take_turns
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
 from scroll_tactile.errors import InputError

@@ -191,19 +191,20 @@ class TestRecordings:
 CPM_LIKE = CPM_FINGER.model_copy(update={"channels": 27})
 
 
-class TestLetterSpike:
-    @pytest.fixture(scope="class")
-    def letters(self, tmp_path_factory):
-        """A folder laid out as letter-spike, one file of which is empty."""
-        tmp_path = tmp_path_factory.mktemp("letters")
-        for letter in LETTERS:
-            folder = tmp_path / "letter-spike" / "data" / letter
-            folder.mkdir(parents=True)
-            for press in range(50):
-                rows = "" if (letter, press) == ("K", 44) else f"{press}.0,0,36,900\n{press}.5,0,36,{press}\n"
-                (folder / f"{letter}_{press}.csv").write_text(HEADER + rows)
-        return tmp_path
+@pytest.fixture(scope="module")
+def letters(tmp_path_factory):
+    """A folder laid out as letter-spike, one file of which is empty."""
+    tmp_path = tmp_path_factory.mktemp("letters")
+    for letter in LETTERS:
+        folder = tmp_path / "letter-spike" / "data" / letter
+        folder.mkdir(parents=True)
+        for press in range(50):
+            rows = "" if (letter, press) == ("K", 44) else f"{press}.0,0,36,900\n{press}.5,0,36,{press}\n"
+            (folder / f"{letter}_{press}.csv").write_text(HEADER + rows)
+    return tmp_path
 
+
+class TestLetterSpike:
     def test_every_press_is_a_stream_in_seeded_folds_and_an_empty_file_is_named(self, letters, caplog):
         with caplog.at_level(logging.WARNING):
             recordings = letter_spike.load(letters, seconds=0.2)

@@ -291,7 +291,7 @@ class ConstituentMemory(OneByOne[TactileLearner]):
         sensor, augmentation = self._read(stream).sensor, self._augmentation
         learner = TactileLearner(sensor=sensor, embedding=self._embedding, exemplars=0, augmentation=augmentation)
         for fabric, shares in self._shares.of.items():
-            learner.describe(fabric, shares)
+            learner.describe(fabric, {name: shares.get(name, 0.0) for name in self._shares.names})
         return learner
 
     def _observe(self, learner: TactileLearner, material: str, stream: Stream) -> None:

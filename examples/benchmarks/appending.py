@@ -14,17 +14,20 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
 
 import numpy as np
-from rich.table import Table
+import typer
 
-from examples.benchmarks.timing import Timing, circumstances, timed
-from scroll_tactile.cli.terminal import console
+from examples.benchmarks.timing import Timing, timed
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
+from scroll_tactile.cli.terminal import progress_bar
 from store.log_writer import LogWriter, create_log
 from store.row_encoding import ROW, encode_row
 
-__all__ = ["run_appending", "show_appending"]
+__all__ = ["log", "run_appending"]
 
 ROW_BYTES = 4300  # of a touch with its readings, BioTac
 ROWS = 240  # in a round: about one MiB, so that each round has one write of zeros ahead
@@ -37,7 +40,7 @@ Append = Callable[[int, bytes], object]
 def run_appending(folder: Path, *, rounds: int, seed: int, note: Callable[[str], None]) -> dict[str, Any]:
     """Append rows in rounds, each way in its turn, every other round in the other order."""
     rng = np.random.default_rng(seed)
-    result: dict[str, Any] = {"bench": "log", **circumstances(seed), "row_bytes": ROW_BYTES, "rows": rounds * ROWS}
+    result: dict[str, Any] = {"bench": "log", "row_bytes": ROW_BYTES, "rows": rounds * ROWS}
     with ExitStack() as opened:
         ways = _ways(folder, opened)
         seconds: dict[str, list[float]] = {name: [] for name in ways}
@@ -63,7 +66,7 @@ def _ways(folder: Path, opened: ExitStack) -> dict[str, Append]:
         database.execute(statement)
     database.execute("CREATE TABLE row (sequence INTEGER PRIMARY KEY, bytes BLOB) STRICT")
     create_log(folder / "log", b"{}")
-    log = opened.enter_context(LogWriter(folder / "log"))
+    journal = opened.enter_context(LogWriter(folder / "log"))
     bare = os.open(folder / "bare", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     opened.callback(os.close, bare)
     about = ("add", "material", bytes(32), time.time(), "{}")
@@ -79,7 +82,7 @@ def _ways(folder: Path, opened: ExitStack) -> dict[str, Append]:
         "SQLite, WAL, synchronous=FULL": lambda *row: database.execute(
             "INSERT INTO row VALUES (?, ?)", (row[0], as_row(*row))
         ),
-        "the log": lambda *row: log.append(ROW, as_row(*row)),
+        "the log": lambda *row: journal.append(ROW, as_row(*row)),
         "a bare file that grows, fdatasync": to_bare,
     }
 
@@ -113,12 +116,18 @@ def _records(seconds: dict[str, list[float]], written: dict[str, list[float]]) -
     ]
 
 
-def show_appending(result: dict[str, Any]) -> None:
-    """Print what a row costs each way."""
-    table = Table("a row of 4.3 kB", "ms, median / p99", "times SQLite's", "p99, times", "written, kB")
-    for record in result["records"]:
-        times = f"{record['median_milliseconds']:.2f} / {record['p99_milliseconds']:.2f}"
-        kilobytes = "" if record["written_bytes"] is None else f"{record['written_bytes'] / 1e3:.1f}"
-        ratios = f"{record['times_sqlite']:.2f}", f"{record['p99_times_sqlite']:.2f}"
-        table.add_row(record["case"], times, *ratios, kilobytes)
-    console().print(table)
+def log(
+    context: typer.Context,
+    rounds: Annotated[int, typer.Option(min=1, help=f"Of {ROWS} rows, each way in its turn.")] = 40,
+    folder: Annotated[Path | None, typer.Option(help="On the disk to measure; the system's temporary one.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Time a durable row of 4.3 kB, and count the bytes it makes the disk write: the log beside a table of SQLite."""
+    with progress_bar() as progress, TemporaryDirectory(dir=folder) as scratch:
+        result = run_appending(Path(scratch), rounds=rounds, seed=seed, note=lambda what: progress(what, 0, 1))
+    columns = {"a row of 4.3 kB": "{./case}", "ms, p50": "{./median_milliseconds|.2f}"}
+    columns |= {"p99": "{./p99_milliseconds|.2f}", "times SQLite's": "{./times_sqlite|.2f}"}
+    columns |= {"p99, times": "{./p99_times_sqlite|.2f}", "written, kB": "{?./written_bytes|/1000|.1f}"}
+    show("appending", columns, result["records"])
+    write(context, result)

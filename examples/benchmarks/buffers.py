@@ -16,10 +16,13 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import typer
 
-from examples.benchmarks.timing import circumstances
 from examples.paper.readers.labelled import Recordings, hold_out
-from scroll_tactile import Embedding
+from examples.paper.runs.options import Data, Dataset, Json, Seed, read
+from examples.paper.runs.results import show, write
+from scroll_tactile import Embedding, Kernels
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
@@ -29,7 +32,7 @@ from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
 
-__all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "compare", "mean_gap", "run_buffers"]
+__all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "buffers", "compare", "mean_gap", "run_buffers"]
 
 IntArray = npt.NDArray[np.int64]
 Codes = npt.NDArray[np.int32]
@@ -187,7 +190,7 @@ def run_buffers(
 ) -> dict[str, Any]:
     """Learn all folds but the first, choose buffers of these capacities in every way, and fine-tune on each.
 
-    Returns circumstances and a list of records: capacity, way, gap, ratio to full herding's, overlap of two schedules,
+    Returns a list of records: capacity, way, gap, ratio to full herding's, overlap of two schedules,
     accuracy of f* by itself and of f, on the first fold.
     """
     train, test = hold_out(recordings, recordings.fold == 0)
@@ -214,7 +217,7 @@ def run_buffers(
                     "f": f,
                 }
             )
-    return {"bench": "buffers", "dataset": recordings.name, **circumstances(seed), "records": records}
+    return {"bench": "buffers", "dataset": recordings.name, "records": records}
 
 
 def _tuned(
@@ -232,3 +235,14 @@ def _tuned(
         logits = reader.logits(tactile_image(stream))
         right.append(max(logits, key=logits.__getitem__) == name)
     return float(np.mean(right))
+
+
+def buffers(context: typer.Context, dataset: Dataset, data: Data, seed: Seed = 0, json: Json = None) -> None:
+    """Compare ways of choosing exemplars: gap to the class means, overlap of two schedules, accuracy of f*."""
+    with progress_bar() as progress:
+        (recordings,) = read("DATASET", dataset, data, seed).values()
+        result = run_buffers(recordings, Kernels(), seed=seed, note=lambda what: progress(what, 0, 1))
+    columns = {"exemplars": "{./capacity}", "way": "{./way}", "gap to full herding's": "{./ratio|.3f}"}
+    columns |= {name: f"{{./{name}|%}}" for name in ("overlap", "tuned", "f")}
+    show(f"{recordings.name}, fold 0", columns, result["records"])
+    write(context, result)

@@ -10,12 +10,15 @@ import time
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from examples.benchmarks.timing import circumstances
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
 from scroll_tactile import Kernels, Sensor, TactileLearner, sensors
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.pipelines import learning
 from scroll_tactile.pipelines.fleet import learn
@@ -23,7 +26,7 @@ from scroll_tactile.pipelines.sources import SourceOptions
 from scroll_tactile.simulation.scene import Scene
 from store import StoreError
 
-__all__ = ["DyingExecutor", "run_fleet"]
+__all__ = ["DyingExecutor", "fleet", "run_fleet"]
 
 BY_FOLDER = SourceOptions(by="folder")
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
@@ -62,7 +65,7 @@ def run_fleet(touches: int, runs: int, flips: int, seed: int, note: Any) -> dict
         costs["merges"] = _merges(folder, paths, note)
         costs["equal_runs"], costs["runs"] = _equal_runs(folder, runs, note), runs
         costs["sound_flips"], costs["flips"] = _sound_flips(folder, flips, note), flips
-    return {"study": "fleet", "touches": touches, **circumstances(seed), **costs}
+    return {"study": "fleet", "touches": touches, **costs}
 
 
 def _recordings(folder: Path, count: int, seed: int) -> list[str]:
@@ -171,6 +174,27 @@ def _sound_flips(folder: Path, flips: int, note: Any) -> dict[str, int]:
             except (StoreError, MismatchError) as error:
                 found["refused"] += str(folder / "p") in str(error) and not learner.materials
     return found
+
+
+def fleet(
+    context: typer.Context,
+    touches: Annotated[int, typer.Option(min=20, help="Recordings, simulated, learned three times.")] = 2000,
+    runs: Annotated[int, typer.Option(min=1, help="With workers that die and touches that come twice.")] = 200,
+    flips: Annotated[int, typer.Option(min=1, help="Of one bit of a packed memory.")] = 500,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Measure a fleet's memory: workers against a plain loop, merges by size, and what can go wrong."""
+    with progress_bar() as progress:
+        result = run_fleet(touches, runs, flips, seed, note=lambda what: progress(what, 0, 1))
+    ways = [{"way": name, **result[name]} for name in ("plain", "workers_1", "workers_2")]
+    columns = {"way": "{./way}", "s a touch": "{./touch|.4f}", "times as fast": "{?./ratio|.2f}"}
+    show("learning", columns | {"merging": "{?./merge_share|%}"}, ways)
+    columns = {"touches": "{./touches}", "bytes": "{./bytes}", "merged in, s": "{./seconds|.3f}"}
+    show("merging", columns, result["merges"])
+    columns = {"equal runs": "{./equal_runs} of {./runs}", "refused or sound flips": "{./sound_flips|sum} of {./flips}"}
+    show("what can go wrong", columns, [result])
+    write(context, result)
 
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")

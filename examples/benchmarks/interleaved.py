@@ -11,17 +11,21 @@ import hashlib
 import tempfile
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+import typer
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.timing import Timing, circumstances
+from examples.benchmarks.timing import Timing
 from examples.benchmarks.vector_peers import GradientSteps, PseudoInverse, Refitted, VectorPeer, lacking
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
 from scroll_tactile import Capabilities, Sensor, TactileLearner
+from scroll_tactile.cli.terminal import progress_bar
 
-__all__ = ["run_interleaved"]
+__all__ = ["interleaved", "run_interleaved"]
 
 FloatArray = npt.NDArray[np.float64]
 Record = dict[str, Any]
@@ -76,9 +80,9 @@ def run_interleaved(
     seed: int = 0,
     note: Callable[[str], object] = lambda what: None,
 ) -> Record:
-    """Train each learner on so many streams, then time pairs; returns circumstances and records."""
+    """Train each learner on so many streams, then time pairs; returns records."""
     sizes = {"streams": streams, "materials": materials, "features": AsIs.dimension}
-    result: Record = {"bench": "interleaved", **circumstances(seed), **sizes}
+    result: Record = {"bench": "interleaved", **sizes}
     source = _Source(materials, AsIs.dimension, seed)
     train = [(i % materials, source.row(i % materials)) for i in range(streams)]
     test = [(place, source.row(place), source.row(place)) for place in source.places(pairs)]
@@ -157,3 +161,27 @@ class _Source:
     def places(self, count: int) -> list[int]:
         found: list[int] = self._random.integers(len(self._means), size=count).tolist()
         return found
+
+
+def interleaved(
+    context: typer.Context,
+    streams: Annotated[int, typer.Option(min=100, help="Learned before anything is timed.")] = 2000,
+    pairs: Annotated[int, typer.Option(min=10, help="Of an observation and a prediction, timed.")] = 300,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Time observing and predicting in turns, 50 materials and 512 features, beside other learners."""
+    with progress_bar() as progress:
+        result = run_interleaved(streams=streams, pairs=pairs, seed=seed, note=lambda what: progress(what, 0, 1))
+    columns = {"learner": "{./learner}", "not measured": "{?./why}"}
+    names = {"ms a pair": "median_", "p99": "p99_", "mean": "mean_", "observe": "observe_median_"}
+    columns |= {
+        head: f"{{?./{name}milliseconds|.2f}}" for head, name in (names | {"predict": "predict_median_"}).items()
+    }
+    columns |= {
+        "times ours": "{?./times_ours|.2f}",
+        "… in memory": "{?./times_ours_in_memory|.2f}",
+        "wrong": "{?./wrong|%}",
+    }
+    show(f"{result['streams']} streams, {result['materials']} materials", columns, result["records"])
+    write(context, result)

@@ -1,4 +1,4 @@
-"""`python -m examples.benchmarks live`: early answers, several touches of one thing, and sets with a guarantee.
+"""`python -m examples.benchmarks decisions`: early answers, several touches of one thing, and sets with a guarantee.
 
 Each fold of a recorded set is tested with what was learned from the others. A touch is predicted at the moments of its
 decision rule and at its end. Earliness is the share of the touch that was felt before it was decided, all of it where
@@ -7,18 +7,20 @@ it was not; with accuracy it makes the harmonic mean that the literature compare
 
 from __future__ import annotations
 
-import json
+import json as json_lines
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.table import Table
+import typer
 
 from examples.paper.readers.labelled import Recordings
+from examples.paper.runs.options import Data, Folds, Json, Seed, folds_of, read
+from examples.paper.runs.results import show, write
 from examples.paper.studies.replay import novelty_area, rotations
-from scroll_tactile.cli.terminal import console, percent
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import decision_rule
@@ -28,7 +30,7 @@ from scroll_tactile.prediction.judging import answer
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["run_decisions", "show_decisions"]
+__all__ = ["decisions", "run_decisions"]
 
 Record = dict[str, Any]
 Progress = Callable[[str, int, int], object]
@@ -63,12 +65,12 @@ def run_decisions(
     for fold in folds:
         kept = None if folder is None else folder / f"{recordings.name} fold {fold} every {every}.json"
         if kept is not None and kept.exists():
-            found.append(json.loads(kept.read_text()))
+            found.append(json_lines.loads(kept.read_text()))
             continue
         record = _fold(recordings, fold, every, progress)
         if kept is not None:
             kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_text(json.dumps(record))
+            kept.write_text(json_lines.dumps(record))
         found.append(record)
     return {"set": recordings.name, "folds": list(folds), "every": every} | _summary(found)
 
@@ -217,24 +219,42 @@ def _decisions(found: Sequence[Record], decided: Sequence[Sequence[int | None]])
     }
 
 
-def show_decisions(results: Sequence[Record]) -> None:
-    """Print what was measured of each set."""
-    table = Table("set", "rule", "wrong of decided", "undecided", "right", "after, s", "harmonic mean")
-    for result in results:
-        for rule, found in result["decisions"].items():
-            name = "p ≥ 0.7 twice running" if rule == "untuned" else f"risk {rule}"
-            wrong = f"{percent(found['wrong'])} ± {percent(found['standard_error'])}"
-            shares = (percent(found["undecided"]), percent(found["accuracy"]), f"{found['seconds']:.2f}")
-            table.add_row(result["set"], name, wrong, *shares, f"{found['harmonic']:.3f}")
-    for peer in json.loads(PEERS.read_text(encoding="utf-8"))["means"]:
-        shares = percent(peer["accuracy"]), f"{peer['seconds']:.2f}", f"{peer['harmonic']:.3f}"
-        table.add_row("BioTac-20, as recorded", peer["system"], "", "", *shares)
-    console().print(table)
-    table = Table("set", *(f"ECE at {seconds} s" for seconds in ECE_AT), *(f"AUROC, {n}" for n in TOGETHER), "coverage",
-                  "least of a material", "mean size")  # fmt: skip
-    for result in results:
-        errors = [f"{result['calibration'][str(seconds)]['ece']:.3f}" for seconds in ECE_AT]
-        areas = [f"{result['novelty_auroc'][str(count)]:.4f}" for count in TOGETHER]
-        cover = percent(result["coverage"]), percent(result["least_coverage"]), f"{result['mean_size']:.2f}"
-        table.add_row(result["set"], *errors, *areas, *cover)
-    console().print(table)
+def decisions(
+    context: typer.Context,
+    data: Data,
+    sets: Annotated[str, typer.Option(help="Which data sets.")] = "biotac-20,roboskin-20,roboskin-20-unmixed",
+    folds: Folds = "all",
+    every: Annotated[int, typer.Option(min=1, help="Test one in so many of a fold's touches.")] = 1,
+    folder: Annotated[Path | None, typer.Option(help="Keep finished folds here; the same again resumes.")] = None,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Measure early answers, touches of one thing together, and sets with a guarantee, on recorded sets.
+
+    A fold takes half a minute, and as long again for every fifty touches.
+    """
+    results = []
+    with progress_bar() as progress:
+        for recordings in read("--sets", sets, data, seed).values():
+            chosen = folds_of(folds, recordings)
+            results.append(run_decisions(recordings, chosen, every=every, folder=folder, progress=progress))
+    rules = [
+        {"set": result["set"], "rule": f"risk {rule}", **found}
+        for result in results
+        for rule, found in result["decisions"].items()
+    ]
+    peers = json_lines.loads(PEERS.read_text(encoding="utf-8"))["means"]
+    rules += [{"set": "BioTac-20, as recorded", "rule": peer["system"], **peer} for peer in peers]
+    columns = {
+        "set": "{./set}",
+        "rule": "{./rule}",
+        "wrong of decided, %": "{?./wrong|%}",
+        "±": "{?./standard_error|%}",
+    }
+    columns |= {"undecided, %": "{?./undecided|%}", "right, %": "{./accuracy|%}", "after, s": "{./seconds|.2f}"}
+    show("decisions", columns | {"harmonic mean": "{./harmonic|.3f}"}, rules)
+    columns = {"set": "{./set}"} | {f"ECE at {at} s": f"{{./calibration/{at}/ece|.3f}}" for at in ECE_AT}
+    columns |= {f"AUROC, {count}": f"{{./novelty_auroc/{count}|.4f}}" for count in TOGETHER}
+    columns |= {"coverage, %": "{./coverage|%}", "least": "{./least_coverage|%}", "mean size": "{./mean_size|.2f}"}
+    show("early answers, novelty and sets", columns, results)
+    write(context, {"bench": "decisions", "sets": results})

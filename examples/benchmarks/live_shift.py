@@ -5,34 +5,35 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from rich.table import Table
+import typer
 
-from examples.benchmarks.timing import circumstances
 from examples.paper.readers.biotac_slide import load
 from examples.paper.readers.labelled import Recordings
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.blas import one_thread
-from scroll_tactile.cli.terminal import console
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import Shift, quiet_noise, resting_level, shift_of, simulated_shift
 
-__all__ = ["run_shifts", "show_shifts"]
+__all__ = ["live", "run_shifts"]
 
 Record = dict[str, Any]
 
-TO_REACH = {"p50": 0.15, "p99": 2.0, "max": 15.0, "found": 0.99, "false": 1.0, "onset": 30.0, "rate": 1000.0}
+LONGEST = 15.0  # ms that a reading may take
 LEARNED = 6  # simulated touches of each of ten materials
 DEVIATIONS = 3.0  # of its noise, that a sensor's rest is set above the least it was pressed
 
 
 def run_shifts(data: Path | None, *, seconds: float, seed: int, note: Callable[[str], None]) -> Record:
     """A record for each shift: simulated ones, and with `data` those of real touches of a fold that was left out."""
-    result, records = {"bench": "live", **circumstances(seed)}, []
+    records = []
     for sensor in (sensors.BIOTAC, sensors.ROBOSKIN):
         note(f"simulated {sensor.name}")
         records.append(_simulated(sensor, seconds, seed))
@@ -41,7 +42,7 @@ def run_shifts(data: Path | None, *, seconds: float, seed: int, note: Callable[[
             note(f"recorded {name}")
             recordings = load(data, "biotac" if name == "biotac" else "roboskin", seed, unmixed=name == "roboskin")
             records.append(_recorded(recordings, seconds, seed))
-    return {**result, "shifts": records}
+    return {"bench": "live", "shifts": records}
 
 
 def _simulated(sensor: Sensor, seconds: float, seed: int) -> Record:
@@ -76,14 +77,14 @@ def _measured(name: str, learner: TactileLearner, shift: Shift) -> Record:
     learner.settle()
     found: list[LiveTouch] = []
     took, processor = np.empty((2, len(shift.readings)))
-    with one_thread(), learner.live() as live:
+    with one_thread(), learner.live() as session:
         for i, (reading, stamp) in enumerate(zip(shift.readings, shift.times.tolist(), strict=True)):
             begin, busy = time.perf_counter(), time.thread_time()
-            now = live.push(reading, stamp)
+            now = session.push(reading, stamp)
             processor[i] = time.thread_time() - busy
             took[i] = time.perf_counter() - begin
             found += now.touches
-        report = vars(live.report)
+        report = vars(session.report)
     scored = _scored(shift, found)
     return {
         "shift": name,
@@ -99,7 +100,7 @@ def _measured(name: str, learner: TactileLearner, shift: Shift) -> Record:
 
 def _quantiles(took: npt.NDArray[np.float64]) -> dict[str, float]:
     p50, p99, most = np.quantile(took, [0.5, 0.99, 1.0]) * 1e3
-    over = np.count_nonzero(took > TO_REACH["max"] / 1e3)
+    over = np.count_nonzero(took > LONGEST / 1e3)
     return {"p50": float(p50), "p99": float(p99), "max": float(most), "longer_than_to_reach": int(over)}
 
 
@@ -124,30 +125,23 @@ def _scored(shift: Shift, found: list[LiveTouch]) -> Record:
     }
 
 
-def show_shifts(records: list[Record]) -> None:
-    """Print the tables beside what is to be reached."""
-    names = ("p50", "p99", "max")
-    speed = Table("shift", "channels", "", *(f"{name} ms" for name in names), "longer", "readings/s", title="a reading")
-    speed.add_row("to reach", "", "", *(f"≤ {TO_REACH[name]:g}" for name in names), "0", f"≥ {TO_REACH['rate']:g}")
-    contact = Table("shift", "touches", "found", "in parts", "false/h", "onset ms", "5 to 95 %", "named right")
-    contact.add_row(
-        "to reach", "", f"≥ {TO_REACH['found']:.0%}", "", f"≤ {TO_REACH['false']:g}", f"≤ {TO_REACH['onset']:g}"
-    )
-    for record in records:
-        for clock, took in (("wall", record["milliseconds"]), ("processor", record["processor_milliseconds"])):
-            of = [f"{took[name]:.3f}" for name in names]
-            rate = f"{record['readings_per_second']:.0f}" if clock == "wall" else ""
-            speed.add_row(record["shift"], str(record["channels"]), clock, *of, str(took["longer_than_to_reach"]), rate)
-        low, high = record["onset_ms"]["p5_p95"]
-        contact.add_row(
-            record["shift"],
-            str(record["touches"]),
-            f"{record['found'] / record['touches']:.1%}",
-            str(record["in_parts"]),
-            f"{record['false'] / record['hours']:.2f}",
-            f"{record['onset_ms']['median']:.1f}",
-            f"{low:.1f} to {high:.1f}",
-            f"{record['named_right'] / max(1, record['found']):.1%}",
-        )
-    console().print(speed)
-    console().print(contact)
+def live(
+    context: typer.Context,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in: also shifts of its touches."),
+    ] = None,
+    hours: Annotated[float, typer.Option(min=0.01, help="How long each shift is.")] = 1.0,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Send shifts of simulated and of recorded touches through a live session, reading by reading."""
+    with progress_bar() as progress:
+        result = run_shifts(data, seconds=3600 * hours, seed=seed, note=lambda what: progress(what, 0, 1))
+    columns = {"shift": "{./shift}", "channels": "{./channels}"}
+    for clock in ("milliseconds", "processor_milliseconds"):
+        columns |= {f"{clock}, {name}".replace("_", " "): f"{{./{clock}/{name}|.3f}}" for name in ("p50", "p99", "max")}
+    columns |= {"readings a second": "{./readings_per_second|.0f}", "touches": "{./touches}", "found": "{./found}"}
+    columns |= {"in parts": "{./in_parts}", "false": "{./false}", "onset, ms": "{./onset_ms/median|.1f}"}
+    show("shifts", columns | {"named right": "{./named_right}"}, result["shifts"])
+    write(context, result)

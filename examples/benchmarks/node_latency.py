@@ -11,21 +11,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from rich.table import Table
+import typer
 
-from examples.benchmarks.timing import circumstances
+from examples.paper.runs.options import Json
+from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner, sensors
-from scroll_tactile.cli.terminal import console
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
 from scroll_tactile.ros2 import TactileNode
 from scroll_tactile.ros2.interfaces import interface, require_rclpy
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import simulated_shift
 
-__all__ = ["run_node", "show_node"]
+__all__ = ["ros2", "run_node"]
 
 Record = dict[str, Any]
 
@@ -40,7 +41,6 @@ WAITED = 60.0  # seconds for what is still to come
 def run_node(seconds: float, note: Callable[[str], None]) -> Record:
     """The result of so many seconds. Raises RecordingError without rclpy, InputError where nothing came."""
     require_rclpy()
-    result = {"bench": "ros2", **circumstances(SCENE.seed)}
     os.environ.setdefault("ROS_DOMAIN_ID", str(10 + os.getpid() % 90))
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     note("learning")
@@ -68,7 +68,7 @@ def run_node(seconds: float, note: Callable[[str], None]) -> Record:
         "max_milliseconds": float(taken.max()),
         "to_reach": TO_REACH,
     }
-    return result | {"records": [record]}
+    return {"bench": "ros2", "records": [record]}
 
 
 class _Timed(TactileNode):
@@ -102,15 +102,18 @@ def _received(learner: TactileLearner, count: int) -> tuple[list[float], Mapping
         rclpy.try_shutdown(context=context)
 
 
-def show_node(result: Record) -> None:
-    """A table of the result."""
-    [record] = result["records"]
-    table = Table(title="BioTac's 19 electrodes at 100 Hz from another process, from publish to state")
-    for heading in ("readings", "lost", "touches", "ms, median", "p99", "longest"):
-        table.add_column(heading, justify="right")
-    counts = [str(record[name]) for name in ("readings", "lost", "touches")]
-    table.add_row(*counts, *(f"{record[f'{name}_milliseconds']:.2f}" for name in ("median", "p99", "max")))
-    console().print(table)
+def ros2(
+    context: typer.Context,
+    seconds: Annotated[float, typer.Option(min=10.0, help="How long readings are sent.")] = 60.0,
+    json: Json = None,
+) -> None:
+    """Send BioTac's readings at 100 Hz from another process to the ROS 2 node."""
+    with progress_bar() as progress:
+        result = run_node(seconds, note=lambda what: progress(what, 0, 1))
+    columns = {name: f"{{./{name}}}" for name in ("readings", "lost", "touches")}
+    columns |= {f"ms, {name}": f"{{./{name}_milliseconds|.2f}}" for name in ("median", "p99", "max")}
+    show("BioTac's 19 electrodes from another process, from publish to state", columns, result["records"])
+    write(context, result)
 
 
 def _publish(topic: str, seconds: float) -> None:

@@ -8,39 +8,38 @@ stands apart. A bare forward pass of a ResNet-18 stands beside the milliseconds 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+import typer
 
 from examples.benchmarks.checkouts import Worker, checkouts, disk_bytes, in_turns, write_touches
-from examples.benchmarks.timing import Timing, circumstances, timed
+from examples.benchmarks.speed_touches import SHORT, SKIN, Touch, biotac_touches, name_of, skin_touch, skin_touches
+from examples.benchmarks.timing import Timing, timed
 from examples.benchmarks.vision_speed import BareResNet
-from examples.paper.readers.biotac_slide import load
-from examples.paper.readers.labelled import hold_out
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import one_torch_thread
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image, three_planes
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.scene import Scene
 
-__all__ = ["Sizes", "run_speed"]
+__all__ = ["Sizes", "run_speed", "speed"]
 
 Record = dict[str, Any]
 Note = Callable[[str], object]
-Touches = Sequence[tuple[str, npt.NDArray[np.float32]]]
 Sides = dict[str, Path]
 
 MEGABYTE = 1e6
-SKIN = Sensor(name="skin", channels=8, rate=100.0, low=-1.0, high=1.0, unit="1", duration=1.0)
-SHORT = SKIN.model_copy(update={"name": "short-skin", "duration": 0.1})
 REPLAYED = 255  # observations that no close and no checkpoint follows: one more, and a checkpoint is written
 TOGETHER = 1000  # touches in a batch
 SCENE = 3  # materials
@@ -111,7 +110,7 @@ def run_speed(
     sizes: Sizes | None = None,
     note: Note = lambda _: None,
 ) -> Record:
-    """Measure everything; `note` is told what is being done. Returns circumstances and a list of records.
+    """Measure everything; `note` is told what is being done. Returns a list of records.
 
     data: folder of BioTac_slide_20_50, of whose first fold's training part the everyday memory is made; simulated
     touches where it is None. before: an older checkout of the project.
@@ -121,7 +120,7 @@ def run_speed(
     sides = checkouts(before)
     with tempfile.TemporaryDirectory() as folder:
         bench = _Bench(sides, Path(folder), sizes or Sizes(), seed, note)
-        result = {"bench": "speed", **circumstances(seed), "touches": "simulated" if data is None else "BioTac-20"}
+        result = {"bench": "speed", "touches": "simulated" if data is None else "BioTac-20"}
         forward = _everyday(bench, data)
         counts = {bench.sizes.materials: bench.only_now()}
         if before is not None and bench.sizes.before_materials:
@@ -134,7 +133,7 @@ def run_speed(
 
 def _everyday(bench: _Bench, data: Path | None) -> Record:
     """The default learner's memory of twenty materials; returns what a bare forward pass took."""
-    train, test = _biotac(bench, data)
+    train, test = biotac_touches(bench.sizes.touches, bench.sizes.asked, data, bench.seed)
     touches = write_touches(bench.folder / "biotac", sensors.BIOTAC, [*train, *test], len(train[0][1]))
     memory = f"{len(train)} touches of {len({name for name, _ in train})} materials, BioTac"
     _fill_one_by_one(bench, memory, touches, len(train))
@@ -155,22 +154,6 @@ def _everyday(bench: _Bench, data: Path | None) -> Record:
 
 
 REFRESHES = 20
-
-
-def _biotac(bench: _Bench, data: Path | None) -> tuple[Touches, Touches]:
-    """Touches to learn, in a random order, and touches to predict, of BioTac or like it."""
-    number = bench.sizes.touches
-    if data is None:
-        scene = Scene(sensor=sensors.BIOTAC, seed=bench.seed)
-        repetitions = -(-number // len(scene.materials))
-        train = [(name, scene.touch(name, i)) for i in range(repetitions) for name in scene.materials][:number]
-        test = [(name, scene.touch(name, 1000 + i)) for i in range(bench.sizes.asked) for name in scene.materials]
-    else:
-        recordings = load(data, "biotac", bench.seed)
-        train, test = hold_out(recordings, recordings.fold == 0)
-    order = np.random.default_rng(bench.seed).permutation(len(train))[:number]
-    learned = [(train[i][0], np.array(train[i][1].readings)) for i in order]
-    return learned, [(name, np.array(stream.readings)) for name, stream in test]
 
 
 def _fill_one_by_one(bench: _Bench, memory: str, touches: Path, number: int) -> None:
@@ -239,7 +222,12 @@ def _forward(seed: int, readings: npt.NDArray[np.float32]) -> Callable[[], objec
 
 
 def _predict_again(
-    bench: _Bench, memory: str, workers: dict[str, Worker], first: int, test: Touches, forward: Callable[[], object]
+    bench: _Bench,
+    memory: str,
+    workers: dict[str, Worker],
+    first: int,
+    test: Sequence[Touch],
+    forward: Callable[[], object],
 ) -> Timing:
     bench.note(f"{memory}: predictions beside a ResNet-18")
     taken: dict[str, list[float]] = {name: [] for name in workers}
@@ -310,14 +298,14 @@ def _open_killed(bench: _Bench, memory: str, touches: Path, touch: int, replayed
 def _many(bench: _Bench, sides: Sides, materials: int) -> None:
     """A memory of many materials, and a scene of three of them beside a memory of these three alone."""
     sizes, memory = bench.sizes, f"{materials} materials × {bench.sizes.each} touches (8 channels, 1 s)"
-    total, scene = materials * sizes.each, [_named(place * materials // SCENE) for place in range(SCENE)]
+    total, scene = materials * sizes.each, [name_of(place * materials // SCENE) for place in range(SCENE)]
     asked = min(200, materials)
     bench.note(f"{memory}: making the touches")
-    touches = write_touches(bench.folder / "skin", SKIN, _simulated(bench.seed, materials, sizes.each), SKIN.readings)
+    touches = write_touches(bench.folder / "skin", SKIN, skin_touches(bench.seed, materials, sizes.each), SKIN.readings)
     few = write_touches(
         bench.folder / "few",
         SKIN,
-        [(name, _skin_touch(bench.seed, int(name[1:]), i)) for i in range(sizes.each) for name in scene],
+        [(name, skin_touch(bench.seed, int(name[1:]), i)) for i in range(sizes.each) for name in scene],
         SKIN.readings,
     )
     paths = {name: bench.folder / f"{name}-{materials}" for name in sides}
@@ -367,25 +355,6 @@ def _filled(checkout: Path, touches: Path, path: Path, total: int) -> None:
         worker.call("close")
 
 
-def _named(place: int) -> str:
-    return f"m{place:06d}"
-
-
-def _simulated(seed: int, materials: int, each: int) -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
-    """Touches to learn, material after material in each round, and then those to predict, one each."""
-    for repetition in range(each):
-        for place in range(materials):
-            yield _named(place), _skin_touch(seed, place, repetition)
-    for i in range(min(200, materials)):
-        yield _named(37 * i % materials), _skin_touch(seed, 37 * i % materials, 1000)
-
-
-def _skin_touch(seed: int, place: int, repetition: int, sensor: Sensor = SKIN) -> npt.NDArray[np.float32]:
-    """A touch of one of any number of materials: twenty of each of the simulator's scenes."""
-    scene = Scene(sensor=sensor, seed=seed + place // 20)
-    return np.array(scene.touch(scene.materials[place % 20], repetition).readings)
-
-
 def _opening(bench: _Bench) -> None:
     """Memories of many short touches: opened after a close, and after a process that ended without one."""
     scene = Scene(sensor=SHORT, seed=bench.seed)
@@ -411,3 +380,37 @@ def _opening(bench: _Bench) -> None:
                     worker.call("observe", touch=number + i)
         own.seconds(memory, "open after a close", taken, "≤ 1000")
         _open_killed(own, memory, touches, number, REPLAYED)
+
+
+def speed(
+    context: typer.Context,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of biotac_slide_20_50, or the one it lies in; else simulated touches.")
+    ] = None,
+    before: Annotated[
+        Path | None, typer.Option(help="An older checkout of the project: the same calls, in turns, and their ratios.")
+    ] = None,
+    touches: Annotated[int, typer.Option(min=40, help="Of the everyday memory.")] = Sizes.touches,
+    pairs: Annotated[int, typer.Option(min=2, help="Of an observation and a prediction.")] = Sizes.pairs,
+    materials: Annotated[int, typer.Option(min=20, help="Of the large memory.")] = Sizes.materials,
+    opening: Annotated[
+        int, typer.Option(min=100, help="Touches of the largest memory opened: 1000000 take an hour.")
+    ] = 100_000,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Time a user's calls and measure what a memory takes, by the public interface alone.
+
+    The whole takes half an hour or so, and with an older checkout more.
+    """
+    opened = tuple(number for number in (10_000, 100_000) if number < opening)
+    sizes = Sizes(touches=touches, pairs=pairs, materials=materials, opening=(*opened, opening))
+    sizes = replace(sizes, before_materials=min(sizes.before_materials, materials))
+    with progress_bar() as progress:
+        result = run_speed(seed=seed, data=data, before=before, sizes=sizes, note=lambda what: progress(what, 0, 1))
+    columns = {name: f"{{./{name}}}" for name in ("memory", "case", "unit")}
+    columns |= {"now": "{./median|.4g}", "p99": "{?./p99|.4g}", "before": "{?./before_median|.4g}"}
+    columns |= {"before, p99": "{?./before_p99|.4g}", "times": "{?./times|.4g}"}
+    columns |= {"of a ResNet-18": "{?./of_forward|.4g}", "to reach": "{./to_reach}"}
+    show("speed", columns, result["records"])
+    write(context, result)

@@ -6,20 +6,14 @@ machine, ratios of one run do.
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from scroll_tactile import __version__
-
-__all__ = ["CLOCKS", "Clock", "Timing", "circumstances", "take_turns", "timed"]
+__all__ = ["CLOCKS", "Clock", "Timing", "take_turns", "timed"]
 
 Clock = Literal["wall", "processor"]
 CLOCKS: dict[Clock, Callable[[], float]] = {"wall": time.perf_counter, "processor": time.process_time}
@@ -75,27 +69,3 @@ def take_turns(
         for name, call in calls.items():
             seconds[name] += [timed(call, clock) for _ in range(IN_A_ROW)]
     return {name: Timing.of(taken, clock) for name, taken in seconds.items()}
-
-
-def circumstances(seed: int) -> dict[str, Any]:
-    """What a result has to be read with: date, seed, versions, machine, and what else ran on it as it began.
-
-    load_average: of the last 1, 5 and 15 minutes, in processes; above `cores` they waited for each other.
-    """
-    return {
-        "date": datetime.now(UTC).date().isoformat(),
-        "seed": seed,
-        "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {platform.processor() or platform.system()}",
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load_average": [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else None,
-        "versions": {"scroll-tactile": __version__}
-        | {name: _version(name) for name in ("torch", "numpy", "scipy", "zarr")},
-    }
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:  # a clone that was not installed
-        return "not installed"

@@ -14,17 +14,21 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+import typer
 from torch import nn
 from torch.nn import functional
 
-from examples.benchmarks.timing import circumstances, take_turns
+from examples.benchmarks.timing import take_turns
 from examples.paper.readers.biotac_slide import load
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
+from scroll_tactile.cli.terminal import percent, progress_bar, say
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, Run, RuntimeName, make_runtime, one_torch_thread
 from scroll_tactile.embeddings.vision import Vision, to_planes
@@ -34,7 +38,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.simulation.scene import Scene
 
-__all__ = ["BareResNet", "run_vision"]
+__all__ = ["BareResNet", "run_vision", "vision"]
 
 Record = dict[str, Any]
 Note = Callable[[str], None]
@@ -98,7 +102,7 @@ def run_vision(
     weights: of a ResNet, a random ResNet-18 where it is None: the cost is the same, the errors are not.
     data: folder of BioTac_slide_20_50, for the accuracy on RoboSkin beside each runtime (a minute for each); or None.
     """
-    result = {"bench": "vision", **circumstances(seed), "threads": torch.get_num_threads(), "rounds": rounds}
+    result = {"bench": "vision", "threads": torch.get_num_threads(), "rounds": rounds}
     net = ResNet.random(seed) if weights is None else load_network(weights)
     state = net.state_dict()
     here = [name for name in ("onnxruntime",) if find_spec(name) and find_spec("onnx")]
@@ -213,3 +217,30 @@ def _errors(embeddings: list[tuple[str, Vision]], image: Image) -> dict[str, flo
         reference = truth.setdefault(embedding.stages, features)
         errors[name] = float(np.linalg.norm(features - reference) / np.linalg.norm(reference))
     return errors
+
+
+def vision(
+    context: typer.Context,
+    weights: Annotated[
+        Path | None, typer.Option(help="A .safetensors or .pth file; random weights cost the same.")
+    ] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="BioTac_slide_20_50: also the accuracy of each runtime on RoboSkin. Minutes.")
+    ] = None,
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="A few rounds: for a look, not for a report.")] = False,
+    json: Json = None,
+) -> None:
+    """Time the vision embedding beside a bare forward pass of its network, in each runtime that is installed."""
+    rounds = 5 if quick else 30
+    with progress_bar() as progress:
+        result = run_vision(
+            weights=weights, data=data, seed=seed, rounds=rounds, note=lambda what: progress(what, 0, 1)
+        )
+    columns = {"what": "{./case}", "image": "{./image}", "ms, p50": "{./median_milliseconds|.2f}"}
+    columns |= {"p99": "{./p99_milliseconds|.2f}", "ratio": "{./ratio|.2f}"}
+    columns |= {"to one thread": "{./ratio_to_one_thread|.2f}", "error of features": "{?./relative_error|.1e}"}
+    show("vision", columns, result["records"])
+    for name, share in result["accuracy"].items():
+        say(f"RoboSkin-20, fold 0, {name}: {percent(share)}")
+    write(context, result)

@@ -164,32 +164,6 @@ def test_weights_too_large_for_a_double_are_not_passed_off():
         solved(np.array([[5e-324], [0.0]]), np.ones((2, 1)))
 
 
-# Centring
-
-
-def centred_truth(rows, targets, penalty):
-    with mpmath.workdps(60):
-        x, y = mpmath.matrix(rows.tolist()), mpmath.matrix(targets.tolist())
-        for part in (x, y):
-            for column in range(part.cols):
-                mean = mpmath.fsum(part[:, column]) / part.rows
-                for row in range(part.rows):
-                    part[row, column] -= mean
-        found = mpmath.lu_solve(x.T * x + penalty * mpmath.eye(x.cols), x.T * y[:, 0])
-        return np.array([float(value) for value in found])
-
-
-@pytest.mark.parametrize("offset", [0.0, 1e6, 1e12])
-def test_centred_weights_do_not_cancel(offset):
-    rows, targets = offset + GAUSSIAN, np.random.default_rng(2).normal(size=(30, 1))
-    solver = Exact()
-    solver.start(8, 1, 0.25)
-    solver.update(rows, targets)
-    found, diagnosis = solver.solve(centred=True)
-    assert np.allclose(found[:, 0], centred_truth(rows, targets, 0.25), rtol=1e-15, atol=0)
-    assert diagnosis.condition < 100
-
-
 # Schedules
 
 

@@ -12,7 +12,8 @@ from commands import refused, run
 
 from examples.benchmarks import speed
 from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
-from examples.benchmarks.speed import SKIN, Sizes, run_speed
+from examples.benchmarks.speed import Sizes, run_speed
+from examples.benchmarks.speed_touches import SKIN
 from examples.benchmarks.timing import CLOCKS, Timing, take_turns
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
 from scroll_tactile.errors import InputError
@@ -110,16 +111,18 @@ def test_a_process_that_ended_without_a_close_left_what_it_acknowledged(tmp_path
 
 
 def test_the_command_measures_prints_and_writes_it(tmp_path, monkeypatch, measured):
-    command = __import__("examples.benchmarks.__main__", fromlist=["app"])
     asked = {}
-    monkeypatch.setattr(command, "run_speed", lambda **given: asked.update(given) or measured)
+    monkeypatch.setattr(speed, "run_speed", lambda **given: asked.update(given) or measured)
     result = run(
         "bench", "speed", "--materials", 200, "--opening", 20000, "--before", tmp_path, "--json", tmp_path / "r"
     )
     assert result.exit_code == 0, result.output
     assert asked["sizes"] == replace(Sizes(), materials=200, before_materials=200, opening=(10_000, 20_000))
     found = json.loads((tmp_path / "r").read_text())
-    assert found["command"] == "python -m examples.benchmarks speed --before BEFORE --materials 200 --opening 20000"
+    assert found["command"] == (
+        "python -m examples.benchmarks speed --before BEFORE --touches 800 --pairs 200 --materials 200 "
+        "--opening 20000 --seed 0"
+    )
     assert str(tmp_path) not in (tmp_path / "r").read_text()
     assert {"load_average", "load_average_after", "versions", "date", "seed"} <= found.keys()
     assert "predict right after an observe" in result.output

@@ -187,35 +187,3 @@ def _finished(kept: Path) -> list[str]:
 
 def test_the_version_is_shown() -> None:
     assert run("--version").stdout == f"scroll-tactile {__version__}\n"
-
-
-def test_schedules_give_one_memory() -> None:
-    result = run("schedules", "--count", "3", "--touches", "2", "--materials", "2", "--features", "64")
-    assert result.exit_code == 0, result.output
-    assert "1 digest, predictions for 2 others the same to the bit" in result.stdout
-    assert "no such folder" in refused("schedules", "--data", "/nowhere")
-    assert "biotac or roboskin" in refused("schedules", "--data", "/nowhere", "--sensor", "contactile")
-
-
-class TestReplay:
-    def test_a_fold_of_real_touches(self, real_data: Path, tmp_path: Path) -> None:
-        options = ["--data", real_data, "--folds", "0", "--materials", "4", "--run", tmp_path / "kept"]
-        result = run("replay", "roboskin-20", *options, "--json", tmp_path / "r.json", "--plot", tmp_path / "p.png")
-        assert result.exit_code == 0, result.output
-        assert "equals offline training: yes" in result.stdout
-        found = json.loads((tmp_path / "r.json").read_text())
-        assert found["command"].startswith("python -m examples.paper replay roboskin-20 --data")
-        assert set(found["versions"]) >= {"scroll-tactile", "torch", "numpy", "python"}
-        assert (found["sensor"]["name"], found["schedule"], found["seed"]) == ("roboskin", "class-by-class", 0)
-        assert found["means"]["accuracy"]["mean"] == found["folds"][0]["accuracy"] > 0.9
-        assert len(found["folds"][0]["digest"]) == 64
-        again = run("replay", "roboskin-20", *options)
-        assert found["folds"][0]["digest"][:16] in again.stdout
-        assert "another run" in refused("replay", "roboskin-20", *options, "--schedule", "shuffled")
-
-    def test_errors_are_one_line(self, tmp_path: Path) -> None:
-        assert "no such folder" in refused("replay", "biotac-20", "--data", tmp_path / "none")
-        assert "it is and does not" in refused("replay", "roboskin-20", "--data", tmp_path)
-        missing = tmp_path / "none" / "r.json"
-        assert "folder that exists" in refused("replay", "biotac-20", "--data", tmp_path, "--json", missing)
-        assert run("replay", "nose-20", "--data", tmp_path).exit_code == 2

@@ -1,12 +1,17 @@
 """What several tests of the studies share."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from paper_touches import PAD, PATCH, pressed, recorded, slid
 
+from examples.paper.readers.labelled import Recordings
+from examples.paper.runs.options import SETS
 from scroll_tactile.embeddings.resnet import ResNet
 
 
@@ -35,3 +40,26 @@ def gelsight(tmp_path: Path) -> Path:
     kinds = {"hardness": grades, "roughness": grades, "texture": grades | {"pen": 2}, "materials": {"apple": "food"}}
     (tmp_path / "physiclear" / "attributes.json").write_text(json.dumps(kinds))
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def small_sets() -> dict[str, Recordings]:
+    """The sets of touches, made up: five materials under two sensors, thirty touches of each in three folds."""
+    sizes: dict[str, Any] = {"materials": 5, "each": 30, "folds": 3}
+    biotac = recorded(PATCH, name="BioTac-20", ordered=True, **sizes)
+    roboskin = recorded(PAD, name="RoboSkin-20", **sizes)
+    return {
+        "biotac-20": biotac,
+        "biotac-20-blocked": replace(biotac, name="BioTac-20 blocked", fold=biotac.blocked()),
+        "roboskin-20": roboskin,
+        "roboskin-20-unmixed": replace(roboskin, name="RoboSkin-20, unmixed"),
+        "letter-spike": pressed(),
+    }
+
+
+@pytest.fixture
+def made_up(small_sets: dict[str, Recordings], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every command read the made-up sets."""
+    for name, recordings in small_sets.items():
+        monkeypatch.setitem(SETS, name, lambda data, seed, recordings=recordings: recordings)
+    monkeypatch.setattr("examples.paper.readers.fabric_slide.load", lambda data, seed: slid())

@@ -7,9 +7,9 @@ import pytest
 from commands import refused, run
 from paper_touches import recorded
 
-from examples.paper.commands import all_command
-from examples.paper.commands.all_command import Part, _left, read_parts
-from examples.paper.commands.options import QUICK_EPOCHS, SETS
+from examples.paper.runs import everything
+from examples.paper.runs.everything import Part, _left, read_parts
+from examples.paper.runs.options import QUICK_EPOCHS, SETS
 from examples.paper.studies.table1 import Table1
 from examples.tables import main
 
@@ -18,7 +18,7 @@ TABLE1 = "python -m examples.paper table1 --data DATA --sets roboskin-20 --epoch
 
 def test_all_results_have_commands_and_those_that_take_least_come_first():
     parts = read_parts()
-    assert {part.name for part in parts} == {file.stem for file in all_command.RESULTS.glob("*.json")}
+    assert {part.name for part in parts} == {file.stem for file in everything.RESULTS.glob("*.json")}
     known = [part.seconds for part in parts if part.seconds is not None]
     assert known == sorted(known) and all(part.commands for part in parts)
 
@@ -41,7 +41,7 @@ def noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     }
     for i, (name, command) in enumerate(commands.items()):
         (folder / f"{name}.json").write_text(json.dumps({"command": command, "seconds": 200 * (i + 1)}))
-    monkeypatch.setattr(all_command, "RESULTS", folder)
+    monkeypatch.setattr(everything, "RESULTS", folder)
     monkeypatch.setitem(SETS, "roboskin-20", lambda data, seed: recorded())
     return folder
 

@@ -1,21 +1,27 @@
-"""Compositions are scored as the paper does, and the fabric pipelines run from the data to the figures."""
-
-import json
+"""Compositions are scored as the paper does; simulated fabrics are what they are made of; heads for the unseen."""
 
 import numpy as np
 import pytest
-from commands import run
+from paper_touches import slid
 
-from examples.paper.fabric.fabric_protocol import score, score_compositions
-from examples.paper.fabric.fabric_study import Letters, SlideTransfer, directions, summary
-from examples.paper.readers.fabric_slide import CPM_FINGER, Slides
-from examples.paper.readers.labelled import Recordings
-from examples.paper.readers.letter_spike import DOTS, GRID, NUSKIN, dots_of
-from scroll_tactile.errors import InputError
-from scroll_tactile.results import Composition, Constituent, Prediction
+from examples.paper.fabric.contactile import Contactile
+from examples.paper.fabric.fabric_protocol import score
+from examples.paper.fabric.objects import most_often, object_groups
+from examples.paper.fabric.ratios import CONTACTILE_RATIOS, ratios
+from examples.paper.fabric.simulated import CONSTITUENTS, HAND, ROBOT, FabricScene
+from examples.paper.fabric.slides import directions
+from examples.paper.fabric.unseen import fit_heads
+from examples.paper.systems.constituents import Heads, Shares
+from scroll_tactile.errors import InputError, UnknownMaterialError
+from scroll_tactile.readouts.attributes import solve
+from scroll_tactile.readouts.task import Task
+from scroll_tactile.sensors import BIOTAC, CONTACTILE
 from scroll_tactile.signals.stream import validate
+from scroll_tactile.statistics.grid import in_units, to_codes
+from scroll_tactile.statistics.statistics import Statistics
 
 SIX = [f"part{number}" for number in range(6)]
+SCENE = FabricScene(seed=0)
 
 
 class TestScore:
@@ -24,16 +30,9 @@ class TestScore:
         predicted = [[0.9, 0.2, 0.1, 0.8, 0.4, 0.0], [0.9, 0.7, 0.1, 0.3, 0.4, 0.0]]
         figures = score(SIX, truth, predicted)
         assert figures["score"] == pytest.approx((1 + 4 / 6) / 2)
-        assert figures["exact"] == 0.5
-        assert figures["always"] == 1.0
-        assert figures["constituents"]["part1"] == {
-            "there": 0.0,
-            "correct": 0.5,
-            "precision": 0.0,
-            "recall": None,
-            "unanswered": 0,
-        }
-        assert figures["share_error"] is None
+        assert (figures["exact"], figures["always"], figures["share_error"]) == (0.5, 1.0, None)
+        wanted = {"there": 0.0, "correct": 0.5, "precision": 0.0, "recall": None, "unanswered": 0}
+        assert figures["constituents"]["part1"] == wanted
 
     def test_it_agrees_with_scikit_learn(self):
         metrics = pytest.importorskip("sklearn.metrics")
@@ -54,111 +53,166 @@ class TestScore:
         assert (figures["score"], figures["constituents"]["a"]["unanswered"]) == (0.5, 4)
         assert figures["calibration_error"] == pytest.approx(0.1)
         assert score(["a"], [[1]], [[np.nan]])["calibration_error"] is None
-
-    @pytest.mark.parametrize(("truth", "presence"), [([[1, 0]], [[0.5]]), ([], []), ([1, 0], [0.5, 0.5])])
-    def test_other_shapes_are_refused(self, truth, presence):
-        with pytest.raises(InputError):
-            score(["a", "b"], truth, presence)
-
-    def test_of_compositions_shares_are_compared_where_there_are_any(self):
-        feels = Prediction("x", 1.0, (("x", 1.0),), 0.0, True, 1.0)
-
-        def predicted(*values):
-            return Composition(tuple(Constituent(*value, ()) for value in values), 0.1, feels)
-
-        answers = [
-            predicted(("silk", 0.9, 0.5), ("wool", 0.8, 0.5)),
-            predicted(("silk", None, None), ("wool", 0.2, 0.9)),
-        ]
-        figures = score_compositions(["silk", "wool"], [{"silk": 0.25, "wool": 0.75}, {"wool": True}], answers)
-        assert figures["share_error"] == pytest.approx(0.25)
-        assert figures["score"] == pytest.approx(3 / 4)
-        with pytest.raises(InputError):
-            score_compositions(["silk"], [{}], answers)
+        for truth, presence in (([[1, 0]], [[0.5]]), ([], []), ([1, 0], [0.5, 0.5])):
+            with pytest.raises(InputError):
+                score(["a", "b"], truth, presence)
 
 
-def press(letter, number):
-    """A simulated press: dots of two taxels' distance, anywhere on the skin, each with a force of its own."""
-    rng = np.random.default_rng([number, *letter.encode()])
-    image = np.zeros((40, *GRID))
-    row, column = rng.integers(0, 4), rng.integers(0, 4)
-    for i, (dot, there) in enumerate(dots_of(letter).items()):
-        if there:
-            assert dot == DOTS[i]
-            image[8:, row + 2 * (i % 3), column + 3 * (i // 3)] = rng.uniform(500, 900)
-    # A taxel that is not pressed sends nothing, and stays at rest.
-    noise = rng.uniform(0, 30, image.shape) * (image > 0)
-    return validate((image + noise).reshape(40, -1), NUSKIN)
+def forces(fabric, protocol, repetition=0, scene=SCENE):
+    """(T, 9, 3) N, once the touch has settled."""
+    return scene.touch(fabric, protocol, repetition).readings.astype(np.float64).reshape(-1, 9, 3)[100:]
 
 
-@pytest.fixture(scope="module")
-def letters():
-    names = [letter for letter in "ABCDEFGHJKLMNOPQRTVXYZ" for _ in range(5)]
-    numbers = np.tile(np.arange(5), len(names) // 5)
-    streams = [press(name, number) for name, number in zip(names, numbers.tolist(), strict=True)]
-    return Recordings("made up", NUSKIN, streams, names, numbers, numbers, ordered=True)
+class TestSimulated:
+    def test_shares_are_parts_of_one_and_every_constituent_is_in_some(self):
+        made_of = SCENE.compositions
+        assert list(made_of) == list(SCENE.fabrics) and len(made_of) == 32
+        assert all(sum(shares.values()) == pytest.approx(1) and len(shares) <= 3 for shares in made_of.values())
+        assert all(0 < share <= 1 for shares in made_of.values() for share in shares.values())
+        often = [sum(name in shares for shares in made_of.values()) for name in CONSTITUENTS]
+        assert min(often) > 2 and max(often) < 30
+        assert max(shares.get("elastane", 0) for shares in made_of.values()) <= 0.1
+        assert FabricScene(seed=1).compositions != made_of
+        few = FabricScene(seed=0, count=5).compositions
+        assert few == {name: made_of[name] for name in few}
+
+    @pytest.mark.parametrize("protocol", [ROBOT, HAND])
+    def test_a_touch_is_a_sound_stream_and_depends_on_its_arguments_alone(self, protocol):
+        state = np.random.get_state()[1].tolist()  # noqa: NPY002 the global generator must stay
+        first = SCENE.touch("fabric07", protocol, 3)
+        assert FabricScene(seed=0).touch("fabric07", protocol, 3) == first
+        assert np.random.get_state()[1].tolist() == state  # noqa: NPY002 see above
+        assert (first.readings.shape, first.clipped, first.sensor) == ((599, 27), 0, SCENE.sensor)
+        others = [SCENE.touch("fabric08", protocol, 3), SCENE.touch("fabric07", protocol, 4)]
+        others.append(FabricScene(seed=1).touch("fabric07", protocol, 3))
+        others.append(SCENE.touch("fabric07", 3 - protocol, 3))
+        assert len({stream.key for stream in [first, *others]}) == 5
+
+    def test_a_robot_presses_and_moves_alike_and_a_hand_does_not(self):
+        load, way = {}, {}
+        for protocol in (ROBOT, HAND):
+            touches = [forces("fabric02", protocol, repetition) for repetition in range(8)]
+            load[protocol] = np.array([touch[..., 2].sum(axis=1).mean() for touch in touches])
+            along = [np.sign(touch[:, :, 0].sum(axis=1)) for touch in touches]
+            way[protocol] = [int(np.flatnonzero(np.diff(one))[0]) for one in along if np.ptp(one)]
+        assert load[ROBOT].mean() == pytest.approx(5, rel=0.1)
+        assert load[HAND].std() > 4 * load[ROBOT].std()
+        assert np.ptp(way[ROBOT]) < 5 < np.ptp(way[HAND])
+
+    def test_yarn_is_observed(self):
+        """Wool drags more than cotton, that more than linen, and polyester least."""
+
+        def friction(name):
+            settled = forces(name, ROBOT)[150:200]
+            return float((np.linalg.norm(settled[..., :2].sum(axis=1), axis=1) / settled[..., 2].sum(axis=1)).mean())
+
+        pure = {next(iter(shares)): name for name, shares in SCENE.compositions.items() if len(shares) == 1}
+        assert friction(pure["polyester"]) < friction(pure["linen"]) < friction(pure["cotton"])
+        wool = [friction(name) for name, shares in SCENE.compositions.items() if shares.get("wool", 0) > 0.6]
+        assert min(wool) > friction(pure["cotton"])
+
+    def test_a_set_is_dealt_into_seeded_folds_of_each_fabric_and_protocol(self):
+        scene = FabricScene(seed=2, count=3)
+        fabrics = scene.touched(robot=5, hand=2)
+        assert fabrics.protocol.tolist() == ([ROBOT] * 5 + [HAND] * 2) * 3
+        assert fabrics.recordings.materials[::7] == list(scene.fabrics)
+        assert fabrics.recordings.streams[12] == scene.touch("fabric02", HAND, 0)
+        assert sorted(fabrics.recordings.fold[:5].tolist()) == [0, 1, 2, 3, 4]
+        assert fabrics.recordings.fold.tolist() == scene.touched(robot=5, hand=2).recordings.fold.tolist()
+
+    @pytest.mark.parametrize(
+        ("call", "error"),
+        [
+            (lambda: SCENE.touch("silk", 1, 0), UnknownMaterialError),
+            (lambda: SCENE.touch("fabric01", 3, 0), InputError),
+            (lambda: SCENE.touch("fabric01", 1, -1), InputError),
+            (lambda: FabricScene(seed=-1), InputError),
+            (lambda: FabricScene(count=0), InputError),
+            (lambda: Contactile(FabricScene(count=1).touched(5, 1), ("kernels",)), InputError),
+        ],
+    )
+    def test_what_is_not_there_is_refused(self, call, error):
+        with pytest.raises(error):
+            call()
+
+    def test_what_a_robot_touched_is_known_when_it_is_touched_again(self):
+        study = Contactile(FabricScene(count=5).touched(robot=5, hand=1), ("kernels",))
+        ((_, figures),) = study.run(["held-out"])
+        assert figures["tested"] == 5 and figures["score"] == figures["fabric"] == 1
+        assert figures["share_error"] < 0.02
 
 
-def test_letters_held_out_are_composed_of_their_dots(letters, tmp_path):
-    task = Letters(letters, groups=4, cosines=300, folder=tmp_path / "run")
-    results = list(task.run([0]))
-    assert [result["part"] for result in results] == ["known", *["never touched"] * 4]
-    means = summary(results)
-    assert means["known"]["score"]["mean"] > 0.9
-    assert means["never touched"]["score"]["mean"] > 0.85
-    assert means["never touched"]["accuracy"]["mean"] == 0
-    tested = [result["tested"] for result in results]
-    assert (tested[0], sum(tested[1:])) == (22, 110)
-    steps = []
-    assert list(task.run([0], lambda *step: steps.append(step))) == results  # noted, and not done again
-    assert steps == []
-    with pytest.raises(InputError, match="expected folds out of"):
-        list(task.run([7]))
-    with pytest.raises(InputError, match="belongs to another run"):
-        list(Letters(letters, groups=5, cosines=300, folder=tmp_path / "run").run([0]))
+def test_heads_are_ridge_regressions_whose_shares_sum_to_one():
+    features = np.random.default_rng(0).standard_normal((60, 5))
+    there = features[:, 0] > 0
+    names = ["yes" if fraction else "no" for fraction in there]
+    shares = Shares(("a", "b"), {"yes": {"a": 1.0}, "no": {"b": 1.0}})
+    reported = Heads(features[:50], features[50:], shares, names[:50], names[50:])(features)
+    assert ((reported.presence[:, 0] > 0.5) == there).mean() > 0.9
+    assert np.allclose(reported.share.sum(axis=1), 1)
 
 
-@pytest.fixture(scope="module")
-def slides():
+class TestRatios:
+    def touch(self, force=1.0, angle=0.0):
+        """A drag of friction 0.4 over a relief, each pillar a little later."""
+        time, pillar = np.arange(300)[:, None] / 100, np.arange(9)
+        load = force * (1 + 0.3 * np.sin(2 * np.pi * (6 * time - 0.1 * pillar)))
+        found = np.stack([-0.4 * load * np.cos(angle), -0.4 * load * np.sin(angle), load], axis=2)
+        return validate(found.reshape(300, 27), CONTACTILE)
+
+    def test_force_and_way_leave_no_trace_and_friction_does(self):
+        usual = ratios(self.touch())
+        assert (usual.sensor, usual.readings.shape) == (CONTACTILE_RATIOS, (300, 27))
+        for other in (self.touch(force=3.0), self.touch(angle=2.0), self.touch(force=0.5, angle=-1.0)):
+            assert np.allclose(ratios(other).readings, usual.readings, atol=1e-4)
+        pillars = usual.readings.reshape(300, 9, 3)
+        assert np.allclose(pillars[..., 0], 0.4, atol=1e-4)
+        assert np.allclose(pillars[..., 1], 0, atol=1e-4)
+        assert pillars[100:200, :, 2].std() == pytest.approx(0.3 / np.sqrt(2), rel=0.1)
+        assert np.isfinite(ratios(validate(np.zeros((50, 27)), CONTACTILE)).readings).all()
+        with pytest.raises(InputError, match="27 channels"):
+            ratios(validate(np.zeros((50, 19)), BIOTAC))
+
+
+def test_directions_are_of_slides_at_other_speeds_and_forces():
+    assert [(int(a.sum()), int(b.sum())) for a, b in directions(slid()).values()] == [(16, 16)] * 4
+
+
+def test_groups_share_the_names_out():
+    groups = object_groups([str(i) for i in range(23)], 4, 1)
+    assert sorted(map(len, groups)) == [5, 6, 6, 6]
+    assert groups == object_groups([str(i) for i in range(23)], 4, 1)
+    assert groups != object_groups([str(i) for i in range(23)], 4, 2)
+    assert most_often(["b", "a", "b", "a", "c"]) == "a"
+
+
+def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
+    """An attribute that the first feature shows is graded of new objects; an object left out was never there."""
     rng = np.random.default_rng(0)
-    shapes = {name: 1 + 0.3 * rng.standard_normal((50, 16)).cumsum(axis=0) / 7 for name in ("felt", "silk")}
-    names, forces, speeds, streams = [], [], [], []
-    for name, shape in shapes.items():
-        for force in (120, 150, 210, 250):
-            for speed in (-150, -10, 20, 120):
-                count = 200 if abs(speed) > 50 else 400
-                i = np.linspace(0, 49, count)
-                values = np.stack([np.interp(i, np.arange(50), column) for column in shape.T], axis=1)
-                readings = np.clip(values, 0.2, 2) * force + rng.normal(0, 2, (count, 16))
-                names, forces, speeds = [*names, name], [*forces, force], [*speeds, speed]
-                streams.append(validate(readings, CPM_FINGER))
-    number = np.arange(len(names)) % 16
-    recordings = Recordings("made up", CPM_FINGER, streams, names, number, number % 5, ordered=False)
-    return Slides(recordings, np.array(forces), np.array(speeds))
-
-
-def test_slides_are_classified_at_another_force_and_speed(slides, tmp_path):
-    assert [(int(a.sum()), int(b.sum())) for a, b in directions(slides).values()] == [(16, 16)] * 4
-    task = SlideTransfer(slides, parts=6, folder=tmp_path / "run")
-    results = list(task.run())
-    assert [result["part"] for result in results[:4]] == list(directions(slides))
-    assert len(results) == 9
-    assert all(result["accuracy"] == 1 for result in results)
-    assert list(task.run()) == results
-
-
-def test_the_commands_report_write_and_resume(letters, slides, tmp_path, monkeypatch):
-    monkeypatch.setattr("examples.paper.readers.letter_spike.load", lambda data, seed: letters)
-    monkeypatch.setattr("examples.paper.readers.fabric_slide.load", lambda data, seed: slides)
-    common = ["--data", tmp_path, "--run", tmp_path / "run", "--json", tmp_path / "out.json"]
-    reported = run("fabric", "letters", *common, "--folds", "1", "--groups", "2", "--cosines", "128")
-    assert reported.exit_code == 0, reported.output
-    assert "mean score per dot" in reported.output
-    result = json.loads((tmp_path / "out.json").read_text())
-    assert result["means"]["known"]["score"]["mean"] > 0.7
-    assert set(result["parts"][0]["constituents"]) == set(DOTS)
-    assert result["command"].startswith("python -m examples.paper fabric letters --data")
-    reported = run("fabric", "slide", "--data", tmp_path, "--json", tmp_path / "slide.json")
-    assert reported.exit_code == 0, reported.output
-    assert "slow → fast" in reported.output
-    assert len(json.loads((tmp_path / "slide.json").read_text())["parts"]) == 9
+    statistics, shown = Statistics(6, (1,)), {}
+    centres = rng.uniform(-0.5, 0.5, (30, 6))
+    for i, centre in enumerate(centres):
+        rows = centre + 0.05 * rng.standard_normal((5, 6))
+        statistics.add(f"m{i:02}", {1: to_codes(rows, 1.0)})
+        shown[f"m{i:02}"] = {"bright": int(centre[0] > 0)}
+    known = {name: value for name, value in shown.items() if name < "m20"}
+    head = fit_heads(statistics, 1, known, ["bright"])["bright"]
+    reported = [head(in_units(centre, 1.0)) for centre in centres[20:]]
+    assert np.mean([item == shown[f"m{i + 20}"]["bright"] for i, item in enumerate(reported)]) >= 0.8
+    # Leaving one out by the formula is leaving it out of the system.
+    counts, sums = statistics.totals(1)
+    means = sums[:20] / counts[:20, None] - head.origin
+    lower = Task.of(statistics, 1, statistics.names(1)).scatter
+    scatter = np.tril(lower) + np.tril(lower, -1).T
+    gram = means @ np.linalg.solve(scatter + head.penalty * np.trace(scatter) / 6 * np.eye(6), means.T)
+    system = np.linalg.inv(solve(gram, head.gamma).inverse)
+    targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)
+    error = 0.0
+    for i in range(20):
+        others = np.delete(np.arange(21), i)
+        known_others = np.append(np.delete(targets, i, axis=0), [[0, 0]], axis=0)
+        left = np.linalg.solve(system[np.ix_(others, others)], known_others)
+        error += np.square(targets[i] - system[i, others] @ left).sum()
+    assert error == pytest.approx(head.error)
+    with pytest.raises(InputError, match="observed was 1"):
+        fit_heads(statistics, 1, {"m00": known["m00"]}, ["bright"])

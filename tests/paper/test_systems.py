@@ -1,6 +1,7 @@
 """The systems of the comparison: encoding, what each learns, and the training that the networks share."""
 
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,19 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from paper_touches import recorded
 from torch import nn
 
 from examples.paper.readers.physiclear import HALF_SIZE
+from examples.paper.studies.table1 import Table1
 from examples.paper.systems.catalogue import SYSTEMS, Catalogue
 from examples.paper.systems.descent import Batches, Course, Precision, TrainingError, descend, logits_of, seeded
 from examples.paper.systems.inputs import average_columns, one_width, picture
 from examples.paper.systems.least_squares import PENALTIES, LeastSquares
 from examples.paper.systems.networks import ConvLSTM, ResNetClassifier, SpikingNet
-from examples.paper.systems.spikes import decode, encode
+from examples.paper.systems.one_pass import OnePass
+from examples.paper.systems.own import is_own, require_own
+from examples.paper.systems.spikes import REST, encode
 from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System, silent, unwatched
 from examples.paper.systems.trained import TrainedNetwork
@@ -66,7 +71,9 @@ class TestSpikes:
         spikes = encode(walk, threshold)
         assert spikes.shape == (6, 40)
         assert (spikes >= 0).all() and (spikes == np.round(spikes)).all()
-        assert np.abs(decode(spikes, threshold) - walk).max() <= threshold * (1 + 1e-6)
+        on, off = np.split(spikes.astype(np.float64), 2)
+        decoded = REST + threshold * np.cumsum(on - off, axis=1)
+        assert np.abs(decoded - walk).max() <= threshold * (1 + 1e-6)
 
     def test_a_rise_is_on_and_a_fall_is_off(self):
         image = np.array([[0.0, 0.35, 0.35, 0.0], [0.0, 0.0, 0.0, 0.0]], dtype=np.float32)
@@ -80,8 +87,6 @@ class TestSpikes:
     def test_thresholds_that_cannot_be_are_refused(self, threshold):
         with pytest.raises(InputError, match="threshold above 0"):
             encode(np.zeros((2, 5), np.float32), threshold)
-        with pytest.raises(InputError, match="threshold above 0"):
-            decode(np.zeros((2, 5), np.float32), threshold)
 
 
 class TestInputs:
@@ -326,3 +331,51 @@ class TestNetworks:
             assert torch.allclose(net(images), before, rtol=1e-3, atol=1e-3 * float(before.abs().max()))
             trained = net.train()(images)  # the batch has the statistics that the network now has
         assert torch.allclose(trained, before, rtol=1e-2, atol=1e-2 * float(before.abs().max()))
+
+
+class Wrong:
+    """What a factory of one's own may make by mistake."""
+
+    def __init__(self, needed: int = 0) -> None:
+        self.needed = needed
+
+
+def needs(argument: int) -> Wrong:
+    return Wrong(argument)
+
+
+class TestOnesOwn:
+    def test_a_system_and_an_embedding_are_made_by_name(self):
+        catalogue = Catalogue()
+        system = catalogue.make("examples.own_system:NearestMean")
+        assert (system.name, isinstance(system, System)) == ("nearest mean", True)
+        assert catalogue.make("examples.own_system:NearestMean") is not system  # each fold has a new one
+        for readout in ("lda", "ridge"):
+            assert isinstance(catalogue.make(f"examples.own_system:Strengths-{readout}"), OnePass)
+
+    @pytest.mark.parametrize(
+        ("key", "message"),
+        [
+            ("nowhere.at_all:make", "module nowhere.at_all cannot be imported from here: No module named 'nowhere'"),
+            ("examples.own_system:__doc__", "a class or a function to call; it is of type str"),
+            (f"{__name__}:needs", "called without arguments"),
+            (f"{__name__}:Wrong", "to make a system.*it makes of type Wrong"),
+            ("examples.own_system:Strengths", "to make a system.*it makes of type Strengths"),
+            ("examples.own_system:NearestMean-lda", "to make an embedding.*it makes of type NearestMean"),
+        ],
+    )
+    def test_what_is_none_is_named(self, key: str, message: str):
+        assert is_own(key)
+        with pytest.raises(InputError, match=message):
+            require_own(key)
+
+    def test_a_run_is_not_resumed_with_another_file(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.syspath_prepend(tmp_path)
+        file = tmp_path / "mine_alone.py"
+        file.write_text("from examples.own_system import NearestMean\n")
+        study = Table1([recorded()], ("mine_alone:NearestMean",), folder=tmp_path / "run")
+        ((_, first),) = study.run({"RoboSkin-20": [0]})
+        assert [figures for _, figures in study.run({"RoboSkin-20": [0]})] == [first]
+        file.write_text("from examples.own_system import NearestMean  # changed\n")
+        with pytest.raises(InputError, match="begun with other the file of mine_alone:NearestMean"):
+            list(study.run({"RoboSkin-20": [0]}))

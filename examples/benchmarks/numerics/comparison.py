@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import typer
 
 from examples.benchmarks.numerics.learned import AGREED, measure_learned
 from examples.benchmarks.numerics.long_runs import run_drift, run_schedules, run_updates
@@ -19,10 +21,12 @@ from examples.benchmarks.numerics.peers import as_case, measure
 from examples.benchmarks.numerics.recorded import NIST, nist_cases, real_memory
 from examples.benchmarks.numerics.regressions import Case, make_cases
 from examples.benchmarks.solvers.methods import SOLVERS
-from examples.benchmarks.timing import circumstances
+from examples.paper.runs.options import Json, Seed
+from examples.paper.runs.results import show, write
+from scroll_tactile.cli.terminal import progress_bar, say
 from scroll_tactile.errors import DatasetError
 
-__all__ = ["claims", "find_nist", "run_numerics"]
+__all__ = ["claims", "find_nist", "numerics", "run_numerics"]
 
 Record = dict[str, Any]
 Progress = Callable[[str, int, int], None]
@@ -75,7 +79,7 @@ def run_numerics(
     records += run_drift(seed, DIMENSION, observations, note)
     records += run_updates(seed, DIMENSION, observations, tuple(SOLVERS), note)
     records += run_schedules(seed, SCHEDULED, 20 if quick else 1000, 32, note)
-    result = {"bench": "numerics", **circumstances(seed), "quick": quick}
+    result = {"bench": "numerics", "quick": quick}
     return result | {"records": records, "claims": claims(records), "not_measured": missing}
 
 
@@ -127,3 +131,39 @@ def _real(seed: int, quick: bool, data: Path | None, missing: dict[str, str]) ->
             yield real_memory(name, data, seed, 64 if quick else 256, 200 if quick else None)
         except DatasetError as error:
             missing[name] = str(error)
+
+
+def numerics(
+    context: typer.Context,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with biotac_slide_20_50: also cases of real features.")
+    ] = None,
+    nist: Annotated[
+        Path | None, typer.Option(help="NIST's linear regressions, nist_strd.json; looked for with the data.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Every case and method, small: under a minute.")] = False,
+    seed: Seed = 0,
+    json: Json = None,
+) -> None:
+    """Compare exact sums with RLS, QR and plain ones on hard cases: errors in weights against the truth, and time.
+
+    The whole takes ten minutes or so.
+    """
+    with progress_bar() as progress:
+        result = run_numerics(seed=seed, quick=quick, data=data, nist=nist or find_nist(data), progress=progress)
+    cases: dict[str, Record] = {}
+    for record in result["records"]:
+        if record["family"] == "schedules":
+            say(f"{record['case']}: {record['method']}: {record['diagnosis']}")
+        else:
+            cases.setdefault(record["case"], {"case": record["case"]})[record["method"]] = record
+    columns = {"case": "{./case}"}
+    for method in dict.fromkeys(record["method"] for record in result["records"]):
+        columns[method] = f"{{?./{method}/answers_error or ./{method}/weights_error|.0e??–}}"
+    show("relative error of the answers, or where a case has none of the weights", columns, cases.values())
+    for what, why in result["not_measured"].items():
+        say(f"[yellow]not measured:[/] {what}: {why}")
+    claimed = result["claims"]
+    verdict = "stay below" if claimed["agreed"] else "[red]exceed[/]"
+    say(f"scores, novelty and ρ of the learner {verdict} {claimed['limit']:.0e}; flipped: {claimed['flipped']}")
+    write(context, result)

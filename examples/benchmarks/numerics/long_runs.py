@@ -10,11 +10,12 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from examples.benchmarks.numerics.learned import SCALE, asked, compared, follow, keep_worst, name_of, solved
-from examples.benchmarks.numerics.peers import Record, decided, error_of, new_solver, record
+from examples.benchmarks.numerics.peers import Record, decided, error_of, record
 from examples.benchmarks.numerics.peers import solved as weights_of
 from examples.benchmarks.numerics.regressions import updates
 from examples.benchmarks.numerics.truth import TrueReadout, exact_weights
 from examples.benchmarks.solvers.exact import Exact
+from examples.benchmarks.solvers.methods import SOLVERS
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
 from scroll_tactile.readouts.readout import Change
 from scroll_tactile.statistics.moments import one_thread
@@ -84,7 +85,7 @@ def run_updates(seed: int, dimension: int, most: int, methods: Sequence[str], no
     truths: dict[int, npt.NDArray[np.longdouble]] = {}
     single_rows = [(rows[i : i + 1], targets[i : i + 1]) for i in range(len(rows))]
     for method in methods:
-        solver = new_solver(method)
+        solver = SOLVERS[method]()
         with one_thread():
             solver.start(dimension, targets.shape[1], penalty)
             fed, spent = 0, 0.0
@@ -157,7 +158,7 @@ def _learned_bytes(method: str, parts: list[tuple[FloatArray, FloatArray]]) -> b
 
 def _solver_bytes(method: str, parts: list[tuple[FloatArray, FloatArray]]) -> bytes:
     """What is compared: the exact form's sums, and of the others, which keep none that are comparable, the weights."""
-    solver: RidgeBase = new_solver(method)
+    solver: RidgeBase = SOLVERS[method]()
     solver.start(parts[0][0].shape[1], parts[0][1].shape[1], 1e-6)
     for rows, targets in parts:
         solver.update(rows, targets)

@@ -18,20 +18,13 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["as_case", "decided", "error_of", "measure", "new_solver", "record", "solved"]
+__all__ = ["as_case", "decided", "error_of", "measure", "record", "solved"]
 
 FloatArray = npt.NDArray[np.float64]
 Record = dict[str, Any]
 
 MOST_IN_A_BATCH = 32
 EDGE = 2.0**BITS
-
-
-def new_solver(method: str) -> RidgeBase:
-    """A solver by name."""
-    solver = SOLVERS[method]()
-    assert isinstance(solver, RidgeBase)
-    return solver
 
 
 def as_case(memory: Memory, penalty: float) -> Case:
@@ -52,7 +45,7 @@ def measure(case: Case, method: str, seed: int) -> Record:
     Times are of the processor, not of the clock: other programs do not count.
     """
     base = record(case.name, case.family, method, len(case.rows), case.rows.shape[1], case.penalty)
-    solver = new_solver(method)
+    solver = SOLVERS[method]()
     sizes = np.random.default_rng([seed, len(case.rows)]).integers(1, MOST_IN_A_BATCH + 1, size=len(case.rows))
     cuts = np.cumsum(sizes)
     cuts = cuts[cuts < len(case.rows)]
@@ -114,7 +107,7 @@ def record(case: str, family: str, method: str, rows: int, dimension: int, penal
 def solved(solver: RidgeBase) -> tuple[FloatArray | None, str]:
     """The weights and the diagnosis; None for weights that were refused or are not numbers."""
     try:
-        weights: FloatArray = solver.weights()  # type: ignore[attr-defined]
+        weights: FloatArray = solver.weights()
     except SingularError as error:
         return None, f"refused: {error}"
     return (weights, solver.diagnosis) if np.isfinite(weights).all() else (None, solver.diagnosis or "not finite")

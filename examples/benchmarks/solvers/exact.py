@@ -104,11 +104,6 @@ class Exact(RidgeBase):
     def _take(self, x: FloatArray, y: FloatArray) -> None:
         self._moments.add(np.concatenate([np.ones((len(x), 1)), x, y], axis=1))
 
-    @property
-    def rows(self) -> int:
-        """How many rows were taken in."""
-        return self._moments.rows
-
     def settle(self) -> None:
         """Bring rows that wait into the sums."""
         self._moments.settle()
@@ -129,25 +124,20 @@ class Exact(RidgeBase):
         places = range(1, 1 + self.dimension), range(1 + self.dimension, len(units))
         return *places, np.where(units == EMPTY, 0, units)
 
-    def system(self, *, centred: bool = False) -> IntegerSystem:
-        """The normal equations as integers; `centred`: about the means of rows and targets, λ as it is."""
+    def system(self) -> IntegerSystem:
+        """The normal equations as integers."""
         x, y, units = self._settled()
         numerator, denominator = self.penalty.as_integer_ratio()
+        penalty = numerator, 1 - denominator.bit_length()
         matrix, right = self._block(x, x), self._block(x, y)
-        if centred:  # n A − c cᵀ, n B − c sᵀ and n λ are whole too
-            sums, n = self._block(x, range(1)), self.rows
-            matrix, right = matrix * n - sums * sums.transpose(), right * n - sums * self._block(range(1), y)
-            numerator *= n
-        return IntegerSystem(
-            matrix, right, units[x.start : x.stop], units[y.start : y.stop], (numerator, 1 - denominator.bit_length())
-        )
+        return IntegerSystem(matrix, right, units[x.start : x.stop], units[y.start : y.stop], penalty)
 
     def weights(self) -> FloatArray:
         """W of shape (d, C). Raises SingularError where λ = 0 and other weights fit as well."""
         return self.solve()[0]
 
-    def solve(self, *, centred: bool = False) -> tuple[FloatArray, Diagnosis]:
-        """W of shape (d, C) and what is to be said of it; of `centred` rows, so that an intercept is free of λ."""
-        weights, diagnosis = solve_exact(self.system(centred=centred))
+    def solve(self) -> tuple[FloatArray, Diagnosis]:
+        """W of shape (d, C) and what is to be said of it."""
+        weights, diagnosis = solve_exact(self.system())
         self.diagnosis = str(diagnosis)
         return weights, diagnosis

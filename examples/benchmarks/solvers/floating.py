@@ -1,6 +1,6 @@
 """Solvers of the ridge regression in floating point: what exact sums are compared with.
 
-All find W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² of rows that come in batches, through one interface (`Solver`). With A =
+All find W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² of rows that come in batches, through one interface (`RidgeBase`). With A =
 Σ x xᵀ and B = Σ x yᵀ:
 
 ================= ==================================================================================

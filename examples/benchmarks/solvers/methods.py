@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.floating import Gram64, PseudoInverseGram, RecursiveLeastSquares, SquareRoot
-from examples.benchmarks.solvers.solver_protocol import Solver
+from examples.benchmarks.solvers.solver_protocol import RidgeBase
 
 __all__ = ["SOLVERS"]
 
-SOLVERS: dict[str, type[Solver]] = {
+SOLVERS: dict[str, type[RidgeBase]] = {
     "exact": Exact,
     "square root": SquareRoot,
     "plain sums": Gram64,

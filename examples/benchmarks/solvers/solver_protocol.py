@@ -1,15 +1,13 @@
-"""What a solver of the ridge regression has to be, and the checks that all of them share."""
+"""What every solver of the ridge regression is, and the checks that all of them share."""
 
 from __future__ import annotations
-
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, ScrollTactileError
 
-__all__ = ["RidgeBase", "SingularError", "Solver"]
+__all__ = ["RidgeBase", "SingularError"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -18,30 +16,12 @@ class SingularError(ScrollTactileError, ArithmeticError):
     """The rows, with this λ, do not determine the weights, or not in this arithmetic: raise λ."""
 
 
-@runtime_checkable
-class Solver(Protocol):
-    """One way to W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² over rows x ∈ R^d with targets y ∈ R^C that come in batches."""
-
-    @property
-    def diagnosis(self) -> str:
-        """What is to be said of the weights that were asked for last; empty where nothing is wrong."""
-        ...
-
-    def start(self, dimension: int, outputs: int, penalty: float) -> None:
-        """Begin with no rows: d features, C outputs and λ ≥ 0."""
-        ...
-
-    def update(self, rows: npt.ArrayLike, targets: npt.ArrayLike) -> None:
-        """Take in rows of shape (n, d) with targets of shape (n, C)."""
-        ...
-
-    def weights(self) -> FloatArray:
-        """W of shape (d, C), of all rows so far. Raises SingularError where they and λ do not determine it."""
-        ...
-
-
 class RidgeBase:
-    """What the solvers share: d, C, λ and the checks of what comes in. A subclass adds `_begin` and `_take`."""
+    """One way to W = argmin Σ ‖y − Wᵀ x‖² + λ ‖W‖² over rows x ∈ R^d with targets y ∈ R^C that come in batches.
+
+    It has d, C, λ and the checks of what comes in; a subclass adds `_begin`, `_take` and `weights`.
+    diagnosis: what is to be said of the weights that were asked for last; empty where nothing is wrong.
+    """
 
     def __init__(self) -> None:
         self.dimension = 0
@@ -71,6 +51,10 @@ class RidgeBase:
             raise InputError(f"expected as many targets as rows; came {len(x)} rows and {len(y)} targets")
         if len(x):
             self._take(x, y)
+
+    def weights(self) -> FloatArray:
+        """W of shape (d, C), of all rows so far. Raises SingularError where they and λ do not determine it."""
+        raise NotImplementedError
 
     def settle(self) -> None:
         """Bring rows that wait into the sums; `weights` does so by itself, but whoever measures asks for it first."""

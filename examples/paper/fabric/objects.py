@@ -1,4 +1,4 @@
-"""Everyday objects under a camera: which of them it is, and what those are like that were never touched before.
+"""`fabric gelsight`: everyday objects under a camera: which it is, and what those never touched before are like.
 
 PhysiCLeAR's videos of a GelSight, each a stream of four frames in contact. Objects that are known are classified in
 folds of their videos. Attributes (hardness, roughness, texture, each of three values) are graded of objects held out:
@@ -8,40 +8,44 @@ value is a constituent that the others were described to have or not.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+import typer
 
 from examples.paper.fabric.unseen import fit_heads
-from examples.paper.readers.labelled import Recordings
+from examples.paper.readers import physiclear
+from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import data_digest, over_folds, require_folds
+from examples.paper.runs.cells import Cell, Figures, learn, over_folds, require_folds, run_cells, silent
+from examples.paper.runs.options import Data, Folds, Json, Quick, Run, Seed, Weights, folds_of, read
+from examples.paper.runs.results import show, write
 from examples.paper.runs.study import weights_digest
-from examples.paper.studies.replay import Progress
 from scroll_tactile import Embedding, Frames
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
+from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 from scroll_tactile.pipelines.metrics import accuracy
-from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.results import Composition
 from scroll_tactile.signals.contact import image_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import FRAMES, Scale
 from scroll_tactile.statistics.grid import in_units
 
-__all__ = ["COSINES", "TREES", "VALUES", "Objects", "most_often", "object_groups", "summary"]
+__all__ = ["COSINES", "TREES", "VALUES", "Objects", "gelsight", "most_often", "object_groups", "summary"]
 
 FloatArray = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
+NEW = "never touched"
 VALUES = (0, 1, 2)
 """Of every attribute."""
 COSINES = 700
@@ -84,26 +88,23 @@ class Objects:
         settings = {"groups": self.groups, "seed": self.seed, "trees": self.trees, "cosines": COSINES}
         known = {"attributes": {name: dict(answer) for name, answer in self.attributes.items()}}
         weights = None if self.weights is None else weights_digest(self.weights)
-        data = {"dataset": self.recordings.name, "data": data_digest(self.recordings)}
-        return {"run": "objects", "weights": weights} | data | settings | known
+        return {"run": "objects", "weights": weights} | settings | known
 
-    def run(self, folds: Sequence[int], progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
+    def run(self, folds: Sequence[int], progress: Progress = silent) -> Iterator[tuple[Cell, Figures]]:
         """The figures of each of these folds of videos, then of each group of objects, as they are finished.
 
         Raises InputError for a fold that is not there or where scikit-learn is missing, and what learning raises.
         """
         require_folds(self.recordings.fold, folds)
-        notes = RunFile(None if self.folder is None else self.folder / "objects.json", self.plan)
-        for by in self._embeddings:
-            for fold in folds:
-                if (name := f"{by}, fold {fold}") not in notes.notes:
-                    notes.note(name, {"part": f"known, {by}", "number": fold} | self._known(by, fold, name, progress))
-                yield notes.notes[name]
-        for i, group in enumerate(object_groups(sorted(self.attributes), self.groups, self.seed)):
-            if (name := f"group {i}") not in notes.notes:
-                result = {"part": "never touched", "number": i, "objects": group}
-                notes.note(name, result | self._unknown(group, name, progress))
-            yield notes.notes[name]
+        name = self.recordings.name
+        cells = [Cell(name, fold, f"known, {by}") for by in self._embeddings for fold in folds]
+        cells += [Cell(name, i, NEW) for i in range(self.groups)]
+        yield from run_cells(self.folder, self.plan, [self.recordings], cells, self._measure, progress)
+
+    def _measure(self, cell: Cell, progress: Progress) -> Figures:
+        if cell.system == NEW:
+            return self._unknown(object_groups(sorted(self.attributes), self.groups, self.seed)[cell.fold], progress)
+        return self._known(cell.system.removeprefix("known, "), cell.fold, progress)
 
     @cached_property
     def _names(self) -> npt.NDArray[np.str_]:
@@ -137,18 +138,13 @@ class Objects:
         image, width = image_of(self.recordings.streams[i], None), self._width
         return embed_windows(embedding, image, {width: list(range(0, image.shape[1], width))})[width]
 
-    def _trained(self, embedding: Embedding, trained: Mask, what: str, progress: Progress) -> TactileLearner:
+    def _trained(self, embedding: Embedding, tested: Mask, progress: Progress) -> TactileLearner:
         learner = TactileLearner(sensor=self.recordings.sensor, embedding=embedding, exemplars=0)
-        train = np.flatnonzero(trained).tolist()
-        for done, i in enumerate(train, start=1):
-            learner.observe(self.recordings.materials[i], self.recordings.streams[i])
-            progress(what, done, len(train))
-        return learner
+        return learn(learner, hold_out(self.recordings, tested)[0], progress)
 
-    def _known(self, by: str, fold: int, what: str, progress: Progress) -> dict[str, Any]:
-        begun = time.perf_counter()
+    def _known(self, by: str, fold: int, progress: Progress) -> Figures:
         tested = self.recordings.fold == fold
-        learner = self._trained(self._embeddings[by], ~tested, what, progress)
+        learner = self._trained(self._embeddings[by], tested, progress)
         streams = [self.recordings.streams[i] for i in np.flatnonzero(tested)]
         truth = self._names[tested].tolist()
         predicted = [learner.predict(stream) for stream in streams]
@@ -166,17 +162,16 @@ class Objects:
             "digest": learner.digest(),
         }
         if self.trees and by == "counts":  # they read nothing else
-            progress(f"{what}: trees", 0, 1)
+            progress("trees", 0, 1)
             chances, classes = self._grown(~tested, tested, self._names)
             figures["trees"] = accuracy(truth, classes[chances.mean(axis=1).argmax(axis=1)].tolist())
             graded = [most_often(answer.tolist()) for answer in classes[chances.argmax(axis=2)]]
             figures["trees' vote"] = accuracy(truth, graded)
-        return figures | {"seconds": time.perf_counter() - begun}
+        return figures
 
-    def _unknown(self, group: Sequence[str], what: str, progress: Progress) -> dict[str, Any]:
-        begun = time.perf_counter()
+    def _unknown(self, group: Sequence[str], progress: Progress) -> Figures:
         tested = np.isin(self._names, group)
-        learner = self._trained(self._waves, ~tested, what, progress)
+        learner = self._trained(self._waves, tested, progress)
         for name, values in self.attributes.items():
             if name not in group:
                 learner.describe(
@@ -199,8 +194,8 @@ class Objects:
                 "gamma": heads[key].gamma,
                 **self._baselines(key, truth, tested, progress),
             }
-        figures = {"learned": int((~tested).sum()), "tested": len(test), "attributes": graded}
-        return figures | {"digest": learner.digest(), "seconds": time.perf_counter() - begun}
+        sizes = {"learned": int((~tested).sum()), "tested": len(test)}
+        return {"objects": list(group), **sizes, "attributes": graded, "digest": learner.digest()}
 
     def _baselines(self, key: str, truth: Sequence[int], tested: Mask, progress: Progress) -> dict[str, float]:
         """Saying always what most videos of the others have; and the trees."""
@@ -236,14 +231,14 @@ def most_often(predicted: Sequence[Any]) -> Any:
     return max(sorted(set(predicted)), key=list(predicted).count)
 
 
-def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, Any]]]:
+def summary(results: Sequence[tuple[Cell, Figures]]) -> dict[str, dict[str, dict[str, Any]]]:
     """Of each kind of part: mean over its videos, and standard deviation over its folds or groups, of each figure.
 
     Figures of attributes are named as "hardness", "hardness, composed", "hardness, trees" and "hardness, always".
     """
     means: dict[str, dict[str, dict[str, float]]] = {}
-    for kind in dict.fromkeys(result["part"] for result in results):
-        answers = [(_flat(result), result["tested"]) for result in results if result["part"] == kind]
+    for kind in dict.fromkeys(cell.system for cell, _ in results):
+        answers = [(_flat(figures), figures["tested"]) for cell, figures in results if cell.system == kind]
         weights = [tested for _, tested in answers]
         for name in answers[0][0]:
             means.setdefault(kind, {})[name] = over_folds([figures[name] for figures, _ in answers], weights)
@@ -259,6 +254,35 @@ def _flat(result: Mapping[str, Any]) -> dict[str, float]:
             if what not in ("penalty", "gamma")
         }
     return figures
+
+
+def gelsight(
+    context: typer.Context,
+    data: Data,
+    weights: Weights = None,
+    folds: Folds = "all",
+    groups: Annotated[int, typer.Option(min=2, help="Objects are left out in so many groups.")] = 5,
+    seed: Seed = 0,
+    trees: Annotated[int, typer.Option(min=0, help="Of the baseline, scikit-learn's; 0: none.")] = TREES,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Classify everyday objects by a GelSight's videos, and grade how hard and rough held-out objects are."""
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        (frames,) = read("--data", "gelsight", data, seed, known=["gelsight"], quick=quick).values()
+        recordings, attributes = physiclear.videos(frames), physiclear.read_attributes(data)
+        felt = set(recordings.materials)
+        known = {name: values for name, values in attributes.items() if name in felt}
+        task = Objects(recordings, known, weights, groups, seed, trees, run)
+        results = list(task.run(folds_of(folds, recordings, quick=quick), progress))
+    means = summary(results)
+    columns = {"objects": "{./part}", "figure": "{./figure}", "right by video, %": "{./right|±}"}
+    flat = [{"part": part, "figure": name, "right": mean} for part, own in means.items() for name, mean in own.items()]
+    show("GelSight", columns, flat)
+    parts = [{"part": cell.system, "number": cell.fold} | figures for cell, figures in results]
+    write(context, task.plan | {"means": means, "parts": parts})
 
 
 def _constituent(attribute: str, value: int) -> str:

@@ -1,4 +1,4 @@
-"""Simulated fabrics under a simulated Contactile-like array, for the tests, the demo and `fabric contactile`.
+"""Simulated fabrics under a simulated Contactile-like array, for `fabric contactile`: the paper's set is not public.
 
 It is no model of any real fabric: the constituents' figures are made up, in the order in which textile handbooks put
 them, and the weaves are drawn. Nothing measured on it says how real fabrics would be classified. What it keeps of them
@@ -23,20 +23,19 @@ direction vary from touch to touch and within one, it turns back when it likes, 
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from examples.paper.readers.labelled import Recordings
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.sensors import CONTACTILE, Sensor
 from scroll_tactile.signals.stream import Stream, validate
 
-__all__ = ["CONSTITUENTS", "HAND", "LIMITS", "ROBOT", "FabricScene"]
+__all__ = ["CONSTITUENTS", "HAND", "LIMITS", "ROBOT", "FabricScene", "Fabrics"]
 
 _Floats = npt.NDArray[np.float64]
 
@@ -81,6 +80,7 @@ _PRESS, _TURN = 0.5, 3.25  # s after which the robot begins to slide, and slides
 _PITCH = 5.0  # mm from pillar to pillar
 _TIP = 0.8  # mm over which a pillar's tip averages
 _LOAD_POWER = 0.9
+_FOLDS = 5
 _NOISE, _ZERO = 0.004, 0.01  # N: of a reading, and of a touch
 # First word of every seed: a recipe, a weave, the pillars and a touch must never draw the same numbers.
 _RECIPE, _CLOTH, _PILLARS, _TOUCH = 11, 12, 13, 14
@@ -104,6 +104,18 @@ class _Path:
     way: _Floats
     force: _Floats
     tilt: _Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Fabrics:
+    """recordings: of N touches. protocol: ROBOT or HAND, int of shape (N,).
+
+    compositions: of each fabric, constituent → share by mass; those that are not named are absent.
+    """
+
+    recordings: Recordings
+    protocol: npt.NDArray[np.int64]
+    compositions: dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -155,30 +167,25 @@ class FabricScene:
         forces = _slide(cloth, path, times, random, _loads(self.seed))
         return validate(np.clip(forces.astype(np.float32), *LIMITS), self.sensor)
 
-    def write(self, folder: Path, robot: int = 40, hand: int = 10) -> None:
-        """Write it as a data set that `contactile.load` reads, one .npy a touch, with LIMITS as its limits.
-
-        folder: made where it is not there. robot, hand: touches of each fabric under either protocol.
-
-        Raises InputError for a folder that holds something already, or cannot be written.
-        """
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if any(folder.iterdir()):
-                raise InputError(f"expected an empty folder to write simulated fabrics into; {folder} holds something")
-            with (folder / "compositions.csv").open("w", encoding="utf-8", newline="") as file:
-                rows = csv.writer(file, lineterminator="\n")
-                rows.writerow(["fabric", *CONSTITUENTS])
-                for name, shares in self.compositions.items():
-                    rows.writerow([name, *(f"{100 * shares.get(constituent, 0):g}" for constituent in CONSTITUENTS)])
-            for protocol, count in ((ROBOT, robot), (HAND, hand)):
-                for name in self.fabrics:
-                    own = folder / f"protocol{protocol}" / name
-                    own.mkdir(parents=True)
-                    for repetition in range(count):
-                        np.save(own / f"{repetition:02d}.npy", self.touch(name, protocol, repetition).readings)
-        except OSError as error:
-            raise InputError(f"simulated fabrics cannot be written into {folder}: {error.strerror}") from error
+    def touched(self, robot: int = 40, hand: int = 10) -> Fabrics:
+        """So many touches of each fabric under either protocol; the scene's seed deals them into five folds."""
+        counts = {ROBOT: robot, HAND: hand}
+        marks = [(name, side, i) for name in self.fabrics for side, count in counts.items() for i in range(count)]
+        folds = [
+            np.random.default_rng([self.seed, place, side]).permutation(np.arange(count) % _FOLDS)
+            for place in range(self.count)
+            for side, count in counts.items()
+        ]
+        recordings = Recordings(
+            name="simulated fabrics",
+            sensor=self.sensor,
+            streams=[self.touch(*mark) for mark in marks],
+            materials=[name for name, *_ in marks],
+            repetition=np.array([i for *_, i in marks]),
+            fold=np.concatenate(folds),
+            ordered=False,
+        )
+        return Fabrics(recordings, np.array([side for _, side, _ in marks]), self.compositions)
 
 
 def _recipe(seed: int, i: int) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """What every reader of a data set returns."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -9,7 +10,7 @@ from scroll_tactile.errors import DatasetError, InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["Recordings", "hold_out"]
+__all__ = ["Recordings", "chosen", "hold_out", "thinned"]
 
 _BLOCK = 10  # repetitions in a block: a fifth of 50
 
@@ -71,3 +72,26 @@ def hold_out(
     touches = list(zip(recordings.materials, recordings.streams, tested.tolist(), strict=True))
     learned = [(name, stream) for name, stream, out in touches if not out]
     return learned, [(name, stream) for name, stream, out in touches if out]
+
+
+def chosen(recordings: Recordings, places: Sequence[int]) -> Recordings:
+    """The recordings at some places, in this order."""
+    return replace(
+        recordings,
+        streams=[recordings.streams[i] for i in places],
+        materials=[recordings.materials[i] for i in places],
+        repetition=recordings.repetition[places],
+        fold=recordings.fold[places],
+    )
+
+
+def thinned(recordings: Recordings, every: int) -> Recordings:
+    """One of so many recordings of each material in each fold, for a look; frames of a video stay together."""
+    marks = list(zip(recordings.materials, recordings.fold.tolist(), recordings.repetition.tolist(), strict=True))
+    numbers: dict[tuple[str, int], list[int]] = {}
+    for material, fold, repetition in dict.fromkeys(marks):
+        numbers.setdefault((material, fold), []).append(repetition)
+    return chosen(
+        recordings,
+        [i for i, (material, fold, number) in enumerate(marks) if number in numbers[material, fold][::every]],
+    )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from hashlib import blake2b
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,6 +17,7 @@ import numpy.typing as npt
 from examples.paper.readers.labelled import Recordings
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
+from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
@@ -24,18 +28,21 @@ __all__ = [
     "Split",
     "data_digest",
     "held_back",
+    "learn",
     "mean_curve",
     "over_folds",
     "pooled",
-    "require_data",
     "require_folds",
     "run_cells",
+    "silent",
     "split",
-    "thinned",
-    "time_left",
 ]
 
 Figures = dict[str, Any]
+
+
+def silent(what: str, done: int, of: int) -> None:
+    """Progress that is reported to nobody."""
 
 
 @dataclass(frozen=True)
@@ -119,35 +126,34 @@ def split(recordings: Recordings, fold: int, seed: int, *, every: int = 1, share
     )
 
 
-def thinned(recordings: Recordings, every: int) -> Recordings:
-    """One of so many recordings of each material in each fold, for a look; frames of a video stay together."""
-    marks = list(zip(recordings.materials, recordings.fold.tolist(), recordings.repetition.tolist(), strict=True))
-    numbers: dict[tuple[str, int], list[int]] = {}
-    for material, fold, repetition in dict.fromkeys(marks):
-        numbers.setdefault((material, fold), []).append(repetition)
-    kept = [i for i, (material, fold, number) in enumerate(marks) if number in numbers[material, fold][::every]]
-    return replace(
-        recordings,
-        streams=[recordings.streams[i] for i in kept],
-        materials=[recordings.materials[i] for i in kept],
-        repetition=recordings.repetition[kept],
-        fold=recordings.fold[kept],
-    )
-
-
 def held_back(count: int, share: float = 0.1) -> int:
     """How many of so many recordings of a material go to the validation: at least one where there are three."""
     return max(int(count >= 3), round(share * count))
 
 
 def run_cells(
-    notes: RunFile, cells: Sequence[Cell], measure: Callable[[Cell, Progress], Figures], progress: Progress
+    folder: Path | None,
+    plan: Mapping[str, Any],
+    sets: Sequence[Recordings],
+    cells: Sequence[Cell],
+    measure: Callable[[Cell, Progress], Figures],
+    progress: Progress = silent,
+    also: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[tuple[Cell, Figures]]:
     """The figures of each cell in turn: read back where it was finished, else measured and noted at once.
 
-    progress: receives the cells done, the time left, and what the cell in hand is doing. A run that is killed loses the
-    cell in hand. Raises what `measure` raises, and InputError where the notes cannot be written.
+    folder: of the notes, or None. plan: all that each figure depends on beside the data, in JSON's types; its "run"
+    names the file. sets: of the data. also: what else cells depend on, by name, where more can be added later.
+    progress: receives the cells done, the time left, and what the cell in hand is doing. A run that is killed loses
+    the cell in hand.
+
+    Raises InputError for a folder of another run or of other data, and what `measure` raises.
     """
+    notes = RunFile(None if folder is None else folder / f"{plan['run'].replace(' ', '-')}.json", plan)
+    for name, mark in (
+        {f"recordings or folds of {item.name}": data_digest(item) for item in sets} | dict(also)
+    ).items():
+        _require_same(notes, name, json.loads(json.dumps(mark)))
     for number, cell in enumerate(cells):
         if cell.key not in notes.notes:
             done = {other: notes.notes[other.key]["seconds"] for other in cells if other.key in notes.notes}
@@ -180,6 +186,16 @@ def time_left(seconds: Mapping[Cell, float], ahead: Sequence[Cell]) -> str:
     return f", about {total / 60:.0f} min left" if total >= 90 else f", about {total:.0f} s left"
 
 
+def learn(
+    learner: TactileLearner, touches: Sequence[Labelled], progress: Progress = silent, what: str = "learning"
+) -> TactileLearner:
+    """The learner, when it has observed these touches."""
+    for done, (material, stream) in enumerate(touches, start=1):
+        learner.observe(material, stream)
+        progress(what, done, len(touches))
+    return learner
+
+
 def data_digest(recordings: Recordings) -> str:
     """16 hex digits of a hash over all streams, materials and folds."""
     digest = blake2b(digest_size=8)
@@ -195,13 +211,11 @@ def require_folds(fold: npt.NDArray[np.intp], folds: Sequence[int]) -> None:
         raise InputError(f"expected folds out of {there}; came {list(folds)}")
 
 
-def require_data(notes: RunFile, recordings: Recordings) -> None:
-    """Note which data a run measures. Raises InputError where it began with other data of that name."""
-    key, digest = f"data of {recordings.name}", data_digest(recordings)
-    if notes.notes.setdefault(key, digest) != digest:
+def _require_same(notes: RunFile, name: str, mark: Any) -> None:
+    if notes.notes.setdefault(name, mark) != mark:
         raise InputError(
-            f"the run in {notes.path} was begun on other recordings or folds of {recordings.name} "
-            f"({notes.notes[key]} there, {digest} here). Give the same data, or take another folder"
+            f"the run in {notes.path} was begun with other {name} ({notes.notes[name]} there, {mark} here). Give the "
+            "same, or take another folder"
         )
 
 

@@ -1,4 +1,4 @@
-"""What the studies of the paper's systems share: what is measured on what, and where it is written down."""
+"""What the studies of the paper's systems share: what is measured on what, where it is noted, and their commands."""
 
 from __future__ import annotations
 
@@ -7,22 +7,47 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from examples.paper.readers.labelled import Recordings
-from examples.paper.runs.cells import Cell, Figures, Split, require_data, run_cells, split
-from examples.paper.systems.catalogue import CONTROLS, NEED_WEIGHTS, SYSTEMS, Catalogue
-from examples.paper.systems.descent import Course, Precision
+from examples.paper.runs.cells import Cell, Figures, Split, run_cells, silent, split
+from examples.paper.runs.options import leave_out, named
+from examples.paper.runs.results import write
+from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, NEED_WEIGHTS, SYSTEMS, Catalogue, library_of, name_of
+from examples.paper.systems.descent import Course
 from examples.paper.systems.own import code_digest, is_own, require_own
 from examples.paper.systems.system_protocol import System
 from examples.paper.systems.trained import require_device
+from scroll_tactile.cli.terminal import say
 from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["NOT_OF_FRAMES", "SystemStudy", "columns_averaged", "require_code", "weights_digest"]
+__all__ = [
+    "NOT_OF_FRAMES",
+    "OwnEmbeddings",
+    "OwnSystems",
+    "SystemStudy",
+    "Systems",
+    "choose_systems",
+    "close",
+    "columns_averaged",
+    "say_conditions",
+    "sensors_of",
+    "systems_of",
+    "weights_digest",
+]
+
+Systems = Annotated[str | None, typer.Option(help=f"Which systems, of {', '.join(SYSTEMS)}.")]
+OwnSystems = Annotated[
+    list[str] | None, typer.Option("--system", help="One's own, as module:factory, see examples/own_system.py; again.")
+]
+OwnEmbeddings = Annotated[
+    list[str] | None, typer.Option("--embedding", help="Ours on an embedding of one's own, as module:factory; again.")
+]
 
 _OF_STREAMS = ("svm", "svm-spikes", "conv-lstm", "snn", "kernels+vision-ridge", "kernels+vision-lda", "conv1d-lda")
 NOT_OF_FRAMES = (*_OF_STREAMS, *CONTROLS)
@@ -54,7 +79,7 @@ class SystemStudy:
     seed: int = 0
     quick: bool = False
     folder: Path | None = None
-    precision: Precision = "float32"
+    precision: str = "float32"
 
     name = "study"
 
@@ -97,22 +122,16 @@ class SystemStudy:
             if not (item.sensor.camera and key in NOT_OF_FRAMES)
         ]
 
-    def run(
-        self, folds: Mapping[str, Sequence[int]], progress: Progress = lambda what, done, of: None
-    ) -> Iterator[tuple[Cell, Figures]]:
+    def run(self, folds: Mapping[str, Sequence[int]], progress: Progress = silent) -> Iterator[tuple[Cell, Figures]]:
         """The figures of each cell as it is finished; those finished before are read back.
 
         Raises InputError for a folder of another run or folds that are not there, and what the systems raise.
         """
-        notes = RunFile(None if self.folder is None else self.folder / f"{self.name}.json", self.plan)
-        cells = self.cells(folds)
-        for key in filter(is_own, self.systems):
-            require_code(notes, key)
         for item in self.sets:
-            require_data(notes, item)
             for fold in folds[item.name]:
                 split(item, fold, self.seed)  # what is refused is refused before anything is measured
-        yield from run_cells(notes, cells, self._measure, progress)
+        code = {f"the file of {key}": code_digest(key) for key in filter(is_own, self.systems)}
+        yield from run_cells(self.folder, self.plan, self.sets, self.cells(folds), self._measure, progress, code)
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         raise NotImplementedError
@@ -139,14 +158,6 @@ class SystemStudy:
         return Catalogue(*made, channels=sensor.channels, camera=sensor.camera)
 
 
-def require_code(notes: RunFile, key: str) -> None:
-    """Note which file a system of one's own lies in. Raises InputError where the run began with another."""
-    if notes.notes.setdefault(f"code of {key}", digest := code_digest(key)) != digest:
-        raise InputError(
-            f"the run in {notes.path} was begun with another {key}: its file has changed. Take another folder"
-        )
-
-
 def columns_averaged(sensor: Sensor) -> int:
     """How many columns of a sensor's images are averaged in a quick run, so that about QUICK_COLUMNS are left."""
     columns = sensor.shape[1] if sensor.camera else sensor.readings
@@ -166,3 +177,62 @@ def weights_digest(weights: str) -> str:
             f"expected weights: a file, or a published name out of {sorted(PUBLISHED)}; there is no file {path}"
         )
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def choose_systems(
+    asked: str | None,
+    usual: Sequence[str],
+    weights: str | None,
+    own_systems: Sequence[str] | None,
+    own_embeddings: Sequence[str] | None,
+) -> tuple[str, ...]:
+    """The systems of --systems, and one's own; without either all that can be made, and a word on the others.
+
+    One's own may stand among --systems, too. Raises InputError for systems that there are not.
+    """
+    parts = [] if asked is None else [part.strip() for part in asked.split(",")]
+    own = [*filter(is_own, parts), *(own_systems or ()), *(f"{spelled}-lda" for spelled in own_embeddings or ())]
+    others = [part for part in parts if not is_own(part)]
+    keys = (*(named("--systems", ",".join(others), usual) if others else ()), *own)
+    for key in own:
+        require_own(key)
+    if keys:
+        return tuple(dict.fromkeys(keys))
+    return tuple(usual) if weights is not None else leave_out(usual, NEED_WEIGHTS, "--weights")
+
+
+def say_conditions(keys: Sequence[str], epochs: int, device: str, precision: str, *, quick: bool) -> None:
+    """What the figures have to be read with."""
+    if any(key in EPOCHAL for key in keys):
+        short = "" if epochs >= 100 else " where the paper has 100"
+        say(f"networks: {epochs} epochs{short}, on {device}, ResNets in {precision}; a tenth learned is the validation")
+    if quick:
+        say(
+            "[yellow]quick:[/] every fifth touch, in training and test; ResNets' images averaged to about 50 columns: "
+            "for a look, not for a report"
+        )
+
+
+def systems_of(keys: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Key → name and library of each system; the libraries' versions stand in what `circumstances` notes."""
+    return {key: {"name": name_of(key), "library": library_of(key)} for key in keys}
+
+
+def sensors_of(sets: Sequence[Recordings]) -> dict[str, Any]:
+    """Set → its sensor, as results keep it."""
+    return {recordings.name: recordings.sensor.model_dump(mode="json") for recordings in sets}
+
+
+def close(
+    context: typer.Context, study: SystemStudy, results: Sequence[tuple[Cell, Figures]], found: Mapping[str, Any]
+) -> None:
+    """Say what figures have to be read with, and folds of unequal size, and write the result."""
+    say_conditions(study.systems, study.epochs, study.device, study.precision, quick=study.quick)
+    for recordings in study.sets:
+        sizes = {cell.fold: figures["tested"] for cell, figures in results if cell.dataset == recordings.name}
+        if len(set(sizes.values())) > 1:
+            listed = ", ".join(map(str, sizes.values()))
+            say(f"{recordings.name}: folds of unequal size, {listed}: every touch counts the same")
+    about = study.plan | {"systems": systems_of(study.systems), "seconds": sum(f["seconds"] for _, f in results)}
+    cells = {cell.key: figures for cell, figures in results}
+    write(context, about | {"sensors": sensors_of(study.sets), **found, "cells": cells})

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from examples.paper.runs.cells import held_back
-from examples.paper.studies.strengths_study import Make, Progress
 from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, OURS, SYSTEMS, Catalogue
 from examples.paper.systems.own import code_digest, is_own
 from examples.paper.systems.system_protocol import System
 from scroll_tactile.errors import InputError
+from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.signals.augmentation import Augmentation, Change
+
+if TYPE_CHECKING:
+    from examples.paper.studies.strengths import Make
 
 __all__ = ["BASELINES", "COPIES", "STRONG", "Sometimes", "baseline"]
 

@@ -17,11 +17,11 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from examples.paper.runs.cells import Figures
-from examples.paper.studies.replay import Progress
+from examples.paper.runs.cells import Figures, learn
 from examples.paper.systems.descent import seeded
 from scroll_tactile import Embedding
 from scroll_tactile.errors import InputError
+from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled
 from scroll_tactile.pipelines.metrics import accuracy
@@ -36,7 +36,7 @@ Part = tuple[torch.Tensor, torch.Tensor]
 
 HIDDEN = 128
 RATE = 1.0  # of 0.3, 1, 3, 10 the best for one robot that has everything, on the tests of fold 0: in their favour
-PLANS = {"1 round": (1, 40), "5 rounds": (5, 8), "20 rounds": (20, 2)}
+PLANS = {"1 round": (1, 40), "20 rounds": (20, 2)}
 """How often the networks are averaged, and epochs on each robot between, 40 in all; the first is one-shot averaging."""
 
 
@@ -140,9 +140,7 @@ class Fleet:
     def _one_robot(self) -> tuple[str, list[Prediction]]:
         """The digest and the answers of one robot that felt everything, in the order of the set."""
         learner = TactileLearner(sensor=self._sensor, embedding=self._embedding, exemplars=0)
-        for material, stream in self._train:
-            learner.observe(material, stream)
-        return learner.digest(), self._answers(learner)
+        return learn(learner, self._train).digest(), self._answers(learner)
 
     def _answers(self, learner: TactileLearner) -> list[Prediction]:
         learner.settle()
@@ -156,8 +154,7 @@ class Fleet:
                 for done, own in enumerate(dealt):
                     progress("robots", done, len(dealt))
                     with self._open(folder / "robot") as robot:
-                        for i in own:
-                            robot.observe(*self._train[i])
+                        learn(robot, [self._train[i] for i in own])
                     joint.merge(folder / "robot", shared="once")
                     shutil.rmtree(folder / "robot")
                 return joint.digest(), self._answers(joint)

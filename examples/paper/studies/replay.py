@@ -1,40 +1,39 @@
-"""Replays of recorded sets: learned in one pass by a schedule, fold by fold, and tested on what was held out."""
+"""`replay`: a recorded set learned in one pass, fold by fold, and tested on what was held out."""
 
 from __future__ import annotations
 
-import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import count
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from examples.paper.readers.labelled import Recordings, hold_out
-from examples.paper.runs.cells import over_folds, require_folds
-from examples.paper.studies.schedules import ScheduleName, arrange
-from scroll_tactile import Kernels
-from scroll_tactile.errors import InputError
+from examples.paper.runs.cells import Cell, Figures, learn, over_folds, require_folds, run_cells, silent
+from examples.paper.runs.options import Data, Dataset, Folds, Json, Quick, Run, Seed, folds_of, read
+from examples.paper.runs.results import show, write
+from examples.paper.runs.study import sensors_of
+from examples.paper.studies.schedules import SCHEDULES, arrange
+from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate, observe_all
+from scroll_tactile.pipelines.classification import Answers, Labelled, evaluate
 from scroll_tactile.pipelines.metrics import calibration_error
-from scroll_tactile.pipelines.runfile import RunFile
-from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.settings import Settings
 
-__all__ = ["FIGURES", "PUBLISHED", "Progress", "Replay", "novelty_area", "rotations", "subset", "summary"]
-
-Progress = Callable[[str, int, int], object]
-"""Receives (what is being done, steps done, steps in all)."""
+__all__ = ["FIGURES", "PUBLISHED", "Replay", "novelty_area", "replay", "rotations", "summary"]
 
 FIGURES = ("accuracy", "first", "half", "twice", "calibration_error", "false_alarms", "wrong_known", "novelty_auroc")
 """Of each fold: accuracy after the last material; from the first 0.3 s; of half streams after learning full ones;
 of full streams after learning half ones; expected calibration error; the shares of known touches called unknown,
 and of touches taken for another material and called known; AUROC of novelty with a fifth of the materials held out."""
 
-PUBLISHED = {"BioTac-20": (0.938, 0.989), "RoboSkin-20": (0.848, 0.960)}
+PUBLISHED = {
+    name: {"ridge on a frozen vision model": ridge, "ResNet fine-tuned offline": tuned}
+    for name, ridge, tuned in (("BioTac-20", 0.938, 0.989), ("RoboSkin-20", 0.848, 0.960))
+}
 """The paper's accuracies: ridge on its frozen vision model, and a pre-trained ResNet fine-tuned offline."""
 
 _FIRST = 0.3  # seconds
@@ -46,136 +45,77 @@ class Replay:
     """What to replay and how.
 
     recordings: the streams. schedule, seed: see `arrange`; the seed draws the order. readout: "lda" or "ridge".
-    blocked: folds of successive repetitions, instead of the published or drawn ones.
     novelty: whether to measure the AUROC of novelty, which learns every fold five times more.
-    features: of the embedding.
-    folder: where each fold's memory and finished figures are kept, so that an interrupted run resumes; or None.
-
-    Raises DatasetError where there are no blocked folds.
+    folder: where finished folds are noted, so that an interrupted run resumes; or None.
     """
 
     recordings: Recordings
-    schedule: ScheduleName = "class-by-class"
+    schedule: str = "class-by-class"
     seed: int = 0
-    readout: ReadoutName = "lda"
-    blocked: bool = False
+    readout: str = "lda"
     novelty: bool = False
-    features: int = 1008
     folder: Path | None = None
 
     @property
     def plan(self) -> dict[str, Any]:
         """All that the figures depend on, in JSON's types."""
-        options = ("schedule", "seed", "readout", "blocked", "novelty", "features")
+        options = {name: getattr(self, name) for name in ("schedule", "seed", "readout", "novelty")}
         asked = {"false_alarms_asked": Settings().false_alarms}
-        size = {"streams": len(self.recordings), "materials": len(set(self.recordings.materials))}
-        return {"run": "replay", "dataset": self.recordings.name, **size, **asked} | {
-            name: getattr(self, name) for name in options
-        }
+        return {"run": "replay", "dataset": self.recordings.name, **asked, **options}
 
-    def run(self, folds: Sequence[int], progress: Progress = lambda what, done, of: None) -> Iterator[dict[str, Any]]:
+    def run(self, folds: Sequence[int], progress: Progress = silent) -> Iterator[tuple[Cell, Figures]]:
         """The figures of each fold in turn, as they are finished; those finished before are read back.
 
         Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
         """
-        places = self.recordings.blocked() if self.blocked else self.recordings.fold
-        require_folds(places, folds)
-        notes = RunFile(None if self.folder is None else self.folder / "replay.json", self.plan)
-        for fold in folds:
-            name = f"fold-{fold}"
-            if "digest" not in notes.notes.get(name, {}):
-                notes.note(name, _ReplayFold(self, fold, places == fold, progress).run())
-            yield notes.notes[name]
+        require_folds(self.recordings.fold, folds)
+        cells = [Cell(self.recordings.name, fold, "one pass") for fold in folds]
+        yield from run_cells(self.folder, self.plan, [self.recordings], cells, self._measure, progress)
 
-
-class _ReplayFold:
-    """One fold: what is learned, what is tested, and the figures that come of it."""
-
-    def __init__(self, replay: Replay, number: int, tested: np.ndarray, progress: Progress) -> None:
-        self.replay = replay
-        self.number = number
-        self.progress = progress
-        recordings = replay.recordings
-        trained, self.test = hold_out(recordings, tested)
-        order = arrange(replay.schedule, [name for name, _ in trained], replay.seed)
-        self.train = [trained[i] for i in order]
-
-    def run(self) -> dict[str, Any]:
-        begun = time.perf_counter()
-        folder = self.replay.folder
-        with self._learner(None if folder is None else folder / f"fold-{self.number}") as learner:
-            done = count(1)
-            observe_all(learner, self.train, lambda: self.progress("learning", next(done), len(self.train)))
-            figures = self._figures(learner)
-            digest = learner.digest()
-        figures["twice"] = self._twice()
-        figures["novelty_auroc"] = self._novelty() if self.replay.novelty else None
+    def _measure(self, cell: Cell, progress: Progress) -> Figures:
+        trained, test = hold_out(self.recordings, self.recordings.fold == cell.fold)
+        train = [trained[i] for i in arrange(self.schedule, [name for name, _ in trained], self.seed)]
+        learner = learn(self._learner(), train, progress)
+        whole = evaluate(learner, test)
+        answers = [*zip(whole.truth, whole.predictions, strict=True)]
+        # The same touches learned in another order, all at random, as offline training has them.
+        order = np.random.default_rng([self.seed, 1]).permutation(len(train))
+        offline = learn(self._learner(), [train[i] for i in order], progress, "learning offline")
+        halves = learn(self._learner(), _halved(train), progress, "learning halves")
         return {
-            "fold": self.number,
-            "learned": len(self.train),
-            "tested": len(self.test),
-            "tested_of": dict(Counter(name for name, _ in self.test)),
-            **{name: figures[name] for name in (*FIGURES, "confusions")},
-            "equals_offline": self._offline() == digest,
-            "digest": digest,
-            "seconds": time.perf_counter() - begun,
-        }
-
-    def _learner(self, path: Path | None = None) -> TactileLearner:
-        sensor, readout = self.replay.recordings.sensor, self.replay.readout
-        embedding = Kernels(dimension=self.replay.features)
-        if path is None:
-            return TactileLearner(sensor=sensor, embedding=embedding, readout=readout)
-        return TactileLearner.open(path, sensor=sensor, embedding=embedding, readout=readout)
-
-    def _figures(self, learner: TactileLearner) -> dict[str, Any]:
-        self.progress("testing", 0, 3)
-        whole = evaluate(learner, self.test)
-        self.progress("testing", 1, 3)
-        first = evaluate(learner, self.test, seconds=_FIRST)
-        self.progress("testing", 2, 3)
-        half = evaluate(learner, [(name, stream.first(stream.seconds / 2)) for name, stream in self.test])
-        self.progress("testing", 3, 3)
-        answers = zip(whole.truth, whole.predictions, strict=True)
-        return {
+            "fold": cell.fold,
+            "learned": len(train),
+            "tested": len(test),
             "accuracy": whole.accuracy,
-            "first": first.accuracy,
-            "half": half.accuracy,
+            "first": evaluate(learner, test, seconds=_FIRST).accuracy,
+            "half": evaluate(learner, _halved(test)).accuracy,
+            "twice": evaluate(halves, test).accuracy,
             "calibration_error": _calibration_error(whole),
             "false_alarms": float(np.mean([prediction.known is False for prediction in whole.predictions])),
             "wrong_known": float(np.mean([one.known is not False and one.material != name for name, one in answers])),
+            "novelty_auroc": self._novelty(train, test, progress) if self.novelty else None,
             "confusions": whole.confusions(),
+            "equals_offline": offline.digest() == learner.digest(),
+            "digest": learner.digest(),
         }
 
-    def _twice(self) -> float:
-        learner = self._learner()
-        shorter = [(name, stream.first(stream.seconds / 2)) for name, stream in self.train]
-        self._train(learner, shorter, "learning halves")
-        return evaluate(learner, self.test).accuracy
+    def _learner(self) -> TactileLearner:
+        readout: Any = self.readout
+        return TactileLearner(sensor=self.recordings.sensor, readout=readout)
 
-    def _offline(self) -> str:
-        """The digest of the same touches learned in another order, all at random: offline training's."""
-        learner = self._learner()
-        order = np.random.default_rng([self.replay.seed, 1]).permutation(len(self.train))
-        self._train(learner, [self.train[i] for i in order], "learning offline")
-        return learner.digest()
-
-    def _novelty(self) -> float:
+    def _novelty(self, train: Sequence[Labelled], test: Sequence[Labelled], progress: Progress) -> float:
         """Mean AUROC over five rotations, a fifth of the materials held out in each. Needs scikit-learn."""
         areas = []
-        for rotation, out in enumerate(rotations([name for name, _ in self.train])):
-            learner = self._learner()
-            train = [touch for touch in self.train if touch[0] not in out]
-            self._train(learner, train, f"novelty {rotation + 1}/{_ROTATIONS}")
-            answers = evaluate(learner, self.test)
+        for rotation, out in enumerate(rotations([name for name, _ in train]), start=1):
+            known = [touch for touch in train if touch[0] not in out]
+            answers = evaluate(learn(self._learner(), known, progress, f"novelty {rotation}/{_ROTATIONS}"), test)
             novelty = [prediction.novelty for prediction in answers.predictions]
             areas.append(novelty_area(novelty, [name in out for name in answers.truth]))
         return float(np.mean(areas))
 
-    def _train(self, learner: TactileLearner, touches: Sequence[Labelled], what: str) -> None:
-        for done, (name, stream) in enumerate(touches):
-            learner.observe(name, stream)
-            self.progress(what, done + 1, len(touches))
+
+def _halved(touches: Sequence[Labelled]) -> list[Labelled]:
+    return [(name, stream.first(stream.seconds / 2)) for name, stream in touches]
 
 
 def rotations(materials: Iterable[str]) -> list[set[str]]:
@@ -212,21 +152,41 @@ def summary(folds: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     return means
 
 
-def subset(recordings: Recordings, materials: int) -> Recordings:
-    """The recordings of the first few materials only.
+def replay(
+    context: typer.Context,
+    dataset: Dataset,
+    data: Data,
+    schedule: Annotated[str, typer.Option(help=f"The order of learning, {' or '.join(SCHEDULES)}.")] = SCHEDULES[0],
+    seed: Seed = 0,
+    folds: Folds = "all",
+    readout: Annotated[str, typer.Option(help="How materials are classified: lda or ridge.")] = "lda",
+    blocked: Annotated[
+        bool, typer.Option("--blocked", help="Folds of successive repetitions (BioTac only): a harder test.")
+    ] = False,
+    novelty: Annotated[
+        bool, typer.Option("--novelty", help="Also hold out 4 of 20 materials, five times over. Slower.")
+    ] = False,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Learn a recorded set in one pass, fold by fold, and test it on what was held out.
 
-    Raises InputError for fewer than two, or more than there are.
+    Nothing is revisited. Afterwards the same touches are learned in another order: the memory must be the same to
+    the bit, so that learning one by one loses nothing against training on everything at once.
     """
-    names = list(dict.fromkeys(recordings.materials))
-    if not 2 <= materials <= len(names):
-        raise InputError(f"expected 2 to {len(names)} materials; came {materials}")
-    kept = [i for i, name in enumerate(recordings.materials) if name in set(names[:materials])]
-    return Recordings(
-        name=recordings.name,
-        sensor=recordings.sensor,
-        streams=[recordings.streams[i] for i in kept],
-        materials=[recordings.materials[i] for i in kept],
-        repetition=recordings.repetition[kept],
-        fold=recordings.fold[kept],
-        ordered=recordings.ordered,
-    )
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        (recordings,) = read("DATASET", dataset, data, seed, quick=quick).values()
+        if blocked:
+            recordings = replace(recordings, fold=recordings.blocked())
+        task = Replay(recordings, schedule, seed, readout, novelty, folder=run)
+        found = [figures for _, figures in task.run(folds_of(folds, recordings, quick=quick), progress)]
+    means = summary(found)
+    rows = [{"figure": name, "mean": means[name]} for name in FIGURES if name in means]
+    published = PUBLISHED.get(recordings.name, {}).items()
+    rows += [{"figure": f"published: {name}", "mean": {"mean": share, "sd": None}} for name, share in published]
+    show(f"{recordings.name}, one pass", {"figure": "{./figure}", "%, folds' mean": "{./mean|±}"}, rows)
+    columns = {"fold": "{./fold}", "right, %": "{./accuracy|%}", "tested": "{./tested}", "learned": "{./learned}"}
+    show("folds", columns | {"equals offline": "{./equals_offline}", "digest": "{./digest}"}, found)
+    write(context, task.plan | {"sensor": sensors_of([recordings])[recordings.name], "means": means, "folds": found})

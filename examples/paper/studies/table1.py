@@ -1,21 +1,40 @@
-"""The paper's Table I: every system on every data set, fold by fold, with the paper's figures beside ours."""
+"""`table1`: every system on every data set, fold by fold, with the paper's figures beside ours."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
-from examples.paper.readers.labelled import Recordings
+import typer
+
 from examples.paper.runs.cells import Cell, Figures, mean_curve, pooled
-from examples.paper.runs.study import SystemStudy
+from examples.paper.runs.options import (
+    QUICK_EPOCHS,
+    Data,
+    Device,
+    Epochs,
+    Folds,
+    InPrecision,
+    Json,
+    Quick,
+    Run,
+    Seed,
+    Weights,
+    folds_of,
+    read,
+)
+from examples.paper.runs.results import show
+from examples.paper.runs.study import OwnEmbeddings, OwnSystems, Systems, SystemStudy, choose_systems, close
 from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import TrainedNetwork
+from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import accuracy
 
-__all__ = ["PAPER", "Table1", "blocked", "rows", "without_losses"]
+__all__ = ["PAPER", "Table1", "rows", "table1"]
+
+OF_TABLE1 = ("biotac-20", "biotac-20-blocked", "roboskin-20", "roboskin-20-unmixed", "gelsight")
 
 PAPER: dict[str, dict[str, float]] = {
     "svm": {"BioTac-20": 0.942, "RoboSkin-20": 0.505},
@@ -109,13 +128,50 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     return found
 
 
-def without_losses(figures: Figures) -> Figures:
+def table1(
+    context: typer.Context,
+    data: Data,
+    weights: Weights = None,
+    sets: Annotated[str, typer.Option(help=f"Which data sets, of {', '.join(OF_TABLE1)}.")] = ",".join(OF_TABLE1),
+    systems: Systems = None,
+    own_systems: OwnSystems = None,
+    own_embeddings: OwnEmbeddings = None,
+    folds: Folds = "all",
+    epochs: Epochs = None,
+    device: Device = "cpu",
+    precision: InPrecision = "float32",
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+) -> None:
+    """Table I: every system on every data set, with the paper's figure beside ours and the difference.
+
+    100 epochs, five folds: hours on a GPU, days without. --systems and --folds take parts of it, --run adds them up.
+    """
+    keys = choose_systems(systems, tuple(SYSTEMS), weights, own_systems, own_embeddings)
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        found = [*read("--sets", sets, data, seed, known=OF_TABLE1, quick=quick).values()]
+        few = epochs or (QUICK_EPOCHS if quick else 100)
+        study = Table1(found, keys, weights, few, device, seed, quick, run, precision)
+        results = list(study.run({item.name: folds_of(folds, item, quick=quick) for item in found}, progress))
+    columns = {
+        "system": "{./system}",
+        "paper": "{?./paper|%}",
+        "here, %": "{./here|±}",
+        "apart": "{?./difference|*100|+.1f}",
+    }
+    columns |= {"of recordings": "{?./here/vote|%}", "folds": "{./here/folds}", "seconds": "{./here/seconds|.0f}"}
+    table = rows(results)
+    for name in (item.name for item in found):
+        own = [(row, row["sets"][name]) for row in table if name in row["sets"]]
+        show(name, columns, [figures | {"system": row["system"], "here": figures} for row, figures in own])
+    close(context, study, [(cell, _without_losses(figures)) for cell, figures in results], {"rows": table})
+
+
+def _without_losses(figures: Figures) -> Figures:
     """The figures of a cell as a result keeps them: of each epoch the accuracy only, which are most of the file."""
     if "epochs" not in figures:
         return figures
     return figures | {"epochs": [epoch["accuracy"] for epoch in figures["epochs"]]}
-
-
-def blocked(recordings: Recordings) -> Recordings:
-    """The same recordings in folds of successive repetitions, named so. Raises DatasetError where there are none."""
-    return replace(recordings, name=f"{recordings.name} blocked", fold=recordings.blocked())

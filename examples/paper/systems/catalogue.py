@@ -12,12 +12,11 @@ from torch import nn
 from examples.paper.runs.cached import Cached
 from examples.paper.studies.peers import NearestNeighbour, StreamingLDA
 from examples.paper.studies.random_convolution import random_convolution
-from examples.paper.systems.controls import OnFeatures
 from examples.paper.systems.descent import Course
 from examples.paper.systems.inputs import Image, average_columns
 from examples.paper.systems.least_squares import LeastSquares
 from examples.paper.systems.networks import ConvLSTM, ResNetClassifier, SpikingNet
-from examples.paper.systems.one_pass import OnePass
+from examples.paper.systems.one_pass import OnePass, OnFeatures
 from examples.paper.systems.own import is_own, is_own_embedding, own_embedding, own_system
 from examples.paper.systems.spikes import encode
 from examples.paper.systems.svm import Svm

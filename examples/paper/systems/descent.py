@@ -63,10 +63,10 @@ class Course:
     decay: float = 1e-4
     patience: int = 10
     factor: float = 0.1
-    precision: Precision = "float32"
+    precision: str = "float32"
 
     @classmethod
-    def in_proportion(cls, epochs: int, precision: Precision = "float32") -> Course:
+    def in_proportion(cls, epochs: int, precision: str = "float32") -> Course:
         """A course of fewer or more epochs with a patience of a tenth of them, as the default has, 1 or more.
 
         With ten epochs' patience the rate would not fall once in twenty, and a network swings until it does.

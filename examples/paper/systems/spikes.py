@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["REST", "decode", "encode"]
+__all__ = ["REST", "encode"]
 
 Image = npt.NDArray[np.float32]
 
@@ -33,7 +33,8 @@ def encode(image: Image, threshold: float, rest: float = REST) -> Image:
     threshold: θ > 0, in units of the image. rest: x_rest, where each channel is before the first reading.
     Raises InputError for another threshold, or an image that is not (C, T).
     """
-    _require(threshold)
+    if not (math.isfinite(threshold) and threshold > 0):
+        raise InputError(f"expected a finite threshold above 0; came {threshold}")
     if image.ndim != 2:
         raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
     steps = (image.astype(np.float64) - rest) / threshold
@@ -44,21 +45,3 @@ def encode(image: Image, threshold: float, rest: float = REST) -> Image:
         fired[:, i] = np.trunc(steps[:, i] - level)
         level += fired[:, i]
     return np.concatenate([np.maximum(fired, 0), np.maximum(-fired, 0)]).astype(np.float32)
-
-
-def decode(spikes: Image, threshold: float, rest: float = REST) -> npt.NDArray[np.float64]:
-    """x̂ of shape (C, T) from the spike counts (2 C, T) of `encode`: nowhere further than θ from what was encoded.
-
-    Raises InputError for a threshold that is not above 0, or an odd number of lines.
-    """
-    _require(threshold)
-    if spikes.ndim != 2 or len(spikes) % 2:
-        raise InputError(f"expected spike counts of shape (2 C, T), ON lines and OFF lines; came {spikes.shape}")
-    on, off = np.split(spikes.astype(np.float64), 2)
-    levels: npt.NDArray[np.float64] = rest + threshold * np.cumsum(on - off, axis=1)
-    return levels
-
-
-def _require(threshold: float) -> None:
-    if not (math.isfinite(threshold) and threshold > 0):
-        raise InputError(f"expected a finite threshold above 0; came {threshold}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
+from examples.paper.runs.cells import silent
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.classification import Labelled
@@ -14,10 +15,6 @@ __all__ = ["System", "Watch", "require_touches", "silent", "unwatched"]
 
 Watch = Callable[[], object]
 """Called after every epoch of a system that has epochs; `predict` answers then with the weights of that moment."""
-
-
-def silent(what: str, done: int, of: int) -> None:
-    """Progress that is reported to nobody."""
 
 
 def unwatched() -> None:

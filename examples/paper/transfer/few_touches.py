@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.readers.labelled import Recordings
+from examples.paper.runs.cells import Cell, Figures, over_folds
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
@@ -31,11 +32,13 @@ __all__ = [
     "candidate_maker",
     "draw_touches",
     "few_touches",
+    "points_of",
 ]
 
 COUNTS = (1, 2, 5, 10, 20)
-WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 """Touches of each material after which the test is taken."""
+
+WHOLE = Scale("window", 1)  # features of a touch as a whole: one row each
 
 
 class FewTouchLearner(Protocol):
@@ -185,3 +188,27 @@ def few_touches(
             right[str(stop)].append(hits)
             begun = stop
     return {"tested": len(test), "right": right, "learned": trained}
+
+
+def points_of(
+    results: Sequence[tuple[Cell, Figures]], beside: str
+) -> dict[tuple[str, str], dict[str, dict[str, float | None]]]:
+    """(data set, system) → count of touches → mean accuracy over folds and draws, and its standard deviation.
+
+    "gain", "gain sd": of the difference to the system `beside`, of the same draws; None where it was not measured.
+    """
+    shares: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for cell, figures in results:
+        own = shares.setdefault((cell.dataset, cell.system), {})
+        for count, right in figures["right"].items():
+            own.setdefault(count, []).extend(hits / figures["tested"] for hits in right)
+    found: dict[tuple[str, str], dict[str, dict[str, float | None]]] = {}
+    for (dataset, system), own in shares.items():
+        points = found.setdefault((dataset, system), {})
+        for count, values in own.items():
+            points[count] = over_folds(values) | {"gain": None, "gain sd": None}
+            others = shares.get((dataset, beside), {}).get(count, [])
+            if len(others) == len(values):
+                gain = over_folds(np.subtract(values, others).tolist())
+                points[count] |= {"gain": gain["mean"], "gain sd": gain["sd"]}
+    return found

@@ -1,4 +1,4 @@
-"""Transfer between tasks: an embedding fine-tuned on one data set, frozen, and read out in closed form on another.
+"""`transfer tasks`: an embedding fine-tuned on one data set, frozen, and read out in closed form on another.
 
 Beside it stand the vision model as it was before any fine-tuning, and kernels, with the same draws of touches.
 """
@@ -7,31 +7,50 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import typer
 
-from examples.paper.readers.labelled import Recordings
+from examples.paper.readers.labelled import Recordings, chosen
 from examples.paper.runs.cached import Cached
-from examples.paper.runs.cells import Cell, Figures, over_folds, require_data, run_cells, split
-from examples.paper.runs.study import weights_digest
-from examples.paper.systems.descent import Course, Precision
+from examples.paper.runs.cells import Cell, Figures, run_cells, silent, split
+from examples.paper.runs.options import (
+    Data,
+    Device,
+    Folds,
+    InPrecision,
+    Json,
+    Plot,
+    Quick,
+    Run,
+    Seed,
+    folds_of,
+    named,
+    numbers,
+    read,
+)
+from examples.paper.runs.pictures import draw_into, logarithmic, picture
+from examples.paper.runs.results import show, write
+from examples.paper.runs.study import sensors_of, weights_digest
+from examples.paper.systems.descent import Course
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork, require_device
-from examples.paper.transfer.few_touches import COUNTS, candidate_maker, few_touches
+from examples.paper.transfer.few_touches import COUNTS, candidate_maker, few_touches, points_of
 from scroll_tactile import Embedding, Kernels, Vision
+from scroll_tactile.cli.terminal import percent, progress_bar, say
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.signals.image import tactile_image
 
-__all__ = ["TRAINING", "TUNED", "TaskTransfer", "rows", "some_frames"]
+__all__ = ["TRAINING", "TUNED", "TaskTransfer", "rows", "some_frames", "tasks"]
 
+OF_TASKS = ("biotac-20", "roboskin-20", "letter-spike", "fabric-slide", "gelsight")
 TRAINING = "fine-tuning"
 TUNED = "vision tuned on "
 """Before the name of the data set that the embedding of a row was fine-tuned on."""
@@ -50,8 +69,7 @@ class TaskTransfer:
     sets: of different names, two or more, all tested. sources: the names of those fine-tuned on; all unless given.
     weights: of the pre-trained ResNet.
     folds: tested, of each set. counts: touches of each material learned before a test; draws: of those touches.
-    epochs, rate: of a fine-tuning; device: where it runs; precision: see `Course`. every: learn every
-    so many recordings only when fine-tuning. seed: of all that is drawn.
+    epochs, rate: of a fine-tuning; device: where it runs; precision: see `Course`. seed: of all that is drawn.
     folder: where finished cells are noted and fine-tuned networks kept, so that a killed run resumes; or None.
 
     Raises InputError for what cannot be, WeightsError for weights that cannot be had.
@@ -65,8 +83,7 @@ class TaskTransfer:
     epochs: int = 10
     rate: float = RATE
     device: str = "cpu"
-    precision: Precision = "float32"
-    every: int = 1
+    precision: str = "float32"
     seed: int = 0
     folder: Path | None = None
     sources: tuple[str, ...] | None = None
@@ -77,10 +94,10 @@ class TaskTransfer:
             raise InputError(f"expected two data sets or more, of different names; came {names}")
         if strange := sorted(set(self.sources or ()) - set(names)):
             raise InputError(f"expected sources out of {names}; came {strange}")
-        if not self.folds or not self.counts or min(self.counts) < 1 or self.draws < 1 or self.every < 1:
+        if not self.folds or not self.counts or min(self.counts) < 1 or self.draws < 1:
             raise InputError(
-                "expected one fold or more, counts of 1 touch or more, 1 draw or more and every 1 or more; came "
-                f"folds {self.folds}, counts {self.counts}, draws {self.draws}, every {self.every}"
+                "expected one fold or more, counts of 1 touch or more and 1 draw or more; came "
+                f"folds {self.folds}, counts {self.counts}, draws {self.draws}"
             )
         if self.seed < 0:
             raise InputError(f"expected a seed of 0 or more; came {self.seed}")
@@ -95,7 +112,7 @@ class TaskTransfer:
     @property
     def plan(self) -> dict[str, Any]:
         """All that each figure depends on, beside the data; sets, sources and folds can be added to a run later."""
-        names = ("counts", "draws", "epochs", "rate", "device", "precision", "every", "seed")
+        names = ("counts", "draws", "epochs", "rate", "device", "precision", "seed")
         options = {name: getattr(self, name) for name in names}
         return {"run": "transfer tasks", **options, "weights": weights_digest(self.weights)}
 
@@ -110,21 +127,19 @@ class TaskTransfer:
                 found += [Cell(name, fold, TUNED + source) for name in names]
         return found
 
-    def run(self, progress: Progress = lambda what, done, of: None) -> Iterator[tuple[Cell, Figures]]:
+    def run(self, progress: Progress = silent) -> Iterator[tuple[Cell, Figures]]:
         """The figures of each cell as it is finished; those finished before are read back.
 
         Raises InputError for a folder of another run or folds that are not there, WeightsError for a fine-tuned network
         that is damaged, and what learning and training raise.
         """
-        notes = RunFile(None if self.folder is None else self.folder / "transfer-tasks.json", self.plan)
-        for source, fold in ((item.name, fold) for item in self.sets for fold in self.folds):
-            if (figures := notes.notes.get(Cell(source, fold, TRAINING).key)) is not None:
-                self._noted[source, fold] = figures["digest"]
         for item in self.sets:
-            require_data(notes, item)
             for fold in self.folds:
-                split(item, fold, self.seed, every=self.every)  # what is refused is refused before anything is measured
-        yield from run_cells(notes, self.cells(), self._measure, progress)
+                split(item, fold, self.seed)  # what is refused is refused before anything is measured
+        for cell, figures in run_cells(self.folder, self.plan, self.sets, self.cells(), self._measure, progress):
+            if cell.system == TRAINING:
+                self._noted[cell.dataset, cell.fold] = figures["digest"]
+            yield cell, figures
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         recordings = self._by_name[cell.dataset]
@@ -142,7 +157,7 @@ class TaskTransfer:
 
     def _train(self, recordings: Recordings, fold: int, progress: Progress) -> Figures:
         """Fine-tune the whole network on all but a fold, a tenth of which chooses the epoch; how right it is then."""
-        touches = split(recordings, fold, self.seed, every=self.every)
+        touches = split(recordings, fold, self.seed)
         trained = TrainedNetwork(TRAINING, self._network, course=self.course, device=self.device, view=tactile_image)
         trained.fit(touches.streams, touches.materials, touches.validation, self.seed, progress)
         predicted = trained.predict(touches.test_streams)
@@ -227,44 +242,20 @@ def some_frames(recordings: Recordings, frames: int) -> Recordings:
     if not recordings.sensor.camera:
         return recordings
     seen: dict[tuple[str, int, int], int] = {}
-    chosen = []
+    kept = []
     for i, (name, fold) in enumerate(zip(recordings.materials, recordings.fold.tolist(), strict=True)):
         video = (name, fold, int(recordings.repetition[i]))
         seen[video] = seen.get(video, 0) + 1
         if seen[video] <= frames:
-            chosen.append(i)
-    return replace(
-        recordings,
-        streams=[recordings.streams[i] for i in chosen],
-        materials=[recordings.materials[i] for i in chosen],
-        repetition=recordings.repetition[chosen],
-        fold=recordings.fold[chosen],
-    )
+            kept.append(i)
+    return chosen(recordings, kept)
 
 
 def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
-    """A row for each data set that is tested and each embedding.
-
-    points: count of touches → mean accuracy over draws and folds, its standard deviation, and the mean and standard
-    deviation of the difference to the vision model of the same draws (None where that was not measured).
-    """
-    shares: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for cell, figures in results:
-        if cell.system == TRAINING:
-            continue
-        of_row = shares.setdefault((cell.dataset, cell.system), {})
-        for count, right in figures["right"].items():
-            of_row.setdefault(count, []).extend(hits / figures["tested"] for hits in right)
+    """A row for each data set that is tested and each embedding, with `points_of` it; gains are over vision."""
+    tested = [(cell, figures) for cell, figures in results if cell.system != TRAINING]
     found = []
-    for (dataset, system), own in shares.items():
-        points = {}
-        for count, values in own.items():
-            point = over_folds(values) | {"gain": None, "gain sd": None}
-            plain = shares.get((dataset, "vision"), {}).get(count, [])
-            if len(plain) == len(values):
-                gain = over_folds(np.subtract(values, plain).tolist())
-                point |= {"gain": gain["mean"], "gain sd": gain["sd"]}
-            points[count] = point
+    for (dataset, system), points in points_of(tested, "vision").items():
         tuned = system.removeprefix(TUNED) if system.startswith(TUNED) else None
         found.append({"dataset": dataset, "system": system, "tuned on": tuned, "points": points})
     return found
@@ -276,3 +267,81 @@ def _digest(tensors: Tensors) -> str:
         digest.update(f"{name} {tuple(tensor.shape)}\n".encode())
         digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()
+
+
+def tasks(
+    context: typer.Context,
+    data: Data,
+    weights: Annotated[str, typer.Option(help="Of a trained ResNet: a file, or a published name such as resnet18.")],
+    sets: Annotated[str, typer.Option(help=f"Two or more of {', '.join(OF_TASKS)}.")] = ",".join(OF_TASKS),
+    sources: Annotated[str | None, typer.Option(help="Which of them to fine-tune on; all unless given.")] = None,
+    folds: Folds = "0",
+    counts: Annotated[str, typer.Option(help="Touches of each material learned before a test.")] = "1,2,5,10,20",
+    draws: Annotated[int, typer.Option(min=1, help="Of the touches that are learned.")] = 3,
+    frames: Annotated[int, typer.Option(min=1, help="Of each video of a camera.")] = 2,
+    epochs: Annotated[int, typer.Option(min=1, help="Of the networks' training.")] = 6,
+    device: Device = "cpu",
+    precision: InPrecision = "float32",
+    seed: Seed = 0,
+    quick: Quick = False,
+    run: Run = None,
+    json: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Fine-tune the vision model on each data set, freeze it, and learn few touches of every other with it."""
+    with progress_bar() as progress:
+        progress("reading", 0, 1)
+        found = read("--sets", sets, data, seed, known=OF_TASKS, quick=quick)
+        by_name = {name: some_frames(item, frames) for name, item in found.items()}
+        chosen_sources = None if sources is None else named("--sources", sources, by_name)
+        study = TaskTransfer(
+            [*by_name.values()],
+            weights,
+            folds=tuple(folds_of(folds, next(iter(by_name.values())), quick=quick)),
+            counts=tuple(sorted(set(numbers("--counts", counts)))),
+            draws=1 if quick else draws,
+            epochs=min(epochs, 3) if quick else epochs,
+            device=device,
+            precision=precision,
+            seed=seed,
+            folder=run,
+            sources=None if chosen_sources is None else tuple(by_name[name].name for name in chosen_sources),
+        )
+        results = list(study.run(progress))
+    table = rows(results)
+    for name in (item.name for item in study.sets):
+        mine = [row for row in table if row["dataset"] == name]
+        columns = {"embedding": "{./system}"} | {
+            f"{count} touches": f"{{./points/{count}|±}}" for count in mine[0]["points"]
+        }
+        show(f"{name}: right, % after so many touches of each material", columns, mine)
+    trained = [(cell, figures) for cell, figures in results if cell.system == TRAINING]
+    text = ", ".join(f"{cell.dataset} {percent(figures['right'] / figures['tested'])}" for cell, figures in trained)
+    say(f"the fine-tuned networks on their own test, after {study.epochs} epochs: {text}")
+    cells = {cell.key: figures for cell, figures in results}
+    write(context, study.plan | {"sensors": sensors_of(study.sets), "frames": frames, "rows": table, "cells": cells})
+    draw_into(plot, lambda file: draw_transfer(file, table))
+
+
+def draw_transfer(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Draw accuracy by touches of each material, a line for each embedding, a panel for each data set tested.
+
+    rows: dataset, system, and points: touches of each material → mean and sd, shares from 0 to 1. Raises InputError
+    where there are none.
+    """
+    if not rows:
+        raise InputError("expected rows to draw; came none")
+    sets = list(dict.fromkeys(row["dataset"] for row in rows))
+    with picture(path, 5 * len(sets), 4.5) as figure:
+        panels = np.asarray(figure.subplots(1, len(sets), squeeze=False))[0]
+        for dataset, panel in zip(sets, panels, strict=True):
+            mine = [row for row in rows if row["dataset"] == dataset]
+            for row in mine:
+                means = [100 * point["mean"] for point in row["points"].values()]
+                spreads = [100 * (point["sd"] or 0) for point in row["points"].values()]
+                counts = [int(count) for count in row["points"]]
+                panel.errorbar(counts, means, spreads, marker=".", capsize=2, label=row["system"])
+            panel.set(xlabel="touches of each material", ylabel="accuracy on the test, %", title=dataset)
+            logarithmic(panel, {int(count) for row in mine for count in row["points"]})
+            panel.grid(alpha=0.3)
+            panel.legend(fontsize=7)

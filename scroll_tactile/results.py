@@ -114,8 +114,9 @@ class Prediction:
     novelty: how unlike the candidates the touch is, in standard deviations above held-out touches of known materials.
         Infinite where nothing was ever observed; 0 where only one material was: there is nothing to compare it with.
     known: whether novelty stays below the threshold of the false-alarm rate. False means "never felt this", and
-        `material` is then only the nearest. None: that cannot be told from too few touches, fewer than 1 / rate − 1
-        that could be left out (19 at the usual 0.05), or from one material.
+        `material` is then only the nearest. None: that cannot be told. Too few touches could be left out, fewer than
+        1 / rate − 1 (19 at the usual 0.05); or one material was observed; or so few touches of each, or by so poor a
+        sensor, that most touches of a new material would stay below the threshold, too.
     seconds: how much touch the answer rests on: the stream's length, at most that of the longest touch learned. Of a
         camera's stream only the frames in contact count, and the one at rest. Of several streams it is the sum.
     tuned: whether f*, the fine-tuned model, gave the probabilities, and not f. Novelty is always f's.

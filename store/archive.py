@@ -15,7 +15,7 @@ from uuid import uuid4
 from store.exceptions import DamageError, NotAStoreError, reported
 from store.files import is_file, open_regular, read_regular, replacing
 from store.layout import CHECKPOINTS, CURRENT_FILE, LOG, Current, checkpoint_path, log_path, read_current
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.log_file import LogFile
 
 __all__ = ["ARCHIVE_BYTES", "Archive", "Files", "files_of", "is_archive", "write_archive"]
@@ -52,7 +52,7 @@ class Files:
         """Open a log to read. Raises DamageError, OSError."""
         return LogFile(path, write=False)
 
-    def read_log(self, path: Path, *, place: Place | None = None, identity: bytes | None = None) -> LogReader:
+    def read_log(self, path: Path, *, place: LogPlace | None = None, identity: bytes | None = None) -> LogReader:
         """Open a log as `LogReader` does, whatever holds it; it is closed again where that fails."""
         file = self.open_log(path)
         try:

@@ -32,7 +32,7 @@ from store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, LateArray, from_js
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["QUICK", "THOROUGH", "CheckpointReader", "Draft", "write_checkpoint"]
+__all__ = ["QUICK", "THOROUGH", "CheckpointDraft", "CheckpointReader", "write_checkpoint"]
 
 # The arrays of 800 BioTac touches, 28.5 MB, become 17.2 MB at level 3, 16.9 at level 6 in thrice the time: that is for
 # checkpoints that somebody waits for, and that stay.
@@ -44,7 +44,7 @@ GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
 
 
 @dataclass(frozen=True, eq=False)
-class Draft:
+class CheckpointDraft:
     """Checked arrays that are to become a checkpoint; `attributes` is JSON, `level` how hard to compress."""
 
     arrays: Mapping[str, np.ndarray]
@@ -53,7 +53,7 @@ class Draft:
     level: int
 
 
-def write_checkpoint(folder: Path, number: int, draft: Draft, identity: Mapping[str, JSON]) -> str:
+def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity: Mapping[str, JSON]) -> str:
     """Write a draft as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
 
     That is its number, `last_sequence`, attributes, the store's identity, the format and, for each array, dtype, shape
@@ -109,7 +109,9 @@ def _as_json(path: Path, described: Mapping[str, ArrayContent]) -> dict[str, JSO
     }
 
 
-def _write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], level: int | None) -> zarr.Group:
+def _write_zarr(
+    path: Path, draft: CheckpointDraft, described: Mapping[str, ArrayContent], level: int | None
+) -> zarr.Group:
     # Imported late: 300 ms that a process which reads, or only appends, need not spend.
     import zarr
     from zarr.codecs import ZstdCodec

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from store.archive import Files
-from store.checkpoint_files import CheckpointReader, Draft, write_checkpoint
+from store.checkpoint_files import CheckpointDraft, CheckpointReader, write_checkpoint
 from store.derived import read_derived, remove_derived, write_derived
 from store.encoding import check_arrays
 from store.exceptions import DamageError, RecordError, StoreError, reported
@@ -28,7 +28,7 @@ from store.layout import (
     remove_unnamed,
     write_current,
 )
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.log_writer import create_log
 from store.records import Arrays, Attributes, Checkpoint, to_json
 from store.row_encoding import HEAD_BYTES, ROW, row_sequence
@@ -47,7 +47,7 @@ class Checkpoints:
         self._committing = threading.Lock()
         self._worker = ThreadPoolExecutor(1, f"store commit {files.folder.name}")
         self._queue = threading.Lock()
-        self._waiting: Draft | None = None
+        self._waiting: CheckpointDraft | None = None
         self._submitted: Future[None] | None = None
         self._failure: Exception | None = None
 
@@ -95,7 +95,7 @@ class Checkpoints:
         found = read_derived(self._folder, name, newest.sha256)
         return None if found is None else Checkpoint(newest.number, newest.last_sequence, *found)
 
-    def keep_derived(self, name: str, draft: Draft) -> None:
+    def keep_derived(self, name: str, draft: CheckpointDraft) -> None:
         """Keep what follows from the newest checkpoint, which is up to the same row, under a name."""
         with self._committing, reported(self._folder, f"keeping {name!r}"):
             newest = self._journal.current().newest
@@ -112,7 +112,7 @@ class Checkpoints:
             )
         return reader
 
-    def commit(self, draft: Draft) -> int:
+    def commit(self, draft: CheckpointDraft) -> int:
         """Write a draft as a checkpoint, have `CURRENT` name it, and return its number."""
         with self._committing:
             current = self._journal.current()
@@ -126,7 +126,7 @@ class Checkpoints:
             self._journal.keep_index()
             return named.number
 
-    def draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int) -> Draft:
+    def draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int) -> CheckpointDraft:
         """Return what is to become a checkpoint, once all of it can be kept. Raises RecordError, StoreError."""
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a checkpoint")
@@ -137,9 +137,9 @@ class Checkpoints:
                 f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
                 f"there is, not {last_sequence!r}"
             )
-        return Draft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
+        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
 
-    def _write(self, draft: Draft, place: Place) -> NamedCheckpoint:
+    def _write(self, draft: CheckpointDraft, place: LogPlace) -> NamedCheckpoint:
         number = self._next(numbers(self._folder, unfinished=True))
         sha256 = write_checkpoint(self._folder, number, draft, self._journal.identity)
         return NamedCheckpoint(number, draft.last_sequence, sha256, place)
@@ -150,7 +150,7 @@ class Checkpoints:
             raise DamageError(f"{self._folder} has a log or a checkpoint of number {number - 1}", path=self._folder)
         return number
 
-    def compact(self, draft: Draft, newest: Draft | None) -> None:
+    def compact(self, draft: CheckpointDraft, newest: CheckpointDraft | None) -> None:
         """Commit a compaction checkpoint and a log in which its rows have no arrays; all is read back before."""
         with self._committing:
             with self._journal.switching():
@@ -174,7 +174,7 @@ class Checkpoints:
             remove_derived(self._folder)
             self.remove_unnamed()
 
-    def commit_later(self, draft: Draft) -> None:
+    def commit_later(self, draft: CheckpointDraft) -> None:
         """Do `commit` in a background thread; a newer one takes the place of one that still waits.
 
         Logs a failure and keeps it until `raise_failure`.
@@ -225,7 +225,7 @@ class Checkpoints:
             logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
 
 
-def read_back(path: Path, last_sequences: Sequence[int]) -> list[Place]:
+def read_back(path: Path, last_sequences: Sequence[int]) -> list[LogPlace]:
     """Read a log that was just written; return for each of these rows a place.
 
     All rows behind that row are behind the place. Raises DamageError where the log does not read back whole.

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from store.compression import decompress_zstd
 from store.encoding import flat_bytes, kept_dtype, require_name, require_shape, require_values
 from store.exceptions import DamageError
-from store.frames import decompress_zstd
 from store.records import from_json
 
 __all__ = [

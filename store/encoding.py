@@ -11,8 +11,8 @@ from math import prod
 
 import numpy as np
 
+from store.compression import compress, decompress
 from store.exceptions import RecordError, VersionError
-from store.frames import compress, decompress
 
 __all__ = [
     "array_digest",

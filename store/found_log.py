@@ -11,7 +11,7 @@ from store.encoding import decode_payload
 from store.exceptions import DamageError, VersionError
 from store.framing import FRAME_BYTES, read_frame
 from store.layout import NamedCheckpoint
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.log_file import find_identity
 from store.records import JSON, Head, from_json
 from store.row_encoding import ROW, decode_head, decode_row, row_sequence
@@ -46,7 +46,7 @@ class FoundLog:
     """
 
     def __init__(
-        self, files: Files, path: Path, identity: bytes | None, progress: Progress, durable: Place | None = None
+        self, files: Files, path: Path, identity: bytes | None, progress: Progress, durable: LogPlace | None = None
     ) -> None:
         self.path, self.damage = path, list[str]()
         self.identity: dict[str, JSON] | None = None

@@ -14,7 +14,7 @@ from store.encoding import check_arrays, encode_payload
 from store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
 from store.files import sync_folder
 from store.layout import CURRENT_FILE, Current, log_path, write_current
-from store.log import Place
+from store.log import LogPlace
 from store.log_writer import LogWriter
 from store.open_log import OpenLog
 from store.records import JSON, Arrays, Attributes, Head, check_key, check_text, check_time, from_json, to_json
@@ -220,7 +220,7 @@ class Journal:
         at.rows.cut(bisect_left(at.rows.offsets, writer.place.offset))
         at.note_place(writer.place)
 
-    def place(self, last_sequence: int) -> Place:
+    def place(self, last_sequence: int) -> LogPlace:
         """Return a place in the log that all rows behind `last_sequence` are behind."""
         with self._using("looking for a place") as at:
             found = bisect_right(at.places, last_sequence, key=lambda noted: noted[0])

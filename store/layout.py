@@ -14,7 +14,7 @@ from typing import Any, Self
 from store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
 from store.framing import IDENTITY_BYTES
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.records import LARGEST_NUMBER, from_json, json_digest
 
 __all__ = [
@@ -68,7 +68,7 @@ class NamedCheckpoint:
     number: int
     last_sequence: int
     sha256: str
-    place: Place
+    place: LogPlace
 
     def to_json(self) -> dict[str, Any]:
         """Return what is written."""
@@ -79,7 +79,7 @@ class NamedCheckpoint:
     def from_json(cls, found: Any) -> Self:
         """Return what `to_json` wrote; raise ValueError, TypeError or KeyError for anything else."""
         offset, number, previous = found["place"]
-        place = Place(_count(offset), _count(number), _count(number), _hex(previous, 16))
+        place = LogPlace(_count(offset), _count(number), _count(number), _hex(previous, 16))
         return cls(_count(found["number"]), _count(found["last_sequence"]), _hex(found["sha256"], 32).hex(), place)
 
 

@@ -27,13 +27,13 @@ from store.framing import (
 from store.log_file import LogFile, Window, frames_behind
 from store.records import LARGEST_NUMBER, payload_digest
 
-__all__ = ["LogReader", "Place"]
+__all__ = ["LogPlace", "LogReader"]
 
 # A window older than the file, what a writer is just writing, and damage look alike the first time, and not the third.
 ATTEMPTS = 3
 
 
-class Place(NamedTuple):
+class LogPlace(NamedTuple):
     """Where a log's next frame belongs: its offset and number, its batch's first number, the checksum before it."""
 
     offset: int
@@ -42,7 +42,7 @@ class Place(NamedTuple):
     previous: bytes
 
     @classmethod
-    def behind(cls, frame: Frame) -> Place:
+    def behind(cls, frame: Frame) -> LogPlace:
         """Return the place of the frame behind this one, in a batch of its own where this one ends a batch."""
         number = frame.number + 1
         batch = number if frame.kind in (HEADER, COMMIT) else frame.batch
@@ -82,13 +82,13 @@ class LogReader:
     """
 
     WRITES = False
-    durable: Place | None = None
+    durable: LogPlace | None = None
 
     def __init__(
         self,
         path: Path,
         *,
-        place: Place | None = None,
+        place: LogPlace | None = None,
         payloads: bool = True,
         identity: bytes | None = None,
         file: LogFile | None = None,
@@ -100,12 +100,12 @@ class LogReader:
             self._file = LogFile(path, write=self.WRITES) if file is None else file
             try:
                 self._window = Window(self._file)
-                self._torn: Place | None = None
+                self._torn: LogPlace | None = None
                 self._proved: Frame | None = None
                 self._first: Frame | None = None
                 try:
                     self._first = self._read_header()
-                    self.place = Place.behind(self._first)
+                    self.place = LogPlace.behind(self._first)
                 except DamageError as damage:
                     if identity is None:
                         raise
@@ -139,13 +139,13 @@ class LogReader:
 
     def _begin_without_header(self, identity: bytes, damage: DamageError) -> None:
         self.header, self.identity, self._mark, self.header_damage = b"", identity, MARK + identity, damage
-        self._torn = self.place = Place(0, 0, 0, NO_CHECKSUM)
+        self._torn = self.place = LogPlace(0, 0, 0, NO_CHECKSUM)
         with suppress(DamageError):
             self.resume()
 
-    def has_place(self, place: Place) -> bool:
+    def has_place(self, place: LogPlace) -> bool:
         """Return whether a place is behind the first frame or a batch of this log."""
-        if self._first is not None and place == Place.behind(self._first):
+        if self._first is not None and place == LogPlace.behind(self._first):
             return True
         try:
             with reported(self.path, "looking for a place"):
@@ -154,12 +154,12 @@ class LogReader:
             return False
         return True
 
-    def _commit_before(self, place: Place) -> Frame:
+    def _commit_before(self, place: LogPlace) -> Frame:
         offset = place.offset - FRAME_BYTES
         is_inside = 0 < offset < self._file.size()
         frame = read_frame(self._file.read(offset, FRAME_BYTES), offset) if is_inside else None
         ours = frame is not None and self._is_ours(frame) and frame.kind == COMMIT and frame.number < LARGEST_NUMBER
-        if frame is None or not ours or Place.behind(frame) != place:
+        if frame is None or not ours or LogPlace.behind(frame) != place:
             raise self._damage(f"holds no batch that ends with frame {place.number - 1} there", offset, place.number)
         return frame
 
@@ -187,7 +187,7 @@ class LogReader:
                     self._last, self.place = self._first, self._torn
                 elif batch:
                     self._last = batch.pop()
-                    self.place = Place.behind(self._last)
+                    self.place = LogPlace.behind(self._last)
                 else:
                     return
                 if batch:
@@ -214,7 +214,7 @@ class LogReader:
                 )
         return batch, damage
 
-    def _scan(self) -> tuple[list[Frame], Place | None]:
+    def _scan(self) -> tuple[list[Frame], LogPlace | None]:
         """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
         place, size = self.place, self._file.size()
         batch: list[Frame] = []
@@ -227,9 +227,9 @@ class LogReader:
             batch.append(frame)
             if frame.kind == COMMIT:
                 return batch, None
-            place = Place.behind(frame)
+            place = LogPlace.behind(frame)
 
-    def _proof(self, torn: Place) -> Frame | None:
+    def _proof(self, torn: LogPlace) -> Frame | None:
         """Return a frame of this log that no power cut can have left behind a torn one; None where there is none."""
         known = self._proved
         if known is not None and known.offset > torn.offset and not torn.can_be_torn_before(known):
@@ -239,7 +239,7 @@ class LogReader:
                 return known
         if self.durable is not None and torn.offset < self.durable.offset:
             commit = pack_frame(self.identity, torn.offset, torn.number, torn.batch, COMMIT, b"", torn.previous)[1]
-            if Place.behind(commit) == self.durable:
+            if LogPlace.behind(commit) == self.durable:
                 return commit  # as it was: all of its batch is there but for this frame
             with suppress(DamageError):
                 return self._commit_before(self.durable)
@@ -255,7 +255,7 @@ class LogReader:
             behind = frames_behind(self._file, torn.offset, self._mark)
             if (frame := next(filter(torn.is_before, behind), None)) is None:
                 raise self._damage("holds no frame behind the damage", torn.offset, torn.number)
-            self.place = Place(frame.offset, frame.number, frame.batch, frame.previous)
+            self.place = LogPlace(frame.offset, frame.number, frame.batch, frame.previous)
             self._last, self._torn = self._first, None
 
     def read(self, offset: int, size: int) -> tuple[Frame, bytes]:
@@ -298,12 +298,12 @@ class LogReader:
             return self._file.size()
 
     @property
-    def beginning(self) -> Place:
+    def beginning(self) -> LogPlace:
         """The place of the first frame behind the header."""
         assert self._first is not None, "its header is damaged"
-        return Place.behind(self._first)
+        return LogPlace.behind(self._first)
 
-    def beginning_at(self, place: Place) -> LogReader:
+    def beginning_at(self, place: LogPlace) -> LogReader:
         """Return another reader, of heads alone, of the same open file, whatever its path names by now.
 
         That one is not to be closed.

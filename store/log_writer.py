@@ -24,7 +24,7 @@ from store.framing import (
     pack_frame,
     read_frame,
 )
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.log_file import PART
 
 __all__ = ["LogWriter", "create_log"]
@@ -51,7 +51,7 @@ class LogWriter(LogReader):
 
     WRITES = True
 
-    def __init__(self, path: Path, *, place: Place | None = None) -> None:
+    def __init__(self, path: Path, *, place: LogPlace | None = None) -> None:
         super().__init__(path, place=place)
         self._writing, self._process = threading.RLock(), os.getpid()
         try:
@@ -112,7 +112,7 @@ class LogWriter(LogReader):
         at = self._next
         data, frame = pack_frame(self.identity, at.offset, at.number, at.batch, kind, payload, at.previous)
         self._staged += data
-        self._next = Place.behind(frame)
+        self._next = LogPlace.behind(frame)
         return frame
 
     def _write(self) -> None:

@@ -10,7 +10,7 @@ from store.encoding import decode_payload
 from store.exceptions import CompactedError, DamageError
 from store.files import sync_folder
 from store.layout import Current, log_path
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.log_writer import LogWriter
 from store.records import JSON, Head, Record, from_json
 from store.row_encoding import decode_head, decode_row
@@ -52,7 +52,7 @@ class OpenLog:
             self.log.close()
             raise
 
-    def _reader(self, place: Place | None, *, write: bool) -> LogReader:
+    def _reader(self, place: LogPlace | None, *, write: bool) -> LogReader:
         """Return the log from a place on; where that is not in it a reader begins at the beginning."""
         try:
             return self._files.read_log(self.path, place=place)
@@ -91,7 +91,7 @@ class OpenLog:
             what = f"{self.path} ends with row {self.last_row}, and had row {self.current.last}: its end is damaged or "
             self.rows.damage.setdefault(len(self.rows), []).append(DamageError(f"{what}was cut off", path=self.path))
 
-    def note_place(self, place: Place) -> None:
+    def note_place(self, place: LogPlace) -> None:
         """Note the place behind all rows that are known."""
         self.places.append((self.last_row, place))
         if len(self.places) > MOST_PLACES:

@@ -17,7 +17,7 @@ from store.exceptions import DamageError
 from store.files import read_regular, remove_tree
 from store.framing import Frame
 from store.layout import DERIVED
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.row_encoding import HEAD_BYTES, ROW, head_size, key_prefix, prefix_in, row_sequence, verified_size
 
 __all__ = ["Index", "Rows", "head_bytes"]
@@ -70,7 +70,7 @@ class Rows:
         found: list[int] = np.flatnonzero(np.frombuffer(self.keys, np.uint64) == key_prefix(key)).tolist()
         return found
 
-    def take(self, log: LogReader, until: int | None = None) -> Iterator[Place]:
+    def take(self, log: LogReader, until: int | None = None) -> Iterator[LogPlace]:
         """Add the rows that follow in a log, up to an offset; yield the place behind each batch. Damage is noted."""
         while True:
             try:
@@ -121,8 +121,8 @@ class _Segment:
     """A file of the index: rows that follow each other, from one place in the log to another."""
 
     path: Path
-    begin: Place
-    end: Place
+    begin: LogPlace
+    end: LogPlace
     count: int
 
 
@@ -134,7 +134,7 @@ class Index:
     are few, and each row is written a few times.
     """
 
-    def __init__(self, folder: Path, identity: bytes, begin: Place) -> None:
+    def __init__(self, folder: Path, identity: bytes, begin: LogPlace) -> None:
         self._folder, self._identity = folder / DERIVED, identity
         self._segments: list[_Segment] = []
         self.end = begin
@@ -165,7 +165,7 @@ class Index:
             self._segments.append(segment)
             self.end = segment.end
 
-    def _path(self, begin: Place) -> Path:
+    def _path(self, begin: LogPlace) -> Path:
         return self._folder / f"rows-{begin.number:012d}"
 
     def _decoded(self, path: Path, data: bytes) -> tuple[_Segment, Rows]:
@@ -173,13 +173,13 @@ class Index:
         mark, identity, *places, count = HEADER.unpack_from(data)
         if mark != MARK or identity != self._identity or len(data) != HEADER.size + 32 * count:
             raise ValueError("it is of another log")
-        begin, end = (Place(places[i], places[i + 1], places[i + 1], places[i + 2]) for i in (0, 3))
+        begin, end = (LogPlace(places[i], places[i + 1], places[i + 1], places[i + 2]) for i in (0, 3))
         rows = Rows()
         for i, name in enumerate(COLUMNS):
             getattr(rows, name).frombytes(data[HEADER.size + 8 * count * i : HEADER.size + 8 * count * (i + 1)])
         return _Segment(path, begin, end, count), rows
 
-    def write(self, rows: Rows, end: Place) -> None:
+    def write(self, rows: Rows, end: LogPlace) -> None:
         """Keep the rows, which are all up to a place, where there are enough that are in no file. Raises OSError."""
         if len(rows) - self.count < EVERY or rows.damage:
             return

@@ -12,7 +12,7 @@ from typing import Literal, Self, cast
 
 from store.archive import files_of
 from store.backup import back_up
-from store.checkpoint_files import QUICK, THOROUGH, Draft
+from store.checkpoint_files import QUICK, THOROUGH, CheckpointDraft
 from store.checkpoints import Checkpoints
 from store.exceptions import NotAStoreError, ReadOnlyError, RecordError, StoreClosedError, StoreError, reported
 from store.files import is_file, store_folder
@@ -283,7 +283,9 @@ class Store:
         self._checkpoints.raise_failure()
         self._checkpoints.commit_later(draft)
 
-    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int = THOROUGH) -> Draft:
+    def _draft(
+        self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int = THOROUGH
+    ) -> CheckpointDraft:
         self._check_open(write=True)
         return self._checkpoints.draft(arrays, last_sequence, attributes, level)
 

@@ -31,13 +31,13 @@ from store.layout import (
     numbers,
     unsafe_entries,
 )
-from store.log import Place
+from store.log import LogPlace
 from store.records import JSON
 
 __all__ = ["FoundCheckpoint", "Problem", "Survey", "check_store", "require_store"]
 
 ATTEMPTS = 4
-NOWHERE = Place(0, 0, 0, NO_CHECKSUM)  # in the log, of a checkpoint that `CURRENT` does not name
+NOWHERE = LogPlace(0, 0, 0, NO_CHECKSUM)  # in the log, of a checkpoint that `CURRENT` does not name
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 
-class Place(StrEnum):
+class LabelSource(StrEnum):
     """What names a touch."""
 
     FILE = "file"
@@ -78,7 +78,7 @@ Preset = Annotated[
     ),
 ]
 Label = Annotated[str | None, typer.Option(help="What all of them are touches of.")]
-LabelBy = Annotated[Place | None, typer.Option(help="What names each touch.")]
+LabelBy = Annotated[LabelSource | None, typer.Option(help="What names each touch.")]
 Labels = Annotated[
     Path | None, typer.Option(help="A .csv of touches, with columns file, begin, end (in seconds) and material.")
 ]
@@ -109,7 +109,7 @@ def source_options(
     clock: str | None,
     columns: str | None,
     label: str | None,
-    label_by: Place | None,
+    label_by: LabelSource | None,
     labels: Path | None,
     label_topic: str | None,
     cut: Cut | None,

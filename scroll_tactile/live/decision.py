@@ -1,7 +1,7 @@
 """When a prediction is made within a touch, and when it is safe to act on.
 
 A touch is decided at the first moment at which its prediction is known and as probable as `sure`, or as strange as
-`strange`. Both are set by touches left out, run through all moments (see `prediction.moments`): the novelty that
+`strange`. Both are set by touches left out, run through all moments (see `prediction.moment_table`): the novelty that
 none of them comes near, and the least probability above which, with every higher one, so few of n are
 decided wrongly that
 
@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.moments import Trajectories
+from scroll_tactile.prediction.moment_table import Trajectories
 from scroll_tactile.readouts.calibration import FEWEST, UNMEASURED
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction

@@ -25,7 +25,7 @@ from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
 from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.moments import Fusion
+from scroll_tactile.prediction.moment_table import Fusion
 from scroll_tactile.readouts.calibration import (
     PRIOR_WEIGHT,
     Calibration,

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.match import Match
 from scroll_tactile.matching.matcher import TouchMatcher
-from scroll_tactile.prediction.moments import (
+from scroll_tactile.prediction.moment_table import (
     APART,
     LEAST_SPREAD,
     WITHIN,
@@ -50,7 +50,7 @@ __all__ = ["HeldOutMoment", "chosen_of", "full_match_weight", "fuse", "moments_o
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
-MOST_HELD_OUT = 96  # touches, each compared with all kept ones at every moment
+MOST_HELD_OUT = 192  # touches, each compared with all kept ones at every moment
 PRIOR_TOUCHES = 0.5  # that the prior, g = 1 and half of the lone β, counts as
 ALONE_TOUCHES = 2.0  # that the prior of the kept touches by themselves counts as
 SHARED_TOUCHES = 10.0  # that the weights of a moment and its neighbours count as

@@ -3,7 +3,7 @@
 The readouts alone judge a touch that they are sure of. One that lies far from all that was learned, that they are not
 sure of, or that has another length than those learned, is compared with kept touches as well (see `matching.matcher`):
 with their prefixes, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by
-its own row of the table (see `prediction.moments`), and they weigh exp(COUNTED e), e the log-likelihood gain per value.
+its own row of the `moment_table`, and they weigh exp(COUNTED e), e the log-likelihood gain per value.
 Channels that never change are filled in with what the kept touches have there, and the touch is judged again. The
 readouts weigh less the further the touch lies from what was learned (w, `Moment.distance_weight`), and the larger the
 share t of its deviation from kept touches that is noise (`Match.noise_share`):
@@ -27,7 +27,7 @@ from scroll_tactile.matching.match import Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
-from scroll_tactile.prediction.moments import WITHIN, match_scores, tempered
+from scroll_tactile.prediction.moment_table import WITHIN, match_scores, tempered
 from scroll_tactile.readouts.calibration import held_out_probabilities
 from scroll_tactile.readouts.leave_one_out import StageScores
 from scroll_tactile.results import Prediction, Unusual
@@ -75,8 +75,10 @@ def answer(
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
-    measured = all(judgement.moment.calibration.measures(false_alarms) for judgement in judgements)
-    known = False if novelty > threshold else True if measured and len(model.names) > 1 else None
+    calibrations = [judgement.moment.calibration for judgement in judgements]
+    measured = all(each.measures(false_alarms) for each in calibrations) and len(model.names) > 1
+    detects = measured and any(each.detects(false_alarms) for each in calibrations)
+    known = False if novelty > threshold else True if detects else None
     p_own, least_own, p_all, least_all = typical[order].T.tolist()
     unusual = tuple(sorted({way for judgement in judgements for way in judgement.unusual}))
     return Prediction(

@@ -17,7 +17,7 @@ from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
-from scroll_tactile.prediction.moments import Fusion, Moment
+from scroll_tactile.prediction.moment_table import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.leave_one_out import HeldOutScores

@@ -28,7 +28,7 @@ from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.moments import Fusion, Moment, Trajectories
+from scroll_tactile.prediction.moment_table import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.readout import Readout, ReadoutName
@@ -44,7 +44,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 NAME = "model"
-MADE_BY = f"{__version__}, 2"  # the release, and how it is written: the judge may differ in another
+MADE_BY = f"{__version__}, 3"  # the release, and how it is written: the judge may differ in another
 MOST_BANKS = 64
 OF_MOMENT = (
     "steps",
@@ -58,7 +58,7 @@ OF_MOMENT = (
     "mean_excess_loss",
     "loss_spread",
 )
-OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties")
+OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties", "novelties_if_new")
 
 
 def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
@@ -160,7 +160,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     expect(isinstance(names, list) and bool(names), "names", "materials", names)
     expect(all(isinstance(name, str) for name in names) and names == sorted(set(names)), "names", "in order", names)
     expect(names == now if same else bool(set(names) & set(now)), "names", f"{now}", names)
-    reader = _Reader(arrays, about, memory, names, same)
+    reader = _ModelReader(arrays, about, memory, names, same)
     readouts = reader.readouts()
     stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
     views = [view for view in memory.plan.views if view in readouts]
@@ -189,7 +189,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     )
 
 
-class _Reader:
+class _ModelReader:
     """Reads the parts of a model from arrays, and raises Unexpected for what they cannot be.
 
     same: whether the memory is as it was then.
@@ -331,13 +331,14 @@ class _Reader:
         weights, medians = self.floats("weights", (total,), 0.0, 1e300), self.floats("median_distances", (total,), 0.0)
         shapes = self.floats("scale_novelty", (novel, 2))
         expect(bool((shapes[:, 1] > 0).all()), "scale_novelty", "spreads above 0", "others")
-        novelties = self.floats("novelties", (int(lengths.sum()),))
+        novelties = [self.floats(name, (int(lengths.sum()),)) for name in ("novelties", "novelties_if_new")]
         ends = np.cumsum([0, *lengths.tolist()]).tolist()
         for i in range(len(scales)):
             own, measured = (slice(edges[i][j], edges[i + 1][j]) for j in (0, 1))
-            known = novelties[ends[i] : ends[i + 1]]
-            expect(bool((np.diff(known) >= 0).all()), "novelties", "ascending", "others")
-            yield Calibration(weights[own], shapes[measured], known, medians[own])
+            known, if_new = (each[ends[i] : ends[i + 1]] for each in novelties)
+            for each in (known, if_new):
+                expect(bool((np.diff(each) >= 0).all()), "novelties", "ascending", "others")
+            yield Calibration(weights[own], shapes[measured], known, if_new, medians[own])
 
     def _trajectories(self, moments: int) -> Trajectories:
         chances = array(self._arrays, "chances", ("float64",), (None, moments, None))

@@ -20,7 +20,7 @@ et al. 2005). All are functions of the statistics and the sample, so of what was
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -65,7 +65,8 @@ class Calibration:
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
     scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
-    novelties: sorted standardised novelty of known, held-out touches, shape (touches,).
+    novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
+    these touches had their own materials never been observed, sorted, shape (touches,).
     median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
     touch counts alike.
     """
@@ -73,6 +74,7 @@ class Calibration:
     weights: FloatArray
     scale_novelty: FloatArray
     novelties: FloatArray
+    novelties_if_new: FloatArray
     median_distances: FloatArray
 
     def weights_at(self, distances: FloatArray) -> FloatArray:
@@ -93,6 +95,10 @@ class Calibration:
     def measures(self, false_alarms: float) -> bool:
         """Whether enough known touches were held out to say which novelty such a share of them exceeds."""
         return self._rank(false_alarms) <= len(self.novelties)
+
+    def detects(self, false_alarms: float) -> bool:
+        """Whether touches of materials never observed are more often above the threshold of such a rate than below."""
+        return float(np.median(self.novelties_if_new)) > self.threshold(false_alarms)
 
     def threshold(self, false_alarms: float) -> float:
         """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
@@ -124,7 +130,7 @@ def calibrate_stage(
     medians = np.full(scales, np.inf)
     if not found.places:
         unheld = np.full(scales, _unheld(found.names, readouts, kind))
-        return Calibration(unheld, _assumed(novel), np.zeros(0), medians)
+        return Calibration(unheld, _assumed(novel), np.zeros(0), np.zeros(0), medians)
     scores, distances = found.scores(), found.distances().min(axis=2)
     if viewed:
         away = found.diagonal_distances()
@@ -132,14 +138,15 @@ def calibrate_stage(
         scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
     weights = scale_weights(scores, found.targets.tolist(), PRIOR_WEIGHT[kind] / scales)
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed(novel), np.zeros(0), medians)
+        return Calibration(weights, _assumed(novel), np.zeros(0), np.zeros(0), medians)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
-    unsorted = Calibration(weights, shape, np.zeros(0), medians).novelty(distances)
+    unsorted = Calibration(weights, shape, np.zeros(0), np.zeros(0), medians).novelty(distances)
     # The mean of scales that agree only in part spreads less than one: back to units of its own spread.
     shape[:, 1] *= max(float(unsorted.std()), 1e-9)
-    own_novelty = Calibration(weights, shape, np.zeros(0), medians).novelty(distances)
-    return Calibration(weights, shape, np.sort(own_novelty), medians)
+    scaled = Calibration(weights, shape, np.zeros(0), np.zeros(0), medians)
+    novelties, if_new = (np.sort(scaled.novelty(of)) for of in (distances, found.distances_if_new()))
+    return replace(scaled, novelties=novelties, novelties_if_new=if_new)
 
 
 @dataclass(frozen=True)

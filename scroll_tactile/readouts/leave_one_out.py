@@ -48,6 +48,7 @@ class HeldOutScores:
 
     rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
     about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
+    distances_if_new: shape (N,), that of the nearest other material, had its own never been observed.
     diagonal_distances: shape (N,), see `Readout.diagonal_distance`, from the material of the highest score.
     """
 
@@ -57,6 +58,7 @@ class HeldOutScores:
     scores: FloatArray
     z: FloatArray
     distances: FloatArray
+    distances_if_new: FloatArray
     diagonal_distances: FloatArray
 
 
@@ -91,6 +93,11 @@ class StageScores:
         picked = self._picked([one.distances for one in self._held_out])
         # In one order in memory: the bits of a mean over touches depend on it.
         return np.ascontiguousarray(picked[:, measuring([one.scale for one in self._held_out])])
+
+    def distances_if_new(self) -> FloatArray:
+        """The relative distance had its own material never been observed; scales as of `distances`, (N, S')."""
+        places = measuring([one.scale for one in self._held_out])
+        return np.stack([self._held_out[i].distances_if_new[self._rows[i]] for i in places], axis=1)
 
     def diagonal_distances(self) -> FloatArray:
         """Diagonal distances from the material of the highest score, (N, S)."""
@@ -141,8 +148,8 @@ def held_out_scores(
         assert leaving is not None
         parts.append(leaving.out(rows, weights, owners, None if queries is None else scored))
     joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
-    diagonal = np.concatenate([np.zeros(0), *(part[3] for part in parts)])
-    return HeldOutScores(readout.scale, index, names, joined[0], joined[1], joined[2], diagonal)
+    if_new, diagonal = (np.concatenate([np.zeros(0), *(part[i] for part in parts)]) for i in (3, 4))
+    return HeldOutScores(readout.scale, index, names, joined[0], joined[1], joined[2], if_new, diagonal)
 
 
 def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:
@@ -181,8 +188,10 @@ class _Leaving:
         weights: FloatArray,
         own: npt.NDArray[np.intp],
         queries: FloatArray | None = None,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Scores, z, distances, each of shape (M·q, R), and diagonal distances (M·q,), without the rows of each touch.
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Scores, z, distances, each of shape (M·q, R), without the rows of each touch; two more distances, (M·q,).
+
+        The two: the relative one without its whole material, and the diagonal one.
 
         rows: that each touch added, about the origin, (M, k, d). weights: the rows of the statistics that it stands
         for, (M,). own: its material among the reference, (M,). queries: what is scored, about the origin, (M, q, d);
@@ -211,16 +220,20 @@ class _Leaving:
             sizes[i, own] += 2 * change * classes_inner[i, own, -1] - np.square(change) * (1 + inner[:, -1, -1])
             length = np.square(scored).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto_inner)
             whole, leverage, across = self._whole(white, scored, columns, weights, share)
+            whole_if_new = self._whole_without_material(scored, columns, own)
         gamma = self.readout.gamma
         lda = gamma * (z - sizes[:, None, :] / 2)
         distances = gamma * (length - whole)[:, :, None] - 2 * lda
+        others = lda.copy()
+        others[i, :, own] = -np.inf
+        if_new = gamma * (length - whole_if_new) - 2 * others.max(axis=2)
         gain = self._as_new(white, columns, inner, weights, own)
         lda[i, :, own] += gain if queries is rows else gain[:, -1:]  # a query counts as the complete touch
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
         scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
         diagonal = self._diagonal_distances(rows, queries, weights, own, scores.argmax(axis=2))
         flat = [part.reshape(touches * count_scored, -1) for part in (scores, centred, distances)]
-        return flat[0], flat[1], flat[2], diagonal.reshape(-1)
+        return flat[0], flat[1], flat[2], if_new.reshape(-1), diagonal.reshape(-1)
 
     def _as_new(
         self,
@@ -281,6 +294,20 @@ class _Leaving:
         whole = length - np.einsum("nki,nki->nk", onto, onto @ inner)
         leverage, across = (np.square(share) * (self._products(of, half) + 1 / self.total) for of in (half, queries))
         return whole, leverage, across
+
+    def _whole_without_material(self, scored: FloatArray, leaving: FloatArray, own: npt.NDArray[np.intp]) -> FloatArray:
+        """As the first of `_whole`, but without the material of the touch; of it the scatter within stays, (M, q)."""
+        counts, middle = self.counts[own], self.means[own] - self.center
+        rest = self.total - counts
+        if not rest.all():
+            return np.full(scored.shape[:2], np.nan)
+        way = np.sqrt(self.excess * counts * self.total / rest)[:, None] * middle
+        columns = np.concatenate([leaving, way[:, None]], axis=1)
+        moved = scored - self.center + (counts / rest)[:, None, None] * middle[:, None]
+        inner = np.linalg.inv(self._products(columns, columns) - np.eye(columns.shape[1]))
+        onto = self._products(moved, columns)
+        length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
+        return np.asarray(length - np.einsum("nki,nki->nk", onto, onto @ inner))
 
     def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """xᵀ T⁻¹ y of whitened vectors, shape (M, a, b)."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 
-__all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "Channel", "channels_of", "drift"]
+__all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "ChannelSummary", "channels_of", "drift"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,7 +23,7 @@ STEADY = 0.5  # of a channel that lives, in as many touches at most it may be st
 
 
 @dataclass(frozen=True)
-class Channel:
+class ChannelSummary:
     """One channel, its levels as shares of its range.
 
     number: from 1. middle: the median; low, high: where 5 and 95 % of the readings lie. still: share of the touches in
@@ -71,7 +71,7 @@ class Channel:
 
 def channels_of(
     touches: Sequence[LevelArray], materials: Sequence[str], signed: npt.NDArray[np.bool_], *, ordered: bool
-) -> list[Channel]:
+) -> list[ChannelSummary]:
     """The channels of some touches, levels (C, T) each.
 
     signed: whether zero lies inside the range of each, (C,). ordered: whether the touches come as they were observed.
@@ -98,13 +98,13 @@ def _channel(
     moved: tuple[float, float] | None,
     *,
     signed: bool,
-) -> Channel:
+) -> ChannelSummary:
     total, read = int(counts.sum()), counts[:MISSING]
     reached = np.cumsum(read) / max(int(read.sum()), 1)
     low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
     bottom, top = float(read[0]) / max(int(read.sum()), 1), float(read[LEVELS - 1]) / max(int(read.sum()), 1)
     missing = float(counts[MISSING]) / max(total, 1)
-    return Channel(i + 1, middle, low, high, *still, bottom, top, signed, missing, moved)
+    return ChannelSummary(i + 1, middle, low, high, *still, bottom, top, signed, missing, moved)
 
 
 def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:

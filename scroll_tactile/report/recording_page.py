@@ -17,7 +17,7 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.recordings import Contents, Interval, Recording, describe, read, touches
 from scroll_tactile.recordings.presets import find
-from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, Channel, channels_of
+from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, ChannelSummary, channels_of
 from scroll_tactile.report.charts import FIRST_DATE, dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.page import Card, State, cards, figure, note, page, table
@@ -128,7 +128,7 @@ class _Seen:
     low: FloatArray
     high: FloatArray
     ranged: bool
-    channels: list[Channel]
+    channels: list[ChannelSummary]
 
     @classmethod
     def of(cls, recording: Recording, preset: str | None) -> _Seen | None:

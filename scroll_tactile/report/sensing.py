@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, Channel, channels_of
+from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, ChannelSummary, channels_of
 from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
 from scroll_tactile.report.page import Card, name_of, note, table
 from scroll_tactile.sensors import Sensor
@@ -28,7 +28,7 @@ COLUMNS = 400  # touches beside each other in the picture of all
 Pixels = npt.NDArray[np.uint8]
 
 
-def listed(channels: Sequence[Channel], most: int = 8) -> str:
+def listed(channels: Sequence[ChannelSummary], most: int = 8) -> str:
     """Their numbers in words."""
     numbers = [str(channel.number) for channel in channels]
     return ", ".join(numbers[:most]) + (f" and {len(numbers) - most} more" if len(numbers) > most else "")
@@ -43,9 +43,9 @@ def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) ->
     return card_of(_channels(sensor, kept, ordered), f"{len(kept)} kept touches")
 
 
-def card_of(found: Sequence[Channel], by: str) -> Card:
+def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
     """How channels stand, of these readings."""
-    wrong: dict[str, list[Channel]] = {}
+    wrong: dict[str, list[ChannelSummary]] = {}
     for channel in found:
         for fault in channel.faults:
             wrong.setdefault(fault, []).append(channel)
@@ -57,7 +57,7 @@ def card_of(found: Sequence[Channel], by: str) -> Card:
     return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
-def _channels(sensor: Sensor, kept: Sequence[KeptTouch], ordered: bool) -> list[Channel]:
+def _channels(sensor: Sensor, kept: Sequence[KeptTouch], ordered: bool) -> list[ChannelSummary]:
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
     levels, materials = [touch.levels for touch in kept], [touch.material for touch in kept]
     return channels_of(levels, materials, (low < 0) & (high > 0), ordered=ordered)
@@ -91,7 +91,9 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool)
     return head + note(words) + state_rows(found, low, high, unit)
 
 
-def state_rows(found: Sequence[Channel], low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], unit: str) -> str:
+def state_rows(
+    found: Sequence[ChannelSummary], low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], unit: str
+) -> str:
     """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
     faulty = [channel for channel in found if channel.faults]
     others = [channel for channel in found if not channel.faults] if len(found) <= MOST_ROWS else []

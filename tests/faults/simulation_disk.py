@@ -23,7 +23,7 @@ import store.rows
 from faults import shim as watch
 from faults.disks import STYLES, Disk, Event, File, Folder, Style, events, rebuild
 from faults.shim import Shim
-from store.checkpoint_files import Draft
+from store.checkpoint_files import CheckpointDraft
 from store.chunks import ArrayContent
 
 AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
@@ -134,7 +134,7 @@ class _Group:
         (self._path / "zarr.json").write_text(text)
 
 
-def write_zarr(path: Path, draft: Draft, described: Mapping[str, ArrayContent], level: int | None) -> Any:
+def write_zarr(path: Path, draft: CheckpointDraft, described: Mapping[str, ArrayContent], level: int | None) -> Any:
     """What zarr writes, file for file, a hundred times as fast; the arrays are of one chunk."""
     path.mkdir()
     for name, array in draft.arrays.items():

@@ -9,7 +9,7 @@ import pytest
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
-from scroll_tactile.prediction.moments import Trajectories
+from scroll_tactile.prediction.moment_table import Trajectories
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene

@@ -14,7 +14,7 @@ from scroll_tactile.prediction.fusion import (
     fuse,
     moments_of,
 )
-from scroll_tactile.prediction.moments import Moment, tempered
+from scroll_tactile.prediction.moment_table import Moment, tempered
 from scroll_tactile.readouts.calibration import FEWEST, Calibration, HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]

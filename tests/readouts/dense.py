@@ -16,7 +16,7 @@ class Dense:
     """
 
     def __init__(self, groups, penalty, share, reference=None, total=None, excess=None):
-        self.names, self.penalty, self.share = sorted(groups), penalty, share
+        self.groups, self.names, self.penalty, self.share = groups, sorted(groups), penalty, share
         self.reference = self.names if reference is None else list(reference)
         self.counts = {name: sum(Fraction(often) for _, often in rows) for name, rows in groups.items()}
         self.width = len(next(iter(groups.values()))[0][0])
@@ -38,7 +38,7 @@ class Dense:
         self.center = [
             sum(self.shares[name] * self.means[name][j] for name in self.reference) for j in range(self.width)
         ]
-        excess = Fraction(self.total) / known if excess is None else excess
+        self.excess = excess = Fraction(self.total) / known if excess is None else excess
         with mpmath.workdps(DIGITS):
             self.within = self.matrix(self.scatter) + self.number(penalty) * mpmath.eye(self.width)
             whole = self.within.copy()

@@ -64,6 +64,9 @@ def require_left_out(found, place, row, own, without, every, material, weight, r
         scores = np.array(without.ridge(row, reference)) - shares + readout.shares
     require_near(found.scores[place], scores)
     require_near(found.distances[place], without.distances(row, reference))
+    if others := [name for name in reference if name != material]:
+        new = Dense(without.groups, without.penalty, without.share, others, without.total, without.excess)
+        require_near(found.distances_if_new[place], min(new.distances(row, others)))
     best = reference[int(found.scores[place].argmax())]
     away = [float(int(x) - m) for x, m in zip(row, without.means[best], strict=True)]
     total = float(readout.counts.sum())

@@ -12,7 +12,7 @@ import store.log
 import store.log_writer
 from store import DamageError, RecordError, StoreClosedError
 from store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.log_file import PART
 from store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
 from store.records import payload_digest
@@ -369,7 +369,7 @@ def test_a_forged_number_is_damage(whole, tmp_path, frame):
 def test_a_place_behind_the_last_number_that_there_can_be_is_refused(whole, tmp_path):
     path = tmp_path / "log"
     path.write_bytes(forged(whole, (2**64 - 1, 2**64 - 1, COMMIT, 0, b"")))
-    place = Place(path.stat().st_size, 2**64, 2**64, path.read_bytes()[-16:])
+    place = LogPlace(path.stat().st_size, 2**64, 2**64, path.read_bytes()[-16:])
     with pytest.raises(DamageError, match="holds no batch"):
         LogWriter(path, place=place)
 

@@ -11,7 +11,7 @@ import struct
 import numpy as np
 import numpy.typing as npt
 
-from store.frames import decompress_zstd, unshuffle_bits
+from store.compression import decompress_zstd, unshuffle_bits
 
 __all__ = ["decompress_blosc"]
 

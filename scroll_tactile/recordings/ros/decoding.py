@@ -37,7 +37,7 @@ class MessageTypes:
 
     def __init__(self, request: Request) -> None:
         self.given = request.definitions
-        self.readers: dict[Channel, _Reader] = {}
+        self.readers: dict[Channel, _MessageReader] = {}
 
     def decode(self, channel: Channel, data: bytes, budget: Budget) -> object:
         """Raises RecordingError for a type that is not defined, bytes that do not fit it, or a budget that is spent."""
@@ -59,7 +59,7 @@ class MessageTypes:
 
 
 @dataclass(frozen=True)
-class _Reader:
+class _MessageReader:
     """What makes an object of bytes. steps: of work for each; nested: whether more come with its bytes."""
 
     read: Callable[[bytes], object]
@@ -76,9 +76,9 @@ def _lines(text: str) -> int:
 
 
 @functools.lru_cache(256)  # as many bags as touches have the same messages
-def _reader(channel: Channel, given: str) -> _Reader:
+def _reader(channel: Channel, given: str) -> _MessageReader:
     if channel.encoding == "json":
-        return _Reader(json.loads)
+        return _MessageReader(json.loads)
     if channel.encoding not in ("cdr", "ros1"):
         raise RecordingError(
             f"messages of topic {channel.topic!r} are encoded as {channel.encoding!r}; expected cdr, ros1 or json"
@@ -109,8 +109,8 @@ def _reader(channel: Channel, given: str) -> _Reader:
     if objects > _MOST_OBJECTS:
         raise RecordingError(f"a message of {channel.type} holds {objects} values; expected at most {_MOST_OBJECTS}")
     if channel.encoding == "ros1":
-        return _Reader(lambda data: store.deserialize_ros1(data, channel.type), _A_MESSAGE + objects, nested)
-    return _Reader(functools.partial(_read_cdr, store, channel.type), _A_MESSAGE + objects, nested)
+        return _MessageReader(lambda data: store.deserialize_ros1(data, channel.type), _A_MESSAGE + objects, nested)
+    return _MessageReader(functools.partial(_read_cdr, store, channel.type), _A_MESSAGE + objects, nested)
 
 
 def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | None]) -> tuple[int, bool]:

@@ -19,7 +19,7 @@ from store.chunks import ArrayContent
 from store.encoding import array_digest, check_arrays, encode_payload
 from store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
 from store.layout import CURRENT_FILE, checkpoint_path, log_path
-from store.log import LogReader, Place
+from store.log import LogPlace, LogReader
 from store.records import payload_digest
 from store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
 from store.rows import Rows
@@ -63,15 +63,15 @@ def read_log(path: Path) -> tuple[bytes, list[bytes]]:
 
 def log_bytes(
     identity: bytes, header: bytes, batches: Iterable[Sequence[tuple[int, bytes]]]
-) -> tuple[bytes, list[Place]]:
+) -> tuple[bytes, list[LogPlace]]:
     """The bytes of a log, and the place behind its first frame and behind each batch of kinds and payloads."""
     data, frame = pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)
-    parts, places, at = [data], [Place.behind(frame)], Place.behind(frame)
+    parts, places, at = [data], [LogPlace.behind(frame)], LogPlace.behind(frame)
     for batch in batches:
         for kind, payload in [*batch, (COMMIT, b"")]:
             data, frame = pack_frame(identity, at.offset, at.number, at.batch, kind, payload, at.previous)
             parts.append(data)
-            at = Place.behind(frame)
+            at = LogPlace.behind(frame)
         places.append(at)
     return b"".join(parts), places
 
@@ -92,7 +92,7 @@ def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) ->
     set_current(path, **current)
 
 
-def as_place(place: Place) -> list[Any]:
+def as_place(place: LogPlace) -> list[Any]:
     """A place as `CURRENT` has it."""
     return [place.offset, place.number, place.previous.hex()]
 

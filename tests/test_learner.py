@@ -132,7 +132,7 @@ def test_something_never_felt_is_more_novel(readout):
     learner = learner_of(repetitions=12, names=NAMES[:3], readout=readout)
     noise = np.random.default_rng(0).uniform(-1, 1, size=(100, 3))
     known = [learner.predict(touch(name, 30 + i)) for i in range(8) for name in NAMES[:3]]
-    assert sum(one.known for one in known) >= 20
+    assert sum(one.known is not False for one in known) >= 20
     strange = learner.predict(noise)
     assert strange.known is False
     assert strange.novelty > max(one.novelty for one in known)

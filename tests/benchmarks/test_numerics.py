@@ -1,7 +1,9 @@
 """`benchmarks numerics`: its truths, its cases, what it measures and what it shows."""
 
+import importlib.util
 import json
 import runpy
+import sys
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -285,7 +287,9 @@ def test_what_cannot_be_written_is_refused_before_anything_is_measured(tmp_path)
 
 
 def test_a_library_that_is_not_there_is_named_with_what_installs_it(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    found = importlib.util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "flint" else found(name))
+    monkeypatch.delitem(sys.modules, "examples.benchmarks.__main__", raising=False)
     app = runpy.run_module("examples.benchmarks.__main__")["app"]
     result = CliRunner().invoke(app, ["numerics"])
     assert result.exit_code == 1 and "[bench]" in result.stderr

@@ -125,7 +125,7 @@ def test_the_command_measures_prints_and_writes_it(tmp_path, monkeypatch, measur
     )
     assert str(tmp_path) not in (tmp_path / "r").read_text()
     assert {"load_average", "load_average_after", "versions", "date", "seed"} <= found.keys()
-    assert "predict right after an observe" in result.output
+    assert "observe, durable" in result.output
 
 
 def test_a_folder_that_is_no_checkout_is_refused(tmp_path):

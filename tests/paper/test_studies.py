@@ -106,7 +106,7 @@ STUDIES = {
         ("streaming LDA", "published: ResNet", "plot:"),
     ),
     "metrics": Study(
-        "metrics roboskin-20 --robots 3 --buffer 8 --every 5",
+        "metrics roboskin-20 --robots 3 --buffer 4 --every 20",
         {
             ("means",): {f"{stream}, {method}" for stream in STREAMS for method in METHODS}
             | {"fleet of 1, alpha 1", "fleet of 3, alpha 0.1"},

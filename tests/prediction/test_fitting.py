@@ -139,7 +139,7 @@ def test_nothing_is_fitted_when_it_is_asked_for(learner, monkeypatch):
 def test_a_touch_at_another_pace_is_known_and_right(learner, times):
     said = [(learner.predict(faster(touch.readings, times)), name) for name, touch in LATER]
     assert np.mean([now.material == name for now, name in said]) >= 0.9
-    assert np.mean([now.known is not False for now, _ in said]) >= 0.85  # eight of each pace were held out: a twentieth, or two
+    assert np.mean([now.known is not False for now, _ in said]) >= 0.85  # eight of each were held out
 
 
 def test_beginnings_are_right_sooner_than_later_and_no_surer_than_that(model):

@@ -187,7 +187,7 @@ def verdict(prediction: Prediction) -> str:
     felt = f" ({', '.join((f'novelty {prediction.novelty:.1f}', *prediction.unusual))})"
     if prediction.known is False:
         return f"[bold yellow]never felt this[/]; nearest is {name}{felt}"
-    doubt = "" if prediction.known else ", if it was ever felt: too few touches to know"
+    doubt = "" if prediction.known else ", if it was ever felt: nothing learned so far can tell"
     return f"[bold green]{name}[/] with {percent(prediction.probability)}{felt}{doubt}"
 
 

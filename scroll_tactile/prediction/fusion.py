@@ -155,7 +155,7 @@ def chosen_of(complete: HeldOutProbabilities, matcher: TouchMatcher | None) -> t
     """
     kept = set() if matcher is None else matcher.kept.rows().keys()
     ranked = [key for _, key in sorted(zip(complete.margins.tolist(), complete.keys, strict=True)) if key in kept]
-    keys, unsure = sorted(ranked), ranked[: MOST_HELD_OUT // 2]
+    keys, unsure = sorted(ranked), ranked[: MOST_HELD_OUT // 4]
     places = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int)
     chosen = [keys[i] for i in places]
     surer = [key for key in chosen if key not in set(unsure)]

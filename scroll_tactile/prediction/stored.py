@@ -338,7 +338,7 @@ class _ModelReader:
             known, if_new = (each[ends[i] : ends[i + 1]] for each in novelties)
             for each in (known, if_new):
                 expect(bool((np.diff(each) >= 0).all()), "novelties", "ascending", "others")
-            yield Calibration(weights[own], shapes[measured], known, if_new, medians[own])
+            yield Calibration(weights[own], shapes[measured], medians[own], known, if_new)
 
     def _trajectories(self, moments: int) -> Trajectories:
         chances = array(self._arrays, "chances", ("float64",), (None, moments, None))

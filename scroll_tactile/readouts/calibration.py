@@ -20,7 +20,7 @@ et al. 2005). All are functions of the statistics and the sample, so of what was
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -65,17 +65,17 @@ class Calibration:
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
     scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
-    novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
-    these touches had their own materials never been observed, sorted, shape (touches,).
     median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
     touch counts alike.
+    novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
+    these touches had their own materials never been observed, sorted, shape (touches,). Both empty where too few were.
     """
 
     weights: FloatArray
     scale_novelty: FloatArray
-    novelties: FloatArray
-    novelties_if_new: FloatArray
     median_distances: FloatArray
+    novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
+    novelties_if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def weights_at(self, distances: FloatArray) -> FloatArray:
         """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
@@ -130,7 +130,7 @@ def calibrate_stage(
     medians = np.full(scales, np.inf)
     if not found.places:
         unheld = np.full(scales, _unheld(found.names, readouts, kind))
-        return Calibration(unheld, _assumed(novel), np.zeros(0), np.zeros(0), medians)
+        return Calibration(unheld, _assumed(novel), medians)
     scores, distances = found.scores(), found.distances().min(axis=2)
     if viewed:
         away = found.diagonal_distances()
@@ -138,13 +138,13 @@ def calibrate_stage(
         scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
     weights = scale_weights(scores, found.targets.tolist(), PRIOR_WEIGHT[kind] / scales)
     if len(distances) < FEWEST:
-        return Calibration(weights, _assumed(novel), np.zeros(0), np.zeros(0), medians)
+        return Calibration(weights, _assumed(novel), medians)
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
-    unsorted = Calibration(weights, shape, np.zeros(0), np.zeros(0), medians).novelty(distances)
+    unsorted = Calibration(weights, shape, medians).novelty(distances)
     # The mean of scales that agree only in part spreads less than one: back to units of its own spread.
     shape[:, 1] *= max(float(unsorted.std()), 1e-9)
-    scaled = Calibration(weights, shape, np.zeros(0), np.zeros(0), medians)
+    scaled = Calibration(weights, shape, medians)
     novelties, if_new = (np.sort(scaled.novelty(of)) for of in (distances, found.distances_if_new()))
     return replace(scaled, novelties=novelties, novelties_if_new=if_new)
 

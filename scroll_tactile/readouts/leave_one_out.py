@@ -287,11 +287,7 @@ class _Leaving:
         if self.excess > 1:
             columns = np.concatenate([columns, np.sqrt(self.excess - 1) * leaving], axis=1)
             signs = np.repeat([-1.0, 1.0], count)
-        moved = queries + (weights[:, None] / rest * middle)[:, None, :]
-        inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
-        onto = self._products(moved, columns)
-        length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
-        whole = length - np.einsum("nki,nki->nk", onto, onto @ inner)
+        whole = self._length_without(queries + (weights[:, None] / rest * middle)[:, None, :], columns, signs)
         leverage, across = (np.square(share) * (self._products(of, half) + 1 / self.total) for of in (half, queries))
         return whole, leverage, across
 
@@ -304,7 +300,11 @@ class _Leaving:
         way = np.sqrt(self.excess * counts * self.total / rest)[:, None] * middle
         columns = np.concatenate([leaving, way[:, None]], axis=1)
         moved = scored - self.center + (counts / rest)[:, None, None] * middle[:, None]
-        inner = np.linalg.inv(self._products(columns, columns) - np.eye(columns.shape[1]))
+        return self._length_without(moved, columns, -np.ones(columns.shape[1]))
+
+    def _length_without(self, moved: FloatArray, columns: FloatArray, signs: FloatArray) -> FloatArray:
+        """The squared length, (M, q), of whitened vectors (M, q, d) under T changed by signed columns (M, k, d)."""
+        inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
         onto = self._products(moved, columns)
         length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
         return np.asarray(length - np.einsum("nki,nki->nk", onto, onto @ inner))

@@ -53,7 +53,7 @@ def judged(columns, logits, scores, keys=KEYS, information=0.5):
     logs = np.zeros((len(keys), C)) if logits is None else logits
     logs = logs - np.log(np.exp(logs).sum(axis=1, keepdims=True))
     novelty = np.random.default_rng(columns).normal(size=len(keys))
-    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.sort(novelty), np.sort(novelty) + 9, np.ones(1))
+    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.ones(1), np.sort(novelty), np.sort(novelty) + 9)
     targets = np.array([OWN[key] for key in keys], dtype=np.intp)
     held = HeldOutProbabilities(NAMES, [*range(len(keys))], list(keys), targets, logs, np.ones(len(keys)), novelty)
     said = np.zeros((len(keys), C)) if scores is None else scores
@@ -220,7 +220,7 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
 
 def test_the_threshold_of_a_moment_is_the_conformal_quantile_of_its_touches():
     calibration = Calibration(
-        np.ones(1), np.array([[0.0, 1.0]]), np.arange(1.0, 100.0), np.arange(51.0, 150.0), np.ones(1)
+        np.ones(1), np.array([[0.0, 1.0]]), np.ones(1), np.arange(1.0, 100.0), np.arange(51.0, 150.0)
     )
     numbers = 1.0, 0.5, 0.5, 0.0, 0.0, np.inf, 0.0, 1.0
     moment = Moment(10, 0, calibration, *numbers)

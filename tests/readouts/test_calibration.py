@@ -144,7 +144,7 @@ def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(un
 def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
     """Of n + 1 exchangeable touches the new one lies above rank r with probability (n + 1 − r) / (n + 1)."""
     known = np.arange(1.0, touches + 1)
-    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), known, known, np.ones(1))
+    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.ones(1), known, known)
     alarms = [Fraction(touches + 1 - rank, touches + 1) for rank in range(1, touches + 1)]
     kept = [rank for rank, alarm in enumerate(alarms, start=1) if alarm <= Fraction(str(share))]
     # Where not even the largest keeps it, twice that.
@@ -229,21 +229,21 @@ positive = st.floats(1e-3, 1e6)
 @given(st.lists(st.tuples(st.floats(0, 9), positive, st.floats(0, 1e6)), min_size=1, max_size=4))
 def test_a_scale_is_weighed_less_the_further_away_a_touch_is_in_it(scales):
     weights, medians, away = map(np.array, zip(*scales, strict=True))
-    calibration = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), np.zeros(0), medians)
+    calibration = Calibration(weights, np.ones((len(weights), 2)), medians)
     expected = [w if s <= u else w * (u / s) for w, u, s in scales]
     np.testing.assert_allclose(calibration.weights_at(away), expected)
     further = calibration.weights_at(2 * away + 1)
     assert (further <= calibration.weights_at(away)).all()
     assert calibration.weights_at(np.stack([away, away])).shape == (2, len(weights))
     never = np.full(len(weights), np.inf)
-    undoubted = Calibration(weights, np.ones((len(weights), 2)), np.zeros(0), np.zeros(0), never)
+    undoubted = Calibration(weights, np.ones((len(weights), 2)), never)
     assert undoubted.weights_at(away).tolist() == weights.tolist()
 
 
 def test_new_touches_are_told_where_most_of_them_lie_above_the_threshold():
     known, ones = np.arange(1.0, 100.0), np.ones(1)
     new = {share: np.sort(np.where(np.arange(99) < 99 * share, 200.0, 0.0)) for share in (0.4, 0.6)}
-    found = {share: Calibration(ones, np.array([[0.0, 1.0]]), known, values, ones) for share, values in new.items()}
+    found = {share: Calibration(ones, np.array([[0.0, 1.0]]), ones, known, values) for share, values in new.items()}
     assert {share: one.detects(0.05) for share, one in found.items()} == {0.4: False, 0.6: True}
 
 

@@ -74,7 +74,7 @@ class TactileLearner(MemoryKeeper):
         self._set_up(Predictor.new(RecipeRequest.of(sensor, embedding, augmentation, settings).recipe()))
 
     def _set_up(self, predictor: Predictor, snapshot_of: str | None = None) -> None:
-        self._predictor, self._snapshot_of, self._range_said = predictor, snapshot_of, False
+        self._predictor, self._snapshot_of, self._range_warned = predictor, snapshot_of, False
 
     @classmethod
     def open(
@@ -176,8 +176,8 @@ class TactileLearner(MemoryKeeper):
         receipt = predictor.ledger.observe(material, touch, *predictor.extractor.learned(touch), source, again=again)
         with predictor.ledger.lock:
             predictor.current.prepare(predictor.ledger)
-        if not self._range_said and (problem := range_problem(touch)) is not None:
-            self._range_said = True
+        if not self._range_warned and (problem := range_problem(touch)) is not None:
+            self._range_warned = True
             warnings.warn(problem, RangeWarning, stacklevel=2)
         return receipt
 

@@ -242,7 +242,7 @@ class Journal:
                 found = at.rows.sequences[index] if index < len(at.rows) else last + 1
                 try:
                     if chosen:
-                        at.tell_damage()
+                        at.warn_of_damage()
                     else:
                         at.require_no_gap(after, min(found - 1, last), index)
                     if found > last:
@@ -272,7 +272,7 @@ class Journal:
         """Yield the rows of a key, but for damaged ones, which a logged warning names."""
         with self._looking("looking for a key") as at:
             at.find(0)
-            at.tell_damage()
+            at.warn_of_damage()
             sequences = [at.rows.sequences[index] for index in at.rows.with_key(key)]
         for sequence in sequences:
             try:

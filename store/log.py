@@ -298,12 +298,12 @@ class LogReader:
             return self._file.size()
 
     @property
-    def beginning(self) -> LogPlace:
+    def first_place(self) -> LogPlace:
         """The place of the first frame behind the header."""
         assert self._first is not None, "its header is damaged"
         return LogPlace.behind(self._first)
 
-    def beginning_at(self, place: LogPlace) -> LogReader:
+    def reader_at(self, place: LogPlace) -> LogReader:
         """Return another reader, of heads alone, of the same open file, whatever its path names by now.
 
         That one is not to be closed.

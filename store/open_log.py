@@ -32,14 +32,14 @@ class OpenLog:
 
     def __init__(self, files: Files, current: Current, *, write: bool) -> None:
         self._files, self.current, self.path = files, current, log_path(files.folder, current.log)
-        self.rows, self.first, self._told = Rows(), 0, 0
+        self.rows, self.first, self._warned = Rows(), 0, 0
         named = current.newest
         self.log = self._reader(None if named is None else named.place, write=write)
         try:
             if self.log.identity != current.log_identity:
                 raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
             self.identity = self._read_identity()
-            self.index = Index(files.folder, current.log_identity, self.log.beginning)
+            self.index = Index(files.folder, current.log_identity, self.log.first_place)
             if named is not None and self.log.place == named.place:
                 self.first = named.last_sequence
             self.read_all = self.first == 0
@@ -121,19 +121,19 @@ class OpenLog:
 
     def _rows_until(self, until: int, *, indexed: bool) -> Rows:
         """Return all rows before an offset, by the index as far as it goes and is of this log, if it may be used."""
-        self.index = Index(self._files.folder, self.current.log_identity, self.log.beginning)
+        self.index = Index(self._files.folder, self.current.log_identity, self.log.first_place)
         rows = self.index.read(self.log, until) if indexed else Rows()
-        for _ in rows.take(self.log.beginning_at(self.index.end), until):
+        for _ in rows.take(self.log.reader_at(self.index.end), until):
             pass
         return rows
 
-    def tell_damage(self) -> None:
+    def warn_of_damage(self) -> None:
         """Log a warning, once, for all that is damaged among the rows that are known."""
-        for damage in () if self._told == len(self.rows.damage) else self.rows.damage.values():
+        for damage in () if self._warned == len(self.rows.damage) else self.rows.damage.values():
             logger.warning(
                 "%s; what was there is passed over where rows of one kind, name or key are asked for", damage[0]
             )
-        self._told = len(self.rows.damage)
+        self._warned = len(self.rows.damage)
 
     def drop_index(self) -> bool:
         """Read the log itself where an index was used, which may be wrong; whether one was."""

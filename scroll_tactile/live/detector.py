@@ -137,7 +137,7 @@ class ContactDetector:
             self._energy += distance
             near = max(self._rest.near, RESIDUAL * self._energy / self._length)
             if self._length >= ring and sum(self._last_distances) <= ring * (self._rest.inner + near):
-                far, own = self._rest.apart(self._last_aways, self._last_distances)
+                far, own = self._rest.mean_and_scatter(self._last_aways, self._last_distances)
                 if far <= near and own <= self._rest.inner:
                     if far > self._rest.near:
                         self._rest.resume(self._last)
@@ -147,7 +147,7 @@ class ContactDetector:
     def _full(self) -> Event | None:
         """A block is full: of rest, or of contact."""
         block, distances = self._block.copy(), self._distances
-        _, own = self._rest.apart(self._aways, distances)
+        _, own = self._rest.mean_and_scatter(self._aways, distances)
         self._distances = []
         self._still = self._still + 1 if own <= self._rest.inner else 0
         quieter = 0 < own * QUIETER < self._rest.mean and self._rest.mean > self._rest.channels / 2

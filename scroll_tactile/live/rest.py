@@ -80,7 +80,7 @@ class Rest:
         np.clip(away, -FARTHEST, FARTHEST, out=away)
         return away, (np.einsum("ij,ij->i", away, away) / UNITS**2).tolist()
 
-    def apart(self, away: Whole, distances: list[float]) -> tuple[float, float]:
+    def mean_and_scatter(self, away: Whole, distances: list[float]) -> tuple[float, float]:
         """Of some readings, in whitened channels: d² of their mean, and their own mean d² about it."""
         total, count = away.sum(axis=0), len(away)
         far = float(total @ total) / (count * UNITS) ** 2

@@ -144,16 +144,16 @@ class MemoryKeeper(ABC):
         where the file is merged, and counted once where it is there already. They are left out of a memory of which any
         were compacted. Without them come the readings of the exemplars. readings: False leaves out all that shows a
         touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with
-        exemplars=0 and kept_touches=0. source: what is said of observations that have none.
+        exemplars=0 and kept_touches=0. source: of observations that have none.
 
         Raises InputError in a memory without a path, and for a source that is none; StoreError.
         """
         require_arguments({"path": path})
-        said = None if source is None else require_source(source)
+        checked_source = None if source is None else require_source(source)
         ledger = self._ledger
         with ledger.lock:
             store = ledger.require_store("be packed")
-            pack_memory(store, ledger.memory, Path(path), rows=rows, readings=readings, source=said)
+            pack_memory(store, ledger.memory, Path(path), rows=rows, readings=readings, source=checked_source)
 
     def compact(self, *, keep: int = 0) -> Compacted:
         """Give up the features and readings of old observations, for space; what was learned from them stays.

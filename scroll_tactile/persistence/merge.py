@@ -32,7 +32,7 @@ class MergeRules:
 
     once: leave out streams that both observed, of one material with one content hash. one_name: refuse touches that are
     there under another name, or came under one before, and leave out those that came before under theirs: what was
-    learned from sources. clipped: contents that clipping made, of which the refusal says so. said: the source of
+    learned from sources. clipped: contents that clipping made, of which the refusal says so. default_source: of
     touches that say none. thorough: see `Gate`.
     """
 
@@ -40,7 +40,7 @@ class MergeRules:
     one_name: bool = False
     descriptions: Choice = "same"
     clipped: Collection[bytes] = ()
-    said: str | None = None
+    default_source: str | None = None
     thorough: bool = True
 
 
@@ -50,8 +50,8 @@ class MergePlan:
 
     rows: heads of its journal. compaction: what stands for those that it compacted. shared: streams that both observed,
     and that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are
-    there under another name, and why that is refused. descriptions: by material, those that we have not. said: see
-    `MergeRules`. newest: what a packed memory sums up.
+    there under another name, and why that is refused. descriptions: by material, those that we have not.
+    default_source: see `MergeRules`. newest: what a packed memory sums up.
     """
 
     source: MemoryStore
@@ -61,7 +61,7 @@ class MergePlan:
     left_out: list[Head]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
-    said: str | None
+    default_source: str | None
     newest: Checkpoint | None
 
     @classmethod
@@ -110,7 +110,7 @@ class MergePlan:
                     ours.record(sequence)
         shared = len(both) + len(again)
         summed = newest if theirs.is_packed else None
-        return cls(theirs, found, rows, shared, left_out, refused, described, rules.said, summed)
+        return cls(theirs, found, rows, shared, left_out, refused, described, rules.default_source, summed)
 
     def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; the number of observations that came in.
@@ -162,15 +162,15 @@ class MergePlan:
         for head in self.rows:
             if compaction is not None and head.sequence <= compaction.last_sequence:
                 if head.kind != MERGE:  # a merge before the compaction checkpoint is a part of it
-                    kept = {name: value for name, value in self._said(head).items() if name == SOURCE}
+                    kept = {name: value for name, value in self._attributes_of(head).items() if name == SOURCE}
                     yield MEMBER, head.label, head.key, kept, None, head.time
             else:
                 record = self.source.record(head.sequence)
-                yield head.kind, head.label, head.key, self._said(head), record.arrays, head.time
+                yield head.kind, head.label, head.key, self._attributes_of(head), record.arrays, head.time
 
-    def _said(self, head: Head) -> dict[str, Any]:
-        touch = head.kind in (OBSERVE, MEMBER) and self.said is not None
-        return {**({SOURCE: self.said} if touch else {}), **head.attributes}
+    def _attributes_of(self, head: Head) -> dict[str, Any]:
+        touch = head.kind in (OBSERVE, MEMBER) and self.default_source is not None
+        return {**({SOURCE: self.default_source} if touch else {}), **head.attributes}
 
 
 def _row(contents: ListedContents | StoredContents, head: Head) -> int | None:

@@ -34,7 +34,7 @@ from scroll_tactile.memory.touch_rows import SOURCE
 from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.pipelines.addresses import expand, fetched
 from scroll_tactile.pipelines.runfile import alone_in
-from scroll_tactile.pipelines.sources import Refused, SourceOptions, said_of
+from scroll_tactile.pipelines.sources import Refused, SourceOptions, stored_source
 from scroll_tactile.pipelines.workers.destination import Destination, FleetReport
 from scroll_tactile.pipelines.workers.engines import Engine, engine, require_workers
 from scroll_tactile.pipelines.workers.jobs import Made, learn_job
@@ -155,7 +155,7 @@ class _Run:
         while self._steps.steps:
             step = self._steps.steps[0]
             if not step.memory and step.made is None:
-                self._into.learn(step, lambda what, done, of: self._tell(done))
+                self._into.learn(step, lambda what, done, of: self._show_progress(done))
             self._come_in(step)
 
     def work(self, engine: Engine) -> None:
@@ -191,7 +191,7 @@ class _Run:
         elif not self._merge_made(step, step.made):
             return True
         self._report.sources += len(self._steps.came_in(step))
-        self._tell()
+        self._show_progress()
         return True
 
     def _merge_made(self, step: Step, made: Made) -> bool:
@@ -215,7 +215,7 @@ class _Run:
         place = Path(source)
         try:
             with fetched(source, self._patience) as place:
-                refused = self._into.merge(place, self._merging, source=said_of(source))
+                refused = self._into.merge(place, self._merging, source=stored_source(source))
         except (InputError, MismatchError, StoreError, OSError) as error:
             if isinstance(error, StoreError) and not _is_of(error, place):
                 raise
@@ -228,7 +228,7 @@ class _Run:
     def _merging(self, what: str, done: int, of: int) -> None:
         self._progress(f"{what} {done} of {of} touches", self._report.sources, self._total)
 
-    def _tell(self, more: int = 0) -> None:
+    def _show_progress(self, more: int = 0) -> None:
         """Say how far the run is; more: sources of the step that is being learned."""
         seconds, refused = time.perf_counter() - self._begun, len(self._report.refused)
         count, done = self._report.observations, min(self._report.sources + refused + more, self._total)

@@ -32,8 +32,8 @@ __all__ = [
     "contact_spans",
     "find_sources",
     "has_touches",
-    "said_of",
     "source_touches",
+    "stored_source",
 ]
 
 FALSE_CONTACTS = 1.0  # an hour
@@ -214,10 +214,10 @@ def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:
     whole = (touch.begin, touch.end) == (0, len(recording))
     where = recording.source + ("" if whole else f"[{touch.begin}:{touch.end}]")
     within = [recording.topic, recording.field] if recording.topic is not None else [options.field]
-    return said_of(" ".join([where, *(part for part in (*within, options.columns) if part)]))
+    return stored_source(" ".join([where, *(part for part in (*within, options.columns) if part)]))
 
 
-def said_of(source: str) -> str:
+def stored_source(source: str) -> str:
     """What a memory keeps of a source's name: printable, and bounded."""
     text = printable(source)
     return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"

@@ -171,4 +171,4 @@ def learn_job(job: LearnJob) -> Made:
 
 def hush(learner: TactileLearner) -> None:
     """Have a learner write no checkpoints, and say nothing of its sensor's range: a run does both, at its end."""
-    learner._ledger.saves, learner._range_said = False, True
+    learner._ledger.saves, learner._range_warned = False, True

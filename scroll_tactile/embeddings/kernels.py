@@ -1,10 +1,7 @@
 """The default embedding: random convolution kernels and level features, made from a seed, for any sensor.
 
-Competing kernels: at how many steps of time each kernel of a group responds most, and least.
-
-After Hydra (Dempster, Schmidt and Webb 2023, arXiv 2203.13652), with counts for both of its pools and with the kernels
-of `banks` in place of Gaussian ones: a response is made once, and counted against a threshold and against the others of
-its group. Beside the proportions of `Kernels` the counts gain 0.84 ± 0.26 points, the mean over fourteen sets.
+Competing kernels (see `counting`) tell at how many steps of time each kernel of a group responds most, and least.
+Beside the proportions they gain 0.84 ± 0.26 points, the mean over fourteen sets.
 """
 
 from __future__ import annotations
@@ -22,28 +19,23 @@ import numpy.typing as npt
 from scroll_tactile.blas import one_thread
 from scroll_tactile.embeddings.banks import (
     LEVELS,
-    ROUND,
-    TAPS,
-    Bank,
     bank,
     bank_size,
     to_levels,
     triangle_features,
     window_statistics,
-    workspace,
 )
+from scroll_tactile.embeddings.convolution import TAPS, Bank
+from scroll_tactile.embeddings.counting import GROUP, Request, competing_groups, count
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import ENOUGH
 
 __all__ = [
-    "GROUP",
     "LEAST_FEATURES",
     "MOST_FEATURES",
     "Kernels",
     "angles",
-    "competing_counts",
-    "competing_groups",
     "groups_by_dilation",
 ]
 
@@ -56,17 +48,27 @@ REACH = 0.6  # of a window: a dilated kernel that spans more has too few positio
 LEAST_FEATURES: Final = 64
 MOST_FEATURES: Final = 8192  # the shortest windows have one dilation, whose bank has 378 kernels of 24 thresholds
 DEFAULT_SEED = 1  # measured with the seeds 0 to 5: BioTac-20 98.6 to 99.2 %, RoboSkin-20 97.6 to 98.3 %
-GROUP = 8  # kernels that compete; four and sixteen were no better
-WEIGHT = 64  # of a kernel of one channel: 64 channels · 12 · 2¹¹ · 64 / √64 < 2²⁴, exact in float32
 MOST_COLUMNS = 2048  # of a whole image convolved at once; longer ones are read window by window
 
 
 @dataclass(frozen=True)
 class Part:
-    """The features that one bank gives: `count` of them, kernel by kernel, threshold after threshold."""
+    """What one dilation gives of windows of some widths.
+
+    features: the most that a width has of it. windows: first place of the convolution, and the one behind the last.
+    groups: of competing kernels. pools: of each width the rows of its windows, its features, and the places of each.
+    """
 
     dilation: int
-    count: int
+    features: int
+    windows: tuple[tuple[int, int], ...]
+    groups: int
+    pools: tuple[tuple[int, slice, int, int], ...]
+
+    def request(self, bank: Bank) -> Request:
+        """What is counted of this dilation's bank."""
+        groups = competing_groups(bank, self.groups) if self.groups else None
+        return Request(bank, self.features, self.windows, groups)
 
 
 class Kernels:
@@ -197,46 +199,26 @@ class Kernels:
     ) -> tuple[dict[int, npt.NDArray[np.float32]], list[npt.NDArray[np.float32]]]:
         """Features of windows; and of competing kernels, dilation by dilation, where a width is given for these."""
         channels, readings = levels.shape
-        contests = _contests(self.dimension, competing)
-        proportions: list[npt.NDArray[np.float32]] = []
+        widths = tuple(windows.items())
+        parts = _parts(self.dimension, channels, readings, widths, competing)
+        requests = [part.request(self._bank(channels, part.dilation)) for part in parts]
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
-        plans = {width: _plan(channels, self._proportions(width), width) for width in windows}
-        uses = {
-            dilation: {w: part.count for w, plan in plans.items() for part in plan if part.dilation == dilation}
-            for dilation in _dilations(max([*windows, competing or 0]))
-        }
-        needed = [max([*of.values(), GROUP * contests.get(dilation, 0)]) for dilation, of in uses.items()]
-        with one_thread():
-            every = tuple(self._bank(channels, dilation) for dilation in uses)
-            banks = _banks(every, tuple(needed))
-            np.matmul(banks.channels, levels, out=workspace.array("sums", len(banks.channels), readings))
-            for own, (dilation, of), rows in zip(every, uses.items(), banks.rows, strict=True):
-                responses = workspace.respond(rows, readings, dilation)
-                if count := contests.get(dilation, 0):
-                    proportions.append(
-                        angles(responses.shape[1])[competing_counts(responses, competing_groups(own, count)).ravel()]
-                    )
-                if not of:
-                    continue
-                where = tuple((min(width, readings), windows[width]) for width in of)
-                found = _counts(own, responses, max(of.values()), where)
-                first = 0
-                for width, features in of.items():
-                    last = first + len(windows[width])
-                    places = min(width, readings) - (TAPS - 1) * dilation
-                    pooled[width].append(angles(places)[found[first:last, :features]])
-                    first = last
-            for width, starts in windows.items():
-                if self._proportions(width) == self.dimension:
-                    continue
+        proportions: list[npt.NDArray[np.float32]] = []
+        for part, found in zip(parts, count(levels, requests), strict=True):
+            proportions.append(angles(readings - (TAPS - 1) * part.dilation)[found.competing.ravel()])
+            for width, rows, features, places in part.pools:
+                pooled[width].append(angles(places)[found.features[rows, :features]])
+        for width, starts in widths:
+            if more := self.dimension - _thresholded(self.dimension, width):
                 cut = np.stack([levels[:, start : start + width] for start in starts])
-                triangle = triangle_features(self.seed, channels, self.dimension - self._proportions(width))
-                pooled[width].append(triangle(window_statistics(cut)))
-        return {width: np.concatenate(parts, axis=1) for width, parts in pooled.items()}, proportions
+                with one_thread():
+                    pooled[width].append(triangle_features(self.seed, channels, more)(window_statistics(cut)))
+        return {width: np.concatenate(arrays, axis=1) for width, arrays in pooled.items()}, proportions
 
-    def _proportions(self, width: int) -> int:
-        """How many of the features are proportions in a window of this width; the rest are of levels."""
-        return self.dimension - (round(self.dimension * SHARE_IN_SHORT) if width <= SHORT else 0)
+
+def _thresholded(features: int, width: int) -> int:
+    """How many of so many features are proportions in a window of this width; the rest are of levels."""
+    return features - (round(features * SHARE_IN_SHORT) if width <= SHORT else 0)
 
 
 def _require_image(image: npt.NDArray[np.float32]) -> None:
@@ -265,61 +247,38 @@ def _contests(features: int, width: int | None) -> dict[int, int]:
     return dict(zip(dilations, groups_by_dilation(features, len(dilations)), strict=True)) if dilations else {}
 
 
-@lru_cache(maxsize=64)
-def _plan(channels: int, features: int, width: int) -> list[Part]:
-    """Share the proportions out over the dilations that fit a width, by the sizes of their banks."""
+@lru_cache(maxsize=256)
+def _parts(
+    dimension: int,
+    channels: int,
+    readings: int,
+    widths: tuple[tuple[int, tuple[int, ...]], ...],
+    competing: int | None,
+) -> list[Part]:
+    """What is counted of each dilation: for windows, by width their first columns, and for an image that competes."""
+    shares = {width: _shares(channels, _thresholded(dimension, width), width) for width, _ in widths}
+    contests = _contests(dimension, competing)
+    parts = []
+    for dilation in _dilations(max([*shares, competing or 0])):
+        windows: list[tuple[int, int]] = []
+        pools: list[tuple[int, slice, int, int]] = []
+        span = (TAPS - 1) * dilation
+        for width, starts in widths:
+            if features := shares[width].get(dilation, 0):
+                first, places = len(windows), min(width, readings) - span
+                windows += [(start, start + places) for start in starts]
+                pools.append((width, slice(first, len(windows)), features, places))
+        most = max((features for _, _, features, _ in pools), default=0)
+        parts.append(Part(dilation, most, tuple(windows), contests.get(dilation, 0), tuple(pools)))
+    return parts
+
+
+def _shares(channels: int, features: int, width: int) -> dict[int, int]:
+    """Dilation → how many of the proportions it gives, by the sizes of the banks that fit a width."""
     dilations = _dilations(width)
     sizes = np.array([bank_size(channels, dilation) for dilation in dilations])
     edges = np.rint(np.cumsum(sizes) * (features / sizes.sum())).astype(int)
-    counts = np.diff(edges, prepend=0)
-    return [Part(dilation, int(count)) for dilation, count in zip(dilations, counts, strict=True) if count]
-
-
-@dataclass(frozen=True)
-class Banks:
-    """The channels of several banks below each other, for one product with an image, and the rows of each."""
-
-    channels: npt.NDArray[np.float32]
-    rows: list[slice]
-
-
-@lru_cache(maxsize=16)  # of at most 0.3 MB each
-def _banks(banks: tuple[Bank, ...], counts: tuple[int, ...]) -> Banks:
-    """Of each dilation's bank the rounds that so many features need."""
-    parts, rows, last = [], [], 0
-    for part, count in zip(banks, counts, strict=True):
-        parts.append(part.channels[: -(-min(count, len(part)) // ROUND) * ROUND])
-        first, last = last, last + len(parts[-1])
-        rows.append(slice(first, last))
-    return Banks(np.concatenate(parts), rows)
-
-
-def _counts(
-    kernels: Bank,
-    responses: npt.NDArray[np.float32],
-    count: int,
-    where: tuple[tuple[int, tuple[int, ...]], ...],
-) -> npt.NDArray[np.int64]:
-    """How often each feature's threshold is exceeded in each window: integers of shape (windows, count).
-
-    responses: of the bank's rows, shape (rows, places); only the places in `where` count.
-    """
-    exceeded = workspace.array("second", count, responses.shape[1])  # the responses are made
-    for first in range(0, count, len(kernels)):
-        size = min(len(kernels), count - first)
-        thresholds = kernels.thresholds[first // len(kernels), :size, None]
-        np.copyto(exceeded[first : first + size], responses[kernels.rows[:size]] > thresholds)
-    counted = exceeded @ _pooling(responses.shape[1], kernels.dilation, where)
-    return counted.T.astype(np.int64)
-
-
-@lru_cache(maxsize=16)  # of at most 1 MB each
-def _pooling(places: int, dilation: int, where: tuple[tuple[int, tuple[int, ...]], ...]) -> npt.NDArray[np.float32]:
-    """0/1 matrix of shape (positions, windows): which of the convolution's positions lie within a window."""
-    span = (TAPS - 1) * dilation
-    place = np.arange(places)
-    columns = [(place >= start) & (place < start + width - span) for width, starts in where for start in starts]
-    return np.stack(columns, axis=1).astype(np.float32)
+    return dict(zip(dilations, np.diff(edges, prepend=0).tolist(), strict=True))
 
 
 @lru_cache(maxsize=1024)
@@ -329,41 +288,7 @@ def angles(places: int) -> npt.NDArray[np.float32]:
     return (np.rint(exact * 2.0**20) / 2.0**20).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class Groups:
-    """The groups of one bank.
-
-    kernels: the row of each in the bank's responses, shape (GROUP, G), a column a group. weights: integers by which the
-    responses of kernels that sum more channels become comparable, float32 of shape (GROUP, G, 1).
-    """
-
-    kernels: npt.NDArray[np.intp]
-    weights: npt.NDArray[np.float32]
-
-
 def groups_by_dilation(features: int, dilations: int) -> list[int]:
     """The number of groups of each dilation: as even as can be; a group has two features a kernel."""
     total = features // (2 * GROUP)
     return [total // dilations + (i < total % dilations) for i in range(dilations)]
-
-
-@lru_cache(maxsize=64)
-def competing_groups(bank: Bank, count: int) -> Groups:
-    """So many groups of a bank's kernels, in its order, which is random; where all have competed, in another."""
-    rng, size = np.random.default_rng([bank.dilation, len(bank)]), len(bank)
-    rounds = [np.arange(size), *(rng.permutation(size) for _ in range(GROUP * count // size))]
-    rows = bank.rows[np.concatenate(rounds)[: GROUP * count]].reshape(count, GROUP).T
-    weights = np.rint(WEIGHT / np.sqrt(bank.channels[rows].sum(axis=2)))
-    return Groups(np.ascontiguousarray(rows), weights.astype(np.float32)[:, :, None])
-
-
-def competing_counts(responses: npt.NDArray[np.float32], of: Groups) -> npt.NDArray[np.int64]:
-    """At how many steps each kernel has the greatest response above 0, and the least below 0: (2, G, GROUP).
-
-    responses: whole numbers, shape (rows, steps). Kernels that share a place both have it.
-    """
-    competing = responses[of.kernels] * of.weights
-    most, least = competing.max(axis=0), competing.min(axis=0)
-    most[most <= 0] = least[least >= 0] = np.inf  # no response is
-    found = [np.bitwise_count(np.packbits(competing == best, axis=2)).sum(axis=2) for best in (most, least)]
-    return np.stack(found).transpose(0, 2, 1).astype(np.int64)

@@ -10,16 +10,11 @@ from images import image
 from touches import PAD
 
 from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.embeddings.banks import HEAVY, LEVELS, MOST_CHANNELS, TAPS, bank, to_levels
+from scroll_tactile.embeddings.banks import LEVELS, MOST_CHANNELS, bank, to_levels
+from scroll_tactile.embeddings.convolution import HEAVY, TAPS
+from scroll_tactile.embeddings.counting import GROUP, WEIGHT, competing_counts, competing_groups
 from scroll_tactile.embeddings.joined import Joined
-from scroll_tactile.embeddings.kernels import (
-    GROUP,
-    WEIGHT,
-    _dilations,
-    competing_counts,
-    competing_groups,
-    groups_by_dilation,
-)
+from scroll_tactile.embeddings.kernels import _dilations, groups_by_dilation
 from scroll_tactile.errors import EmbeddingError
 
 SMALL = Kernels(dimension=64)
@@ -43,7 +38,7 @@ def proportions(embedding, whole, width):
             continue
         own = bank(embedding.seed, len(whole), dilation)
         of, most, least = competing_groups(own, number), [], []
-        for group in of.kernels.T:
+        for group in own.rows[of.members]:
             sizes = own.channels[group].sum(axis=1)
             weights = [round(WEIGHT / float(size) ** 0.5) for size in sizes]
             all_of_group = [
@@ -92,9 +87,10 @@ def test_kernels_that_share_a_place_both_have_it_and_nobody_has_a_flat_one():
     own = bank(1, 2, 1)
     of = competing_groups(own, 2)
     flat = np.zeros((len(own.channels), 10), np.float32)
-    assert not competing_counts(flat, of).any()
-    flat[of.kernels[:2, 0]] = 1.0 / of.weights[:2, 0]  # two of the first group, alike once they are weighed
-    assert competing_counts(flat, of)[0, 0].tolist() == [10, 10, 0, 0, 0, 0, 0, 0]
+    assert not competing_counts(flat, own, of).any()
+    alike = 1 / of.weights[0, :2, None].astype(np.float32)
+    flat[own.rows[of.members[0, :2]]] = alike  # two of the first group, alike once they are weighed
+    assert competing_counts(flat, own, of)[0, 0].tolist() == [10, 10, 0, 0, 0, 0, 0, 0]
 
 
 def test_weighed_responses_are_exact_in_float32():
@@ -105,8 +101,8 @@ def test_weighed_responses_are_exact_in_float32():
 def test_every_kernel_of_a_bank_competes_before_any_does_again():
     own = bank(1, 5, 8)
     of = competing_groups(own, 2 * len(own) // GROUP)
-    once = of.kernels.T.ravel()[: len(own)]
-    assert sorted(once.tolist()) == sorted(own.rows.tolist())
+    once = of.members.ravel()[: len(own)]
+    assert sorted(once.tolist()) == list(range(len(own)))
 
 
 def test_joined_embeddings_compete_each_by_itself():

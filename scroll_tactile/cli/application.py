@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from scroll_tactile import __version__
+from scroll_tactile import __version__, native
 from scroll_tactile.cli.bulk import evaluate, fleet, learn
 from scroll_tactile.cli.everyday import compose, describe, inspect, observe, predict
 from scroll_tactile.cli.replay import live
@@ -29,7 +29,7 @@ app = typer.Typer(
 
 def _show_version(requested: bool) -> None:
     if requested:
-        typer.echo(f"scroll-tactile {__version__}")
+        typer.echo(f"scroll-tactile {__version__}, kernels {native.described()}")
         raise typer.Exit
 
 

@@ -20,7 +20,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -191,12 +190,10 @@ class Conformal:
         for into, own in zip(whole, levels, strict=True):
             reach = min(own.shape[1], self._longest)
             into[:, :reach] = own[:, :reach]
-        inside = np.zeros((self._longest, len(self._edges) - 1), np.float32)
-        for block, (first, last) in enumerate(pairwise(self._edges)):
-            inside[first:last, block] = 1.0
-        read = whole != MISSING
-        counts = read.astype(np.float32) @ inside
-        means = (np.where(read, whole, 0).astype(np.float32) @ inside).astype(np.float64) / np.maximum(counts, 1)
+        read, firsts = whole != MISSING, self._edges[:-1]
+        counts = np.add.reduceat(read, firsts, axis=2, dtype=np.int32)
+        sums = np.add.reduceat(np.where(read, whole, np.uint8(0)), firsts, axis=2, dtype=np.int32)
+        means = sums / np.maximum(counts, 1)
         steps = np.rint(np.log1p(means) * (STEPS / np.log(LEVELS)))
         blocks: npt.NDArray[np.uint8] = np.where(counts > 0, steps, UNREAD).astype(np.uint8)
         return blocks.transpose(0, 2, 1).reshape(len(levels), -1)

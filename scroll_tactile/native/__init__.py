@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["available", "count", "reason"]
+__all__ = ["available", "count", "described", "reason"]
 
 
 def _load() -> tuple[Callable[..., None] | None, str]:
@@ -32,3 +32,8 @@ def count(*arguments: Any) -> None:
     """`tactile_count` of kernels.h. Raises ValueError for arrays that do not fit together."""
     assert _found is not None
     _found(*arguments)
+
+
+def described() -> str:
+    """Which kernels are at work, in words."""
+    return "compiled" if available else f"by numpy: {reason}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Literal
 
@@ -118,6 +119,7 @@ def whole_columns(sensor: Sensor) -> int:
     return 0 if sensor.camera else min(max(sensor.readings, FEWEST), MOST_COLUMNS)
 
 
+@lru_cache(maxsize=1024)  # asked three times a touch
 def extent(columns: int, widths: tuple[int, ...], *, partial: bool = True, frames: bool = False) -> Extent:
     """The windows that are read of a touch of so many columns, at every scale that fits.
 
@@ -265,9 +267,7 @@ class WindowPlan:
 
     def places(self, columns: int) -> dict[Scale, list[int]]:
         """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""
-        places = scored(self.extent(columns), columns, partial=self.partial)
-        windows = {Scale("window", width): chosen for width, chosen in places.items()}
-        return windows | {view: [0] for view in self.views}
+        return dict(_places(self, columns))
 
     def milestones(self) -> tuple[int, ...]:
         """The lengths at which a touch reaches its stages."""
@@ -276,3 +276,11 @@ class WindowPlan:
     def stages(self, columns: int) -> list[int]:
         """The lengths of a touch's stages, the last its own."""
         return stages(columns, self.widths, partial=self.partial)
+
+
+@lru_cache(maxsize=1024)
+def _places(plan: WindowPlan, columns: int) -> Mapping[Scale, list[int]]:
+    """See `WindowPlan.places`."""
+    places = scored(plan.extent(columns), columns, partial=plan.partial)
+    windows = {Scale("window", width): chosen for width, chosen in places.items()}
+    return windows | {view: [0] for view in plan.views}

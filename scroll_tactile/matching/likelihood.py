@@ -131,7 +131,7 @@ class Likelihood:
 
     def _made(self, noise: Noise) -> Table:
         chances = self._chances(noise)
-        logs = np.log((1 - FLOOR) * chances + FLOOR / LEVELS)
+        logs = _logs(chances)
         whole = np.zeros((256, 256), dtype=np.int16)
         whole[:LEVELS, :LEVELS] = np.rint(logs.T * UNIT)
         mean = chances @ _LEVELS
@@ -150,16 +150,34 @@ class Likelihood:
             information=float(self.weights @ information),
         )
 
+    def entries(self, noise: Noise, places: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
+        """`Table.logs` of a noise at some places, without the table."""
+        y, x = np.divmod(places, 256)
+        read = (y != MISSING) & (x != MISSING)
+        away, spread = y + 0.5 - x, self.spread[np.where(read, x, 0)]
+        below = np.where(y == LEVELS - 1, 1.0, self._below(noise, away, spread))
+        chances = np.maximum(below - np.where(y == 0, 0.0, self._below(noise, away - 1, spread)), 0.0)
+        return np.where(read, np.rint(_logs(chances) * UNIT), 0).astype(np.int64)
+
     def _chances(self, noise: Noise) -> FloatArray:
         """P(y | x), [x, y]; what lies beyond an end of the range is read as that end."""
-        reach = noise.amplitude * (LEVELS - 1)
-        if noise.normal or not reach:
-            below = _normal(_DISTANCE / np.hypot(self.spread, reach / math.sqrt(3))[:, None])
-        else:
-            spread = np.hypot(self.spread, BLUR * reach)[:, None]
-            below = (_sloped(_DISTANCE + reach, spread) - _sloped(_DISTANCE - reach, spread)) / (2 * reach)
+        below = self._below(noise, _DISTANCE, self.spread[:, None])
         below[:, -1] = 1.0
         return np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)
+
+    @staticmethod
+    def _below(noise: Noise, away: FloatArray, spread: FloatArray) -> FloatArray:
+        """The probability of no more than a level whose upper end is so far from x, which is spread so much."""
+        reach = noise.amplitude * (LEVELS - 1)
+        if noise.normal or not reach:
+            return _normal(away / np.hypot(spread, reach / math.sqrt(3)))
+        blurred = np.hypot(spread, BLUR * reach)
+        return np.asarray((_sloped(away + reach, blurred) - _sloped(away - reach, blurred)) / (2 * reach))
+
+
+def _logs(chances: FloatArray) -> FloatArray:
+    """L of P(y | x); see above."""
+    return np.asarray(np.log((1 - FLOOR) * chances + FLOOR / LEVELS))
 
 
 def _normal(z: FloatArray) -> FloatArray:

@@ -17,10 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile import native
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.kept_arrays import KeptArrays, blends, block_means, unchanging, weighted_means
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Likelihood, Noise, Table
@@ -62,13 +64,12 @@ PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardl
 class _Query:
     """A touch that is compared: its levels (C, T), as far as the longest kept touch goes where it is not `whole`.
 
-    shifted: 256 · level, flat. seen: which values count, (C, T). stuck: the channels that are. full: the columns that
+    seen: which values count, (C, T). stuck: the channels that are. full: the columns that
     it is a part of. values: how many count. share: the part of all that do. held_out: the row of the kept touch that it
     is, if it is one.
     """
 
     levels: LevelArray
-    shifted: Rows
     seen: npt.NDArray[np.bool_]
     stuck: npt.NDArray[np.bool_]
     full: int
@@ -84,7 +85,7 @@ class _Query:
         grid = levels[:, :full].copy()
         stuck = unchanging(grid) & ~quiet
         grid[stuck] = MISSING
-        return cls(grid, grid.ravel().astype(np.intp) << 8, grid != MISSING, stuck, full, whole, held_out)
+        return cls(grid, grid != MISSING, stuck, full, whole, held_out)
 
     @property
     def values(self) -> int:
@@ -97,17 +98,40 @@ class _Query:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Values of a touch beside those of some others: 256 · level + other level, (others, values).
+    """Values of a touch, levels (values,), beside those of some others, (others, values).
 
     weights: of each other's sum: by the same number of values, where some lack, (others,).
     """
 
-    places: Rows
+    own: LevelArray
+    others: LevelArray
     weights: FloatArray
+
+    @cached_property
+    def places(self) -> Rows:
+        """256 · level + other level, (others, values)."""
+        return (self.own.astype(np.intp) << 8) | self.others
 
     def logs(self, table: Table) -> FloatArray:
         """Log-likelihood of the touch by each of the others, (others,)."""
-        return np.asarray(table.logs.take(self.places).sum(axis=1, dtype=np.int64) / UNIT * self.weights)
+        if native.available:
+            sums = np.empty(len(self.others), np.int64)
+            native.sum_logs(self.own, self.others, table.logs, sums)
+        else:
+            sums = table.logs.take(self.places).sum(axis=1, dtype=np.int64)
+        return np.asarray(sums / UNIT * self.weights)
+
+    def logs_by(self, likelihood: Likelihood, noise: Noise) -> FloatArray:
+        """What `logs` gives with the table of a noise, without making it: by the pairs of levels that occur."""
+        distinct, counts = self._distinct
+        return np.asarray(counts @ likelihood.entries(noise, distinct) / UNIT * self.weights)
+
+    @cached_property
+    def _distinct(self) -> tuple[Rows, npt.NDArray[np.int64]]:
+        """The places that occur, ascending, and how often each does, (others, places)."""
+        counts = np.stack([np.bincount(row, minlength=256 * 256) for row in self.places])
+        distinct = np.flatnonzero(counts.any(axis=0))
+        return distinct, counts[:, distinct]
 
 
 @dataclass(frozen=True)
@@ -203,13 +227,12 @@ class TouchMatcher:
         return self.deviation.likelihood.table(noise)
 
     def _pairs(self, others: LevelArray, query: _Query, values: slice | Rows = slice(None)) -> _Pairs:
-        others = others[:, values]
-        places = query.shifted[values] | others
+        own, others = query.levels.ravel()[values], np.ascontiguousarray(others[:, values])
         if self.kept.gapless:
-            return _Pairs(places, np.ones(len(others)))
+            return _Pairs(own, others, np.ones(len(others)))
         seen = query.seen.ravel()[values]
         both = np.count_nonzero((others != MISSING) & seen, axis=1)
-        return _Pairs(places, np.count_nonzero(seen) / np.maximum(both, 1))
+        return _Pairs(own, others, np.count_nonzero(seen) / np.maximum(both, 1))
 
     def _rough_noise(self, query: _Query) -> Noise:
         # Each row once, ascending; numpy's own way imports a fiftieth of a second of masked arrays.
@@ -239,7 +262,8 @@ class TouchMatcher:
             same = labels == labels[np.argmax(others.logs)]
             nearest = blends(others.levels[same], others.logs[same], WARMTHS[:2])
         pairs = self._pairs(nearest, query)
-        return max(noise.near(stride), key=lambda near: float(pairs.logs(self._table(near)).max()))
+        likelihood = self.deviation.likelihood
+        return max(noise.near(stride), key=lambda near: float(pairs.logs_by(likelihood, near).max()))
 
     def _result(self, query: _Query, others: _Others, noise: Noise, columns: int) -> Match:
         table, natural, logs = self._table(noise), self.deviation, others.logs

@@ -8,30 +8,32 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable
 from typing import Any
 
-__all__ = ["available", "count", "described", "reason"]
+__all__ = ["available", "count", "described", "reason", "sum_logs"]
 
 
-def _load() -> tuple[Callable[..., None] | None, str]:
+def _load() -> tuple[Any, str]:
     if os.environ.get("SCROLL_TACTILE_NUMPY", "") not in {"", "0"}:
         return None, "turned off by SCROLL_TACTILE_NUMPY"
     try:
-        found: Any = importlib.import_module("scroll_tactile.native._kernels")
+        return importlib.import_module("scroll_tactile.native._kernels"), ""
     except ImportError as error:  # not built, or for another machine
         return None, str(error)
-    return found.count, ""
 
 
-_found, reason = _load()
-available = _found is not None
+_module, reason = _load()
+available = _module is not None
 
 
 def count(*arguments: Any) -> None:
     """`tactile_count` of kernels.h. Raises ValueError for arrays that do not fit together."""
-    assert _found is not None
-    _found(*arguments)
+    _module.count(*arguments)
+
+
+def sum_logs(*arguments: Any) -> None:
+    """Sums of a table's entries over pairs of values; see module.c. Raises ValueError for what does not fit."""
+    _module.sum_logs(*arguments)
 
 
 def described() -> str:

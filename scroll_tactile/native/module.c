@@ -1,4 +1,4 @@
-/* `tactile_count` for Python: every array is a buffer, and nothing is read or written outside of one. */
+/* What is compiled, for Python: every array is a buffer, and nothing is read or written outside of one. */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
@@ -121,7 +121,48 @@ static PyObject *count(PyObject *module, PyObject *args)
     Py_RETURN_NONE;
 }
 
+/* Sums of a table's entries at 256 · own + other, for each of some others. */
+static void sum_entries(const uint8_t *own, Py_ssize_t values, const uint8_t *others, Py_ssize_t count,
+                        const int16_t *table, int64_t *sums)
+{
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const uint8_t *other = others + i * values;
+        int64_t sum = 0;
+        for (Py_ssize_t v = 0; v < values; v++)
+            sum += table[(size_t)own[v] << 8 | other[v]];
+        sums[i] = sum;
+    }
+}
+
+static PyObject *sum_logs(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer own, others, table, sums;
+    if (!PyArg_ParseTuple(args, "y*y*y*w*", &own, &others, &table, &sums))
+        return NULL;
+    const Py_ssize_t count = sums.len / (Py_ssize_t)sizeof(int64_t);
+    const int sound = require(table.len == 65536 * (Py_ssize_t)sizeof(int16_t), "a table of 65536 entries") &&
+                      require(sums.len % (Py_ssize_t)sizeof(int64_t) == 0 && (own.len == 0 || count <= others.len / own.len) &&
+                                  others.len == count * own.len,
+                              "as many values of each other touch, and a sum for each");
+    if (sound) {
+        Py_BEGIN_ALLOW_THREADS;
+        sum_entries(own.buf, own.len, others.buf, count, table.buf, sums.buf);
+        Py_END_ALLOW_THREADS;
+    }
+    PyBuffer_Release(&own);
+    PyBuffer_Release(&others);
+    PyBuffer_Release(&table);
+    PyBuffer_Release(&sums);
+    if (!sound)
+        return NULL;
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef methods[] = {
+    {"sum_logs", sum_logs, METH_VARARGS,
+     "sum_logs(own, others, table, sums): the sums of a table, int16 of 256 · own + other, over the values, uint8, of a\n"
+     "touch and of others, int64, one to each. Raises ValueError for what does not fit together."},
     {"count", count, METH_VARARGS,
      "count(readings, dilation, features, levels, heavy, begins, channels, thresholds, edges, spans, members, weights,\n"
      "counted, contests): see kernels.h. The last two are written. Raises ValueError for what does not fit together."},

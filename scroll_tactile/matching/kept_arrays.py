@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile import native
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
@@ -22,8 +23,9 @@ FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
-# Kept touches whose means are multiplied at once: the bits of a product do not depend on how many are kept.
-AT_ONCE = 128
+AT_ONCE = 128  # kept touches whose means are multiplied at once: more leave the processor's cache
+QUARTERS = 4  # steps of a guess in one level
+GUESSED = (-256.0, 510.0)  # levels: a guess of what was before noise may lie beyond the range
 COARSER = 8  # blocks in one where touches of another speed are compared: finer ones are not side by side
 
 
@@ -31,14 +33,13 @@ COARSER = 8  # blocks in one where touches of another speed are compared: finer 
 class _Parts:
     """What is made of kept touches, row by row, with room for more.
 
-    blocks: means, rounded to levels, as floats, (touches, C · B). wide_blocks: means over wider blocks of each touch's
-    own length, (touches, C · B'). squares: sums of the squares of blocks by channel, (touches, C). columns: the length
-    of each. gapless: whether it has a value everywhere. unchanging: the channels that never change, (touches, C).
+    blocks: means, rounded to levels, MISSING where nothing was read, (touches, C · B). wide_blocks: means over wider
+    blocks of each touch's own length, (touches, C · B'). columns: the length of each. gapless: whether it has a value
+    everywhere. unchanging: the channels that never change, (touches, C).
     """
 
-    blocks: npt.NDArray[np.float32]
-    wide_blocks: npt.NDArray[np.float32]
-    squares: npt.NDArray[np.float32]
+    blocks: LevelArray
+    wide_blocks: LevelArray
     columns: Rows
     gapless: npt.NDArray[np.bool_]
     unchanging: npt.NDArray[np.bool_]
@@ -47,9 +48,8 @@ class _Parts:
     def empty(cls, count: int, channels: int, edges: Rows) -> _Parts:
         """Room for so many touches."""
         return cls(
-            np.empty((count, channels * (len(edges) - 1)), np.float32),
-            np.empty((count, channels * (len(edges[::COARSER]) - 1)), np.float32),
-            np.empty((count, channels), np.float32),
+            np.empty((count, channels * (len(edges) - 1)), np.uint8),
+            np.empty((count, channels * (len(edges[::COARSER]) - 1)), np.uint8),
             np.empty(count, np.intp),
             np.empty(count, np.bool_),
             np.empty((count, channels), np.bool_),
@@ -65,14 +65,13 @@ class _Parts:
 
 
 PARTS = tuple(field.name for field in fields(_Parts))
-LEVEL_PARTS = ("blocks", "wide_blocks")  # whole numbers, 0 to 254
 
 
 class KeptArrays:
     """Kept touches of one number of channels, in rows; lengths may differ.
 
     touches: material and key of each row. longest: columns of the longest that there may be. labels: the place of each
-    row's material among `materials`, which are in alphabetical order. blocks, wide_blocks, squares, columns: as in
+    row's material among `materials`, which are in alphabetical order. blocks, wide_blocks, columns: as in
     `_Parts`. gapless: whether all touches have values everywhere. quiet: how many have a channel unchanging, (C,).
 
     Any number of threads may read it at once. It follows where nobody reads: otherwise a copy does.
@@ -109,17 +108,15 @@ class KeptArrays:
         return arrays
 
     def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """`_Parts` of the touches, row by row in the order of `touches`; levels in a byte each."""
-        made = {name: getattr(self._parts, name)[: len(self)] for name in PARTS}
-        return made | {name: made[name].astype(np.uint8) for name in LEVEL_PARTS}
+        """`_Parts` of the touches, row by row in the order of `touches`."""
+        return {name: getattr(self._parts, name)[: len(self)] for name in PARTS}
 
     @classmethod
     def from_arrays(
         cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
     ) -> KeptArrays:
         """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
-        floats = {name: arrays[name].astype(np.float32) for name in LEVEL_PARTS}
-        parts = _Parts(**{name: arrays[name] for name in PARTS} | floats)
+        parts = _Parts(**{name: arrays[name] for name in PARTS})
         own = [(touch.material, touch.key) for touch in touches]
         return cls(len(touches[0].levels), longest, own, [touch.levels for touch in touches], parts)
 
@@ -127,8 +124,7 @@ class KeptArrays:
     def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
         """Name → dtype and shape of what `to_arrays` gives of so many touches."""
         parts = _Parts.empty(count, channels, _edges(longest, channels))
-        types = {name: "uint8" if name in LEVEL_PARTS else getattr(parts, name).dtype.name for name in PARTS}
-        return {name: (types[name], getattr(parts, name).shape) for name in PARTS}
+        return {name: (getattr(parts, name).dtype.name, getattr(parts, name).shape) for name in PARTS}
 
     def copy(self) -> KeptArrays:
         """Another of the same touches: what comes to it does not come to this one."""
@@ -187,9 +183,8 @@ class KeptArrays:
         parts, columns = self._parts, touch.levels.shape[1]
         whole = np.full((self.channels, self.longest), MISSING, dtype=np.uint8)
         whole[:, :columns] = touch.levels
-        means = np.rint(block_means(whole, self._edges)[0])
-        parts.blocks[row], parts.squares[row] = means.ravel(), (means**2).sum(axis=1)
-        parts.wide_blocks[row] = np.rint(block_means(touch.levels, self.wide_edges(columns))[0]).ravel()
+        parts.blocks[row] = _block_levels(whole, self._edges)
+        parts.wide_blocks[row] = _block_levels(touch.levels, self.wide_edges(columns))
         parts.columns[row], parts.gapless[row] = columns, not bool((whole == MISSING).any())
         parts.unchanging[row] = unchanging(touch.levels)
         self.touches.append((touch.material, touch.key))
@@ -201,7 +196,7 @@ class KeptArrays:
         place = {name: i for i, name in enumerate(self.materials)}
         self.labels = np.array([place[material] for material, _ in self.touches], dtype=np.intp)
         self.blocks, self.wide_blocks = parts.blocks[:count], parts.wide_blocks[:count]
-        self.squares, self.columns = parts.squares[:count], parts.columns[:count]
+        self.columns = parts.columns[:count]
         self.gapless = bool(parts.gapless[:count].all())
         self.quiet = parts.unchanging[:count].sum(axis=0)
 
@@ -234,39 +229,24 @@ class KeptArrays:
         edges: Rows = self._edges[::COARSER] * columns // self.longest
         return edges
 
-    def distances(
-        self, guesses: npt.NDArray[np.float32], known: npt.NDArray[np.bool_], whole: bool
-    ) -> npt.NDArray[np.float32]:
-        """Squared distances of all touches from guesses (guesses, blocks), but for the guesses' own squares.
+    def distances(self, guesses: FloatArray, known: npt.NDArray[np.bool_], whole: bool) -> FloatArray:
+        """Mean squared distances of all touches from guesses, (touches, guesses), over the blocks that both have.
 
-        Where some blocks lack, of either, they are means over the others, with the guesses' squares.
+        guesses: levels, (guesses, C · B). known: the blocks that they have, (C · B,). Whole numbers of quarters of a
+        level, divided once: the same on every machine. The largest float where both have no block.
         """
-        blocks = self.wide_blocks if whole else self.blocks
-        if self.gapless and not whole and bool((known.all(axis=1) == known.any(axis=1)).all()):
-            square = self.squares[:, known[:, 0]].sum(axis=1)[:, None]  # no BLAS: some report a NaN of few columns
-            return np.asarray(square - 2 * _product(blocks, guesses.T))
-        columns = np.flatnonzero(known)
-        blocks, guesses = blocks[:, columns], guesses[:, columns]
-        square = np.einsum("nd,nd->n", blocks, blocks, dtype=np.float32)[:, None]
-        if self.gapless or whole:
-            return np.asarray(square - 2 * _product(blocks, guesses.T))
-        both = self._read()[:, columns].astype(np.float32)
-        far = square - 2 * _product(blocks, guesses.T) + both @ np.square(guesses).T
-        return np.asarray(far / np.maximum(both.sum(axis=1, keepdims=True), 1))
+        steps = np.rint(np.clip(guesses, *GUESSED) * QUARTERS).astype(np.int16)
+        return _distances(self.wide_blocks if whole else self.blocks, steps, known)
 
     def nearest_alike(self, row: int) -> tuple[LevelArray, LevelArray] | None:
         """The levels of a touch and of the nearest other one of its material; None where there is no other."""
         others = np.flatnonzero((self.labels == self.labels[row]) & (np.arange(len(self)) != row))
         if not len(others):
             return None
-        far = self.squares[others].sum(axis=1) - 2 * _product(self.blocks[others], self.blocks[row])
+        blocks = self.blocks[row]
+        far = _distances(self.blocks[others], QUARTERS * blocks[None].astype(np.int16), blocks != MISSING)[:, 0]
         own, other = self.prefixes([row, int(others[np.argmin(far)])])
         return own, other
-
-    def _read(self) -> npt.NDArray[np.bool_]:
-        """Whether a touch has any value in a block, (touches, C · B)."""
-        values = (self.prefixes(range(len(self))) != MISSING).reshape(len(self), self.channels, self.longest)
-        return np.logical_or.reduceat(values, self._edges[:-1], axis=2).reshape(len(self), -1)
 
 
 def _edges(longest: int, channels: int) -> Rows:
@@ -275,10 +255,26 @@ def _edges(longest: int, channels: int) -> Rows:
     return np.linspace(0, longest, blocks + 1).astype(np.intp)
 
 
-def _product(blocks: npt.NDArray[np.float32], guess: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """blocks @ guess."""
-    parts = [blocks[row : row + AT_ONCE] @ guess for row in range(0, len(blocks), AT_ONCE)]
-    return np.concatenate(parts)
+def _distances(rows: LevelArray, guesses: npt.NDArray[np.int16], known: npt.NDArray[np.bool_]) -> FloatArray:
+    """Mean squared distances of rows of levels (rows, blocks) from guesses in quarters, (rows, guesses)."""
+    sums, seen = np.empty((len(rows), len(guesses)), np.int64), np.empty(len(rows), np.int64)
+    if native.available:
+        native.distances(np.ascontiguousarray(rows), np.ascontiguousarray(guesses), known, sums, seen)
+    else:
+        exact = guesses.astype(np.float64)
+        for first in range(0, len(rows), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            both = (rows[part] != MISSING) & known
+            quarters = np.where(both, QUARTERS * rows[part].astype(np.float64), 0.0)
+            square = np.square(quarters).sum(axis=1)[:, None] + both @ np.square(exact).T
+            sums[part], seen[part] = square - 2 * (quarters @ exact.T), both.sum(axis=1)
+    return np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], np.finfo(np.float64).max)
+
+
+def _block_levels(levels: LevelArray, edges: Rows) -> LevelArray:
+    """Means of the blocks of a touch, rounded to levels, (C · B,); MISSING where nothing was read."""
+    means, known = block_means(levels, edges)
+    return np.where(known, np.rint(means), MISSING).astype(np.uint8).ravel()
 
 
 def at_places(

@@ -217,7 +217,7 @@ class TouchMatcher:
         means, known = block_means(query.levels, self.kept.edges(query.levels.shape[1], query.whole))
         tables = [self._table(noise) for noise in noises]
         guess = np.stack([(means - table.offset) / table.slope * known for table in tables]).reshape(len(noises), -1)
-        far = self.kept.distances(guess.astype(np.float32), known, query.whole)
+        far = self.kept.distances(guess, known.ravel(), query.whole)
         if query.held_out is not None:
             far[query.held_out] = np.inf
         count = min(count, len(far) - (query.held_out is not None))

@@ -10,7 +10,7 @@ import importlib
 import os
 from typing import Any
 
-__all__ = ["available", "count", "described", "reason", "sum_logs"]
+__all__ = ["available", "count", "described", "distances", "reason", "sum_logs"]
 
 
 def _load() -> tuple[Any, str]:
@@ -32,8 +32,13 @@ def count(*arguments: Any) -> None:
 
 
 def sum_logs(*arguments: Any) -> None:
-    """Sums of a table's entries over pairs of values; see module.c. Raises ValueError for what does not fit."""
+    """`tactile_sum_logs` of matching.h. Raises ValueError likewise."""
     _module.sum_logs(*arguments)
+
+
+def distances(*arguments: Any) -> None:
+    """`tactile_distances` of matching.h. Raises ValueError likewise."""
+    _module.distances(*arguments)
 
 
 def described() -> str:

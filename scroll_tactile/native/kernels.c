@@ -2,13 +2,7 @@
 
 #include <string.h>
 
-/* With glibc each loop is also made for processors with wider registers, and chosen when the module is loaded. */
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
-#define WIDE __attribute__((target_clones("avx2", "default")))
-#else
-#define WIDE
-#endif
-
+#include "wide.h"
 
 /* Sum a kernel's channels at each reading. */
 WIDE static void sum_channels(const int16_t *restrict levels, int32_t readings, const uint16_t *restrict channels,

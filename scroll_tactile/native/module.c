@@ -3,6 +3,7 @@
 #include <Python.h>
 
 #include "kernels.h"
+#include "matching.h"
 
 /* An argument's items of a size; −1 with ValueError where the buffer is no whole number of them. */
 static Py_ssize_t items(const Py_buffer *buffer, size_t size, const char *name)
@@ -18,6 +19,19 @@ static int require(int holds, const char *what)
     if (!holds)
         PyErr_Format(PyExc_ValueError, "expected %s", what);
     return holds;
+}
+
+/* Whether a length is so many times another. */
+static int of(Py_ssize_t length, Py_ssize_t count, Py_ssize_t each)
+{
+    return each == 0 || count <= PY_SSIZE_T_MAX / each ? length == count * each : 0;
+}
+
+static PyObject *done(int well)
+{
+    if (!well)
+        return NULL;
+    Py_RETURN_NONE;
 }
 
 static int sound_bank(const tactile_bank *bank, Py_ssize_t listed, int32_t channels)
@@ -116,22 +130,7 @@ static PyObject *count(PyObject *module, PyObject *args)
     const int failed = count_into(with, readings, dilation, features);
     for (int i = 0; i < BUFFERS; i++)
         PyBuffer_Release(&with[i]);
-    if (failed)
-        return NULL;
-    Py_RETURN_NONE;
-}
-
-/* Sums of a table's entries at 256 · own + other, for each of some others. */
-static void sum_entries(const uint8_t *own, Py_ssize_t values, const uint8_t *others, Py_ssize_t count,
-                        const int16_t *table, int64_t *sums)
-{
-    for (Py_ssize_t i = 0; i < count; i++) {
-        const uint8_t *other = others + i * values;
-        int64_t sum = 0;
-        for (Py_ssize_t v = 0; v < values; v++)
-            sum += table[(size_t)own[v] << 8 | other[v]];
-        sums[i] = sum;
-    }
+    return done(!failed);
 }
 
 static PyObject *sum_logs(PyObject *module, PyObject *args)
@@ -140,29 +139,58 @@ static PyObject *sum_logs(PyObject *module, PyObject *args)
     Py_buffer own, others, table, sums;
     if (!PyArg_ParseTuple(args, "y*y*y*w*", &own, &others, &table, &sums))
         return NULL;
-    const Py_ssize_t count = sums.len / (Py_ssize_t)sizeof(int64_t);
-    const int sound = require(table.len == 65536 * (Py_ssize_t)sizeof(int16_t), "a table of 65536 entries") &&
-                      require(sums.len % (Py_ssize_t)sizeof(int64_t) == 0 && (own.len == 0 || count <= others.len / own.len) &&
-                                  others.len == count * own.len,
-                              "as many values of each other touch, and a sum for each");
+    const Py_ssize_t count = sums.len / 8;
+    const int sound = require(table.len == 2 * TACTILE_TABLE, "a table of 65536 entries") &&
+                      require(sums.len % 8 == 0 && of(others.len, count, own.len), "a sum to each other touch");
     if (sound) {
         Py_BEGIN_ALLOW_THREADS;
-        sum_entries(own.buf, own.len, others.buf, count, table.buf, sums.buf);
+        tactile_sum_logs(own.buf, own.len, others.buf, count, table.buf, sums.buf);
         Py_END_ALLOW_THREADS;
     }
     PyBuffer_Release(&own);
     PyBuffer_Release(&others);
     PyBuffer_Release(&table);
     PyBuffer_Release(&sums);
-    if (!sound)
+    return done(sound);
+}
+
+static int sound_guesses(const int16_t *guesses, Py_ssize_t count)
+{
+    int outside = 0;
+    for (Py_ssize_t i = 0; i < count; i++)
+        outside |= guesses[i] > TACTILE_MOST_GUESS || guesses[i] < -TACTILE_MOST_GUESS;
+    return require(!outside, "guesses in ±2048");
+}
+
+static PyObject *distances(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer rows, guesses, known, sums, seen;
+    if (!PyArg_ParseTuple(args, "y*y*y*w*w*", &rows, &guesses, &known, &sums, &seen))
         return NULL;
-    Py_RETURN_NONE;
+    const Py_ssize_t count = seen.len / 8, number = count ? sums.len / 8 / count : 0;
+    const int sound = require(seen.len % 8 == 0 && of(rows.len, count, known.len), "a count to each row") &&
+                      require(sums.len % 8 == 0 && of(sums.len / 8, count, number), "a sum to each row and guess") &&
+                      require(guesses.len % 2 == 0 && of(guesses.len / 2, number, known.len), "guesses of a row's width") &&
+                      sound_guesses(guesses.buf, guesses.len / 2);
+    if (sound) {
+        Py_BEGIN_ALLOW_THREADS;
+        tactile_distances(rows.buf, count, known.len, guesses.buf, number, known.buf, sums.buf, seen.buf);
+        Py_END_ALLOW_THREADS;
+    }
+    PyBuffer_Release(&rows);
+    PyBuffer_Release(&guesses);
+    PyBuffer_Release(&known);
+    PyBuffer_Release(&sums);
+    PyBuffer_Release(&seen);
+    return done(sound);
 }
 
 static PyMethodDef methods[] = {
     {"sum_logs", sum_logs, METH_VARARGS,
-     "sum_logs(own, others, table, sums): the sums of a table, int16 of 256 · own + other, over the values, uint8, of a\n"
-     "touch and of others, int64, one to each. Raises ValueError for what does not fit together."},
+     "sum_logs(own, others, table, sums): see matching.h. The last is written. Raises ValueError for what does not fit."},
+    {"distances", distances, METH_VARARGS,
+     "distances(rows, guesses, known, sums, seen): see matching.h. The last two are written. Raises ValueError likewise."},
     {"count", count, METH_VARARGS,
      "count(readings, dilation, features, levels, heavy, begins, channels, thresholds, edges, spans, members, weights,\n"
      "counted, contests): see kernels.h. The last two are written. Raises ValueError for what does not fit together."},

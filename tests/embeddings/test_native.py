@@ -18,6 +18,9 @@ from scroll_tactile.embeddings import counting
 from scroll_tactile.embeddings.banks import LEVELS, MOST_CHANNELS, bank
 from scroll_tactile.embeddings.convolution import ROUND, Bank
 from scroll_tactile.embeddings.counting import GROUP, Request, competing_groups, count_by_c, count_by_numpy
+from scroll_tactile.matching.kept_arrays import _distances
+from scroll_tactile.matching.likelihood import MISSING, Table
+from scroll_tactile.matching.matcher import _Pairs
 from scroll_tactile.signals.image import stretched
 
 SOURCES = Path(native.__file__).parent
@@ -164,18 +167,71 @@ def test_arrays_that_do_not_fit_are_refused(case):
         native.count(*(given | {name: make(given[name])}).values())
 
 
+@compiled
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_touches_are_compared_as_by_numpy(data):
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    others, width = data.draw(st.integers(0, 140)), data.draw(st.integers(1, 700))
+    rows = rng.choice([0, 1, 100, 254, MISSING], (others, width)).astype(np.uint8)
+    guesses = rng.integers(-1024, 2041, (data.draw(st.integers(1, 5)), width)).astype(np.int16)
+    known, own = rng.random(width) < 0.8, rng.integers(0, 256, width).astype(np.uint8)
+    table = Table(rng.integers(-(2**15), 2**15, 256 * 256).astype(np.int16), 0.0, 1.0, known, known, 1.0)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        by_c, by_numpy = both(
+            monkeypatch,
+            lambda: (_distances(rows, guesses, known), _Pairs(own, rows, np.ones(others)).logs(table)),
+        )
+    assert [array.tobytes() for array in by_c] == [array.tobytes() for array in by_numpy]
+
+
+ROW, LOGS = np.zeros((2, 5), np.uint8), np.zeros(65536, np.int16)
+UNFIT = {
+    "a table cut short": ("sum_logs", ROW[0], ROW, LOGS[:-1].copy(), np.zeros(2, np.int64)),
+    "more sums than touches": ("sum_logs", ROW[0], ROW, LOGS, np.zeros(3, np.int64)),
+    "touches of other values": ("sum_logs", ROW[0, :4].copy(), ROW, LOGS, np.zeros(2, np.int64)),
+    "half a sum": ("sum_logs", ROW[0], ROW, LOGS, np.zeros(12, np.uint8)),
+    "guesses of another width": (
+        "distances", ROW, np.zeros((1, 4), np.int16), np.ones(5, bool), np.zeros(2, np.int64), np.zeros(2, np.int64),
+    ),
+    "a guess that overflows": (
+        "distances", ROW, np.full((1, 5), 2049, np.int16), np.ones(5, bool), np.zeros(2, np.int64), np.zeros(2, np.int64),
+    ),
+    "more rows than there are": (
+        "distances", ROW, np.zeros((1, 5), np.int16), np.ones(5, bool), np.zeros(3, np.int64), np.zeros(3, np.int64),
+    ),
+    "sums that are not each row's": (
+        "distances", ROW, np.zeros((1, 5), np.int16), np.ones(5, bool), np.zeros(3, np.int64), np.zeros(2, np.int64),
+    ),
+}  # fmt: skip
+
+
+@compiled
+@pytest.mark.parametrize("case", UNFIT)
+def test_touches_that_do_not_fit_are_refused(case):
+    name, *given = UNFIT[case]
+    with pytest.raises(ValueError, match="expected "):
+        getattr(native, name)(*given)
+
+
 SCRIPT = """
 import importlib.util, sys, numpy as np
 spec = importlib.util.spec_from_file_location("scroll_tactile.native._kernels", sys.argv[1])
 module = importlib.util.module_from_spec(spec); spec.loader.exec_module(module)
 from scroll_tactile import Kernels, native
 from scroll_tactile.embeddings import counting
-native.count, native.available = module.count, True
-rng, known = np.random.default_rng(3), Kernels(dimension=333)
+native._module, native.available = module, True
+rows, known = np.full((3, 300), 254, np.uint8), np.ones(300, np.bool_)
+sums, seen = np.empty((3, 2), np.int64), np.empty(3, np.int64)
+native.distances(rows, np.full((2, 300), -2048, np.int16), known, sums, seen)
+assert (sums == 300 * (4 * 254 + 2048) ** 2).all() and (seen == 300).all()
+native.sum_logs(rows[0], rows, np.full(65536, -32768, np.int16), seen)
+assert (seen == -32768 * 300).all()
+rng, embedding = np.random.default_rng(3), Kernels(dimension=333)
 for channels, readings in ((1, 12), (3, 17), (5, 64), (40, 301), (70, 90), (2, 1100)):
     whole = rng.uniform(-1, 1, (channels, readings)).astype(np.float32)
     windows = {readings: [0], 12: [0, readings - 12], readings // 2 + 1: [readings // 3]}
-    known.embed_competing(whole, windows, readings + 5)
+    embedding.embed_competing(whole, windows, readings + 5)
 assert counting._agrees()
 """
 
@@ -189,7 +245,7 @@ def test_sanitizers_find_nothing(tmp_path):
     headers = sysconfig.get_paths()["include"]
     if not (Path(headers) / "Python.h").exists():
         pytest.skip("needs Python's headers")
-    sources = [str(SOURCES / "kernels.c"), str(SOURCES / "module.c")]
+    sources = [str(source) for source in sorted(SOURCES.glob("*.c"))]
     subprocess.run([gcc, *flags, "-Werror", "-Wall", "-Wextra", f"-I{headers}", *sources, "-o", str(built)], check=True)
     asan, ubsan = (
         subprocess.run(

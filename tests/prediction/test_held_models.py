@@ -289,7 +289,7 @@ def _arrays(model):
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
     matcher, conformal = model.matcher, model.conformal
-    found |= {f"kept {name}": getattr(matcher.kept, name) for name in ("blocks", "wide_blocks", "squares", "labels")}
+    found |= {f"kept {name}": getattr(matcher.kept, name) for name in ("blocks", "wide_blocks", "labels")}
     found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
     return found
 

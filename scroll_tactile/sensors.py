@@ -1,6 +1,7 @@
 """What is known about a tactile sensor: its channels, rate and range of values.
 
-Five sensors come with the project; one's own is one more, made in one line:
+Five sensors come with the project, and another is made in one line. Presets of drivers (topic, field and sensor) are in
+`recordings.presets`.
 
 >>> from scroll_tactile.sensors import Sensor
 >>> skin = Sensor(name="my-skin", channels=39, rate=50.0, low=0.0, high=1.0, unit="counts", duration=5.0)

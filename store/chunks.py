@@ -1,7 +1,8 @@
-"""An array of a checkpoint: what is said of it, and how zarr has it on disk, in chunks that are read and verified.
+"""An array of a checkpoint: its description, and how zarr has it on disk, in chunks that are read and verified.
 
-zarr writes them and anybody may read them with it. Here they are read without it: of a description that somebody else
-made, only one that our own writers would have made for the array counts, and of a file not more than its chunk needs.
+zarr writes them and anybody may read them with it. Here they are read without it. A description from elsewhere is
+accepted only if our own writers would have made the same for the array, and of a file no more is read than its chunk
+needs.
 """
 
 from __future__ import annotations

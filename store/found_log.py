@@ -25,7 +25,7 @@ REPORT_EVERY = 256  # rows
 
 
 class Fault(enum.Enum):
-    """What can be wrong with a row, said of one and of several."""
+    """A fault of a row; its value: the words for one row, and for several."""
 
     MISSING = ("is missing", "are missing")
     DAMAGED = ("fails its checksum", "fail their checksums")

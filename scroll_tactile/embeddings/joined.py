@@ -91,7 +91,7 @@ class Joined:
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
     ) -> dict[int, npt.NDArray[np.floating]]:
-        """Embed windows of an image: width → first columns, to width → features (windows, d)."""
+        """Embed windows of an image: width → first steps, to width → features (windows, d)."""
         embedded = [embed_windows(part, image, windows) for part in self.parts]
         return {width: self._beside([rows[width] for rows in embedded]) for width in windows}
 

@@ -23,8 +23,8 @@ with optional("torch", "torch", "the embedding ModuleEmbedding"):
 
 __all__ = ["ModuleEmbedding"]
 
-NARROWEST = 9  # columns that a module is given; modules of convolutions read no two columns
-COLUMNS = (NARROWEST, 30, 75)  # of the fixed images that the fingerprint is taken of
+SHORTEST = 9  # steps that a module is given; modules of convolutions read no two steps
+STEPS = (SHORTEST, 30, 75)  # of the fixed images that the fingerprint is taken of
 CHANNELS = (1, 3, 19)
 
 
@@ -32,7 +32,7 @@ class ModuleEmbedding:
     """A torch module of one's own, from images (1, C, T) float32 in [-1, 1] to features (1, d), as an embedding.
 
     The module is copied, put into evaluation mode and frozen: what is done to the original later changes nothing. An
-    image of fewer than nine columns is continued by its mirror image to nine before the module reads it.
+    image of fewer than nine steps is continued by its mirror image to nine before the module reads it.
 
     name: what messages call it. dimension: d. bound: no feature's magnitude exceeds it.
     partial_windows: whether it reads a touch narrower than a window as it reads a whole window.
@@ -87,7 +87,7 @@ class ModuleEmbedding:
             digest.update(f"\n{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
             digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
         read = 0
-        for image in (canary(channels, columns) for channels in self._channels for columns in COLUMNS):
+        for image in (canary(channels, steps) for channels in self._channels for steps in STEPS):
             try:
                 features = self.embed(image)
             except (RuntimeError, ValueError, IndexError):  # what torch says of an image that does not fit
@@ -96,7 +96,7 @@ class ModuleEmbedding:
             read += 1
         if not read:
             raise EmbeddingError(
-                f"{self!r} reads no image of {self._channels} channels and {COLUMNS} columns: say in `channels` how "
+                f"{self!r} reads no image of {self._channels} channels and {STEPS} columns: say in `channels` how "
                 "many it takes"
             )
         return digest.hexdigest()
@@ -107,7 +107,7 @@ class ModuleEmbedding:
         Raises EmbeddingError where the module's output has another shape, is not finite or exceeds the bound.
         """
         with steady():
-            output = self._module(torch.tensor(fit(image, max(NARROWEST, image.shape[-1]))[None], dtype=torch.float32))
+            output = self._module(torch.tensor(fit(image, max(SHORTEST, image.shape[-1]))[None], dtype=torch.float32))
         if not isinstance(output, torch.Tensor) or output.shape != (1, self.dimension):
             came = tuple(output.shape) if isinstance(output, torch.Tensor) else type(output).__name__
             raise EmbeddingError(

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest
-from scroll_tactile.signals.windows import WindowPlan, scales, whole_columns
+from scroll_tactile.signals.windows import WindowPlan, scales, whole_steps
 
 __all__ = [
     "TOGETHER",
@@ -110,7 +110,7 @@ class WindowEmbedding(Embedding, Protocol):
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
     ) -> Mapping[int, FloatArray]:
-        """Width → features (windows, d) of width → first columns; see the function `embed_windows`."""
+        """Width → features (windows, d) of width → first steps; see the function `embed_windows`."""
         ...
 
 
@@ -162,7 +162,7 @@ def parts_of(embedding: Embedding) -> tuple[Embedding, ...]:
 def window_plan(sensor: Sensor, embedding: Embedding) -> WindowPlan:
     """How an embedding reads the touches of a sensor: which windows, and which scales judge, as it declares."""
     declared = capabilities_of(embedding)
-    whole = whole_columns(sensor) if declared.reads_whole_touches else 0
+    whole = whole_steps(sensor) if declared.reads_whole_touches else 0
     return WindowPlan(
         scales(sensor),
         declared.partial_windows,
@@ -192,9 +192,9 @@ def require_rest(embedding: Embedding, sensor: Sensor) -> None:
 def embed_windows(
     embedding: Embedding, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
 ) -> dict[int, FloatArray]:
-    """Embed windows of a tactile image: for each width, those that begin at the given columns.
+    """Embed windows of a tactile image: for each width, those that begin at the given steps of time.
 
-    image: shape (C, T), in [-1, 1]. windows: width in columns → first columns. Returns width → features of
+    image: shape (C, T), in [-1, 1]. windows: width in steps → first steps. Returns width → features of
     shape (number of windows, d), where row i equals `embedding.embed(image[:, start_i : start_i + width])`
     to the bit. A window that begins at 0 may be wider than the image: it is read as far as it goes. An embedding
     whose capabilities say `embeds_windows` reads them all at once.
@@ -218,11 +218,11 @@ def embed_competing(
     return dict(features), competing
 
 
-def canary(channels: int, columns: int) -> npt.NDArray[np.float32]:
+def canary(channels: int, steps: int) -> npt.NDArray[np.float32]:
     """A fixed image of shape (C, T) in [-1, 1] whose features a fingerprint holds.
 
     A sawtooth of integers: no sine, whose last bit differs between machines.
     """
-    place = np.arange(channels * columns).reshape(channels, columns)
+    place = np.arange(channels * steps).reshape(channels, steps)
     image: npt.NDArray[np.float32] = ((place * (place + 7) * 13 % 255) / 127.0 - 1).astype(np.float32)
     return image

@@ -33,10 +33,10 @@ FloatArray = npt.NDArray[np.float32]
 MEAN = (0.485, 0.456, 0.406)
 DEVIATION = (0.229, 0.224, 0.225)
 
-# Windows of TOGETHER columns or more share one pass over the whole image: RoboSkin is classified 0.3 points better so
+# Windows of TOGETHER steps or more share one pass over the whole image: RoboSkin is classified 0.3 points better so
 # than in windows apart, and one pass is cheaper. Narrower ones are cut out first, for early decisions rest on them, and
 # these see only what was observed: pooled from a whole pass, the first 0.3 s were right in 7 % instead of 87.
-MOST_COLUMNS = 4096  # of a whole image passed at once; of longer ones every window is read by itself, at bounded memory
+MOST_STEPS = 4096  # of a whole image passed at once; of longer ones every window is read by itself, at bounded memory
 LEAST = {"torchvision": 1, "universal": 3}  # rows and columns: a kernel has to fit the padded image
 BATCH = 32  # images at once in `embed_bulk`
 
@@ -119,8 +119,8 @@ class Vision:
         settings = (self._net.depth, self._net.stem, self.stages, self.runtime, version_of(self.runtime))
         digest = hashlib.sha256(f"vision 1 {settings} {self.precision} {MEAN} {DEVIATION} {TOGETHER}".encode())
         hash_tensors(digest, self._net)
-        for channels, columns in ((3, 9), (19, 30), (60, 75)):
-            digest.update(self.embed(canary(channels, columns)).astype("<f4").tobytes())
+        for channels, steps in ((3, 9), (19, 30), (60, 75)):
+            digest.update(self.embed(canary(channels, steps)).astype("<f4").tobytes())
         return digest.hexdigest()
 
     def embed(self, image: npt.NDArray[np.float32]) -> FloatArray:
@@ -135,14 +135,14 @@ class Vision:
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
     ) -> dict[int, FloatArray]:
-        """Embed windows of an image: width → first columns, to width → features (windows, d).
+        """Embed windows of an image: width → first steps, to width → features (windows, d).
 
-        Windows of 48 columns or more are averaged from one pass over the whole image, so that they also see a little
+        Windows of 48 steps or more are averaged from one pass over the whole image, so that they also see a little
         of what lies beside them. A narrower one is what `embed` gives for it alone, to the bit.
         """
         image = self._readable(image)
-        columns = image.shape[1]
-        wide = [width for width in windows if width >= TOGETHER and columns <= MOST_COLUMNS]
+        steps = image.shape[1]
+        wide = [width for width in windows if width >= TOGETHER and steps <= MOST_STEPS]
         places = [(start, width) for width in wide for start in windows[width]]
         pooled = iter(self._read(image, places)) if places else iter(())
         features: dict[int, FloatArray] = {}
@@ -166,12 +166,12 @@ class Vision:
         images = [self._readable(image) for image in images]
         for i, image in enumerate(images):
             sizes.setdefault(image.shape, []).append(i)
-        for (_, columns), members in sizes.items():
+        for (_, steps), members in sizes.items():
             for first in range(0, len(members), BATCH):
                 batch = members[first : first + BATCH]
                 with torch.inference_mode(), torch.autocast("cpu", enabled=False):
                     planes = to_planes(torch.from_numpy(np.stack([images[i] for i in batch]).astype(np.float32)))
-                    features[batch] = self._pooled(planes, [(0, columns)], columns)[:, 0]
+                    features[batch] = self._pooled(planes, [(0, steps)], steps)[:, 0]
         return features
 
     def network(self) -> TunableVision:
@@ -184,7 +184,7 @@ class Vision:
         return TunableVision(net, self.stages)
 
     def _readable(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """The image, continued by its mirror image where it has fewer columns than the network can read."""
+        """The image, continued by its mirror image where it has fewer steps than the network can read."""
         if image.ndim != 2 or 0 in image.shape:
             raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
         least = LEAST[self._net.stem]
@@ -202,9 +202,9 @@ class Vision:
             features: FloatArray = self._pooled(planes, windows, image.shape[1])[0]
             return features
 
-    def _pooled(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], columns: int) -> FloatArray:
+    def _pooled(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], steps: int) -> FloatArray:
         maps = self._run(planes.numpy())
-        pooled = pool_windows([torch.from_numpy(maps[stage]) for stage in self.stages], columns, windows)
+        pooled = pool_windows([torch.from_numpy(maps[stage]) for stage in self.stages], steps, windows)
         # Rounding may pass 1 by a unit in the last place.
         features: FloatArray = np.minimum(pooled.numpy(), np.float32(1))
         return features
@@ -228,7 +228,7 @@ class TunableVision(nn.Module):
         return self
 
     def forward(self, images: torch.Tensor, windows: Sequence[tuple[int, int]]) -> torch.Tensor:
-        """Features (B, windows, d) of images (B, C, T) in [-1, 1], at windows (first column, width).
+        """Features (B, windows, d) of images (B, C, T) in [-1, 1], at windows (first step, width).
 
         Equal to the embedding's but for rounding; all windows are averaged from one pass.
         """
@@ -247,11 +247,11 @@ def to_planes(images: torch.Tensor) -> torch.Tensor:
     return ((planes + 1) / 2 - mean) / deviation
 
 
-def pool_windows(maps: Sequence[torch.Tensor], columns: int, windows: Sequence[tuple[int, int]]) -> torch.Tensor:
+def pool_windows(maps: Sequence[torch.Tensor], steps: int, windows: Sequence[tuple[int, int]]) -> torch.Tensor:
     """Average maps over windows: features (B, windows, d), each map's part of them of length 1.
 
-    maps: of some stages, each (B, planes, rows, W), of an image of so many columns. windows: (first column, width) in
-    columns of the image; one that reaches beyond it is taken as far as it goes. Averaged are all rows, and the
+    maps: of some stages, each (B, planes, rows, W), of an image of so many steps. windows: (first step, width) in
+    steps of the image; one that reaches beyond it is taken as far as it goes. Averaged are all rows, and the
     columns of the map that the window covers, at least one. A part that is zero stays zero.
     """
     parts = []
@@ -260,8 +260,8 @@ def pool_windows(maps: Sequence[torch.Tensor], columns: int, windows: Sequence[t
         # Window by window: what is asked for beside a window must not change its bits, and a product would.
         averages = []
         for start, width in windows:
-            first = start * across // columns
-            after = max(first + 1, -(-min(start + width, columns) * across // columns))
+            first = start * across // steps
+            after = max(first + 1, -(-min(start + width, steps) * across // steps))
             averages.append(stage[..., first:after].mean(dim=(2, 3)))
         parts.append(functional.normalize(torch.stack(averages, dim=1), dim=-1))
     return torch.cat(parts, dim=-1)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows, parts_of
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import steady
-from scroll_tactile.embeddings.vision import MOST_COLUMNS, TunableVision, Vision
+from scroll_tactile.embeddings.vision import MOST_STEPS, TunableVision, Vision
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.libraries import optional
 from scroll_tactile.memory.touch_rows import Codes
@@ -136,7 +136,7 @@ class TouchFeatures:
 
     def reads(self, columns: int) -> bool:
         """Whether a touch of so many columns is one pass of the network, or needs none."""
-        return not self.tunable or columns <= MOST_COLUMNS
+        return not self.tunable or columns <= MOST_STEPS
 
     def network(self) -> Backbone:
         """A new copy of the network, with the embedding's own weights."""

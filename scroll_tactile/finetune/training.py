@@ -225,7 +225,7 @@ class Trainer:
     def _augmented(self, sample: TrainingSample, random: np.random.Generator) -> TrainingSample:
         if random.random() >= AUGMENTED:
             return sample
-        image = AUGMENTATION.augment(sample.image, random, columns=sample.image.shape[1])
+        image = AUGMENTATION.augment(sample.image, random, steps=sample.image.shape[1])
         return replace(sample, image=image, frozen=self.touches.frozen(image))
 
     def _step(

@@ -258,7 +258,7 @@ def _edges(longest: int, channels: int) -> Rows:
 def _distances(rows: LevelArray, guesses: npt.NDArray[np.int16], known: npt.NDArray[np.bool_]) -> FloatArray:
     """Mean squared distances of rows of levels (rows, blocks) from guesses in quarters, (rows, guesses)."""
     sums, seen = np.empty((len(rows), len(guesses)), np.int64), np.empty(len(rows), np.int64)
-    if native.available:
+    if native.available and len(rows):
         native.distances(np.ascontiguousarray(rows), np.ascontiguousarray(guesses), known, sums, seen)
     else:
         exact = guesses.astype(np.float64)

@@ -1,4 +1,4 @@
-"""The buffer of exemplars, read from where they lie: the journal, its compaction checkpoint, or the memory itself."""
+"""The buffer of exemplars, read from the journal, its compaction checkpoint, or the memory itself."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 
 def ranked_exemplars(memory: Memory, store: Store | None) -> dict[str, list[Exemplar]]:
-    """The buffer, as `rank`, against the exact means of all that was observed. Raises as `exemplar_candidates`."""
+    """The buffer, ranked by `rank` against the exact means of all observations. Raises as `exemplar_candidates`."""
     statistics = memory.statistics
 
     def mean(material: str, scale: Scale) -> npt.NDArray[np.int64]:
@@ -58,8 +58,8 @@ def _exemplars_in(memory: Memory, store: Store, sequence: int) -> list[Exemplar]
     require_compaction(memory, store)
     row = store.record(sequence) if sequence else store.compaction()
     if isinstance(row, Record) and row.kind == OBSERVE:
-        columns, codes = memory.codes(row)
-        readings, stages = only_readings(row.arrays), memory.plan.scored_stages(columns)
+        steps, codes = memory.codes(row)
+        readings, stages = only_readings(row.arrays), memory.plan.scored_stages(steps)
         return [Exemplar.of(row.label, row.key, readings, stages, codes)]
     about = None if row is None else cast(Any, row.attributes.get("exemplars"))
     return [] if row is None or about is None else exemplars_from_arrays(row.arrays, about)

@@ -1,7 +1,7 @@
-"""Which touches a memory has, by the hash of their readings: one content is one touch, and has one name.
+"""Which touches a memory has, by the hash of their readings: equal readings are one touch.
 
-A touch that is there under its name is not learned a second time, whoever brings it. One that is there under another is
-refused where many are learned from files, in one process or by a fleet; `observe` takes it, and a merge is a union.
+A touch that the memory has under the same name is never learned twice. One that it has under another name is refused in
+learning from files, by one process or a fleet; `observe` and `merge` accept it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
     """Why a touch that is there under these names cannot be learned as a material; None where it can.
 
-    clipped: whether all its values lay outside the sensor's range, so that clipping may have made it this touch.
+    clipped: whether all its values lay outside the sensor's range, so that clipping may have made it equal another.
     """
     if not names or material in names:
         return None
@@ -36,7 +36,7 @@ def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str |
 
 
 class ListedContents:
-    """The touches of a memory by their keys. rows: of each its material, its key and its row in the journal."""
+    """The touches of a memory by their keys. rows: (material, key, row in the journal) of each."""
 
     def __init__(self, rows: Iterable[tuple[str, bytes, int]] = ()) -> None:
         self._rows: dict[bytes, tuple[tuple[str, int], ...]] = {}
@@ -44,7 +44,7 @@ class ListedContents:
             self.add(material, key, sequence)
 
     def copy(self) -> ListedContents:
-        """The same touches, to be changed apart."""
+        """A copy that changes independently."""
         other = ListedContents()
         other._rows = dict(self._rows)
         return other
@@ -62,7 +62,7 @@ class ListedContents:
             self._rows.pop(key, None)
 
     def names(self, key: bytes) -> list[str]:
-        """The names of a content, the first that it was given first; none where it is not there."""
+        """The names of a content, oldest first; none where it is not there."""
         return list(dict.fromkeys(name for name, _ in self._rows.get(key, ())))
 
     def find(self, material: str, key: bytes) -> int | None:
@@ -81,7 +81,7 @@ class StoredContents:
         return (head for head in heads if head.kind in (OBSERVE, MEMBER) and not self._memory.is_gone(head.sequence))
 
     def copy(self) -> ListedContents:
-        """All of them that are not damaged, to be changed apart."""
+        """A copy in memory that changes independently, without damaged rows."""
         heads = self._active(_sound(self._store))
         return ListedContents((head.label, head.key, head.sequence) for head in heads)
 
@@ -96,7 +96,7 @@ class StoredContents:
 
 
 def _sound(store: Store) -> Iterator[Head]:
-    """The heads of a journal, but for those that are damaged: nobody can say what they hold."""
+    """The heads of a journal, without the damaged ones, whose content nobody knows."""
     after = 0
     while True:
         try:

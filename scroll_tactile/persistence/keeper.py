@@ -1,4 +1,4 @@
-"""What a learner does with its memory without a touch at hand: changes, copies, and what the journal says."""
+"""The learner's methods that embed no touch: changes and copies of its memory, and lists from its journal."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MemoryKeeper(ABC):
     @property
     @abstractmethod
     def _ledger(self) -> Ledger:
-        """What has the memory, and its journal."""
+        """The memory with its journal."""
 
     @property
     def path(self) -> Path | None:
@@ -77,8 +77,8 @@ class MemoryKeeper(ABC):
         """Make what is observed, retracted or forgotten in the block durable together, when it ends.
 
         For many touches: it waits for the disk once. If the process dies in the block, none of it is kept; after an
-        exception, what came before it is. Other threads wait for its end, and it allows no fine-tuning, merging,
-        compacting or closing. In a memory without a path it does nothing.
+        exception, all that came before the exception is. Other threads wait for its end; fine-tuning, merging,
+        compacting and closing are refused in it. In a memory without a path it does nothing.
 
         Raises StoreError where the batch could not be made durable: the memory is then as it was before it.
         """
@@ -101,7 +101,7 @@ class MemoryKeeper(ABC):
 
         Returns its new sequence; it keeps its time and source. A description stays with the name that it was given to.
 
-        Raises what `retract` raises (nothing was changed), also MaterialError for a name that is none; InputError where
+        Raises what `retract` raises (nothing was changed), also MaterialError for an invalid name; InputError where
         it has that name already, and in a batch.
         """
         return self._ledger.relabel(receipt, require_name(material))
@@ -140,13 +140,15 @@ class MemoryKeeper(ABC):
 
         It holds what was learned: sums, sampled touches, kept touches and descriptions, and of each observation its
         name, content hash, time and source. f* and retracted observations stay behind.
-        rows: also each observation's readings, or codes where the memory has no readings, so that it can be retracted
-        where the file is merged, and counted once where it is there already. They are left out of a memory of which any
-        were compacted. Without them come the readings of the exemplars. readings: False leaves out all that shows a
-        touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with
-        exemplars=0 and kept_touches=0. source: of observations that have none.
 
-        Raises InputError in a memory without a path, and for a source that is none; StoreError.
+        rows: also each observation's
+        readings, or codes where the memory has no readings. A memory that merges the file can then retract the
+        observation, and count it once if it has it already. A memory of which any rows were compacted is packed without
+        rows. Without rows the file has the readings of the exemplars alone. readings: False leaves out all that shows a
+        touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with exemplars=0
+        and kept_touches=0. source: for observations that have none.
+
+        Raises InputError in a memory without a path, and for an invalid source; StoreError.
         """
         require_arguments({"path": path})
         checked_source = None if source is None else require_source(source)
@@ -166,9 +168,9 @@ class MemoryKeeper(ABC):
         return self._ledger.compact(keep)
 
     def refresh(self) -> bool:
-        """In a memory opened to read, take in what was committed since; whether there was anything.
+        """Take in the rows committed since, in a memory opened to read; returns whether there were any.
 
-        Raises StoreError; what was known before stays then.
+        Raises StoreError; the memory then stays as it was.
         """
         return self._ledger.refresh()
 

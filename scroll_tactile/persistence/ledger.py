@@ -1,4 +1,4 @@
-"""The changes of a memory: each is durable when its method returns, and whole or not there at all."""
+"""The changes of a memory: each is atomic, and durable when its method returns."""
 
 from __future__ import annotations
 
@@ -37,7 +37,11 @@ __all__ = ["Ledger"]
 
 
 class Ledger(OpenMemory):
-    """The memory of one learner, and all that changes it: a row of the journal first, then the sums."""
+    """The memory of one learner, and all that changes it.
+
+    An observation appends its row to the journal before it changes the sums. A retraction changes the sums first, and
+    reverts them if the journal refuses its row.
+    """
 
     def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
         durable = self.store is not None and not self._batching
@@ -53,16 +57,19 @@ class Ledger(OpenMemory):
         *,
         again: bool = False,
     ) -> Receipt:
-        """Append an observation to the journal, then add it to the memory; again: also one that is there already."""
+        """Append an observation to the journal, then add it to the memory; durable on return, in a batch at its end.
+
+        again: observe once more a touch that the memory has under this name.
+        """
         require_row(stream)
         with self.lock:
             self.require_open()
-            # In a memory opened to read the journal refuses all.
+            # A memory opened to read skips this: its journal refuses the row below.
             if not again and (self.store is None or self.store.mode == "write"):
                 known = self.contents().find(material, stream.key)
                 if known is not None:
                     return self._receipt(known, material, stream, repeated=True)
-            # Before the journal has it: every row there must fit at the next opening.
+            # Checked before the row is in the journal: the next opening must be able to add every row.
             self.memory.statistics.require_room(codes)
             undo = self._undo_of(material, stream.key, columns) if self.store is None else None
             with self._mutation(_nothing, undo):
@@ -70,11 +77,11 @@ class Ledger(OpenMemory):
                 if self._contents is not None:
                     self._contents.add(material, stream.key, sequence)
                 self._changed([(material, codes, 1)])
-            self._snapshot_if_due()
+            self._checkpoint_if_due()
             return self._receipt(sequence, material, stream)
 
     def _undo_of(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
-        """What takes the next observation back, of a memory without a store."""
+        """A function that undoes the next observation, for a memory without a store."""
         memory, sequence = self._memory.undo(material, key, columns), self._memory.sequence + 1
 
         def undo() -> None:
@@ -86,7 +93,7 @@ class Ledger(OpenMemory):
 
     def _append(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None) -> int:
         memory = self._memory
-        # Of every stream, not of the exemplars alone: any can take the place of a retracted one.
+        # Readings of every stream are kept, not of exemplars alone: any can take the place of a retracted exemplar.
         kept = self._bare or memory.exemplars is not None or memory.kept is not None
         packed = pack_readings(stream.readings) if kept else {}
         if self.store is None:
@@ -102,7 +109,7 @@ class Ledger(OpenMemory):
         return head.sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
-        """As `TactileLearner.describe`, of what was checked."""
+        """As `TactileLearner.describe`, for a description that was checked."""
         with self.lock:
             self.require_open()
             memory = self.memory
@@ -119,7 +126,7 @@ class Ledger(OpenMemory):
                     memory.sequence = self.store.append(DESCRIBE, material, b"", attributes=attributes).sequence
                 describe(memory.descriptions, material, constituents)
                 self.described += 1
-            self._snapshot_if_due()
+            self._checkpoint_if_due()
 
     def retract(self, receipt: Receipt | int) -> None:
         """As `TactileLearner.retract`."""
@@ -139,9 +146,9 @@ class Ledger(OpenMemory):
         return len(found)
 
     def _retract(self, store: Store, records: list[Record], material: str) -> None:
-        # In the memory first: it reads rows again that may be damaged, and after a retraction is in the journal every
-        # opening would have to read them.
-        store.compaction()
+        # The memory changes before the journal: that reads rows again, and one may be damaged. With the retraction in
+        # the journal, every later opening would fail on that row.
+        store.compaction()  # raises where it is damaged: choosing samples again needs it
         memory, sequences = self._memory, spans(record.sequence for record in records)
         chosen, tuned = memory.chosen, memory.tuned
 
@@ -157,7 +164,7 @@ class Ledger(OpenMemory):
             memory.sequence = head.sequence
             apply_description(memory.descriptions, head)
             self._changed(retracted)
-        self._snapshot_if_due()
+        self._checkpoint_if_due()
 
     def relabel(self, receipt: Receipt | int, material: str) -> int:
         """As `TactileLearner.relabel`."""
@@ -167,7 +174,7 @@ class Ledger(OpenMemory):
             record = observation_of(store, self.memory, receipt)
             if record.label == material:
                 raise InputError(f"observation {record.sequence} of {store.path} is called {material!r} already")
-            store.compaction()  # a damaged one has what the retraction needs
+            store.compaction()  # raises where it is damaged: choosing samples again needs it
             memory = self._memory
             with self._mutation(), store.batch():
                 removed = memory.retract(record)
@@ -176,7 +183,7 @@ class Ledger(OpenMemory):
                 attributes, arrays, time = record.attributes, dict(record.arrays), record.time
                 head = store.append(OBSERVE, material, record.key, attributes=attributes, arrays=arrays, time=time)
                 self._changed([removed, *(replay(memory, Record(**vars(head), arrays=arrays), store) or ())])
-            self._snapshot_if_due()
+            self._checkpoint_if_due()
             return head.sequence
 
     def _require_no_batch(self, what: str) -> None:
@@ -204,16 +211,16 @@ class Ledger(OpenMemory):
                 raise
             finally:
                 self._batching = False
-            self._snapshot_if_due()
+            self._checkpoint_if_due()
             if raised is not None:
                 raise raised
 
     def merge(
         self, other: str | os.PathLike[str], rules: MergeRules, progress: Callable[[str, int, int], object]
     ) -> tuple[Merged, list[tuple[Head, str]]]:
-        """As `TactileLearner.merge`; also the rows there that are refused, and why.
+        """As `TactileLearner.merge`; also returns the rows of the other memory that are refused, and why.
 
-        Raises ObservationError also where one that is refused cannot be left out.
+        Raises ObservationError also where a refused row was compacted there, and cannot be left out.
         """
         with self.lock:
             store, memory = self.require_store("merge"), self.memory
@@ -224,7 +231,7 @@ class Ledger(OpenMemory):
                 with self._mutation(), store.batch():
                     added = plan.append_to(store, memory, lambda done, of: progress("merging", done, of))
             self._changed()
-            self._snapshot_if_due()
+            self._checkpoint_if_due()
         return Merged(added, plan.shared, len(plan.descriptions)), plan.refused
 
     def compact(self, keep: int) -> Compacted:
@@ -235,8 +242,8 @@ class Ledger(OpenMemory):
             before = sum(store.size().values())
             self.require_writing()
             if last_sequence > memory.compacted:
-                store.compaction()  # a damaged one has what the new one needs
-                # With the tuned model, which the compaction checkpoint may lack.
+                store.compaction()  # raises where it is damaged: the new one is made from it
+                # The newest state has the tuned model, which the compaction checkpoint may lack.
                 newest = memory.to_arrays() if last_sequence < memory.sequence else None
                 kept = until(memory, store, last_sequence) if last_sequence < memory.sequence else memory
                 arrays, attributes = kept.to_arrays(last_sequence, exemplar_candidates(kept, store))
@@ -260,7 +267,7 @@ class Ledger(OpenMemory):
             before = memory.tuned, memory.tuned_last_sequence
             memory.tuned, memory.tuned_last_sequence = tuned, last_sequence
             try:
-                self._snapshot()
+                self._write_checkpoint()
             except BaseException:
                 # Ctrl-C may come when the checkpoint is already current: closing writes the earlier tuned model again.
                 (memory.tuned, memory.tuned_last_sequence), self._saved = before, -1

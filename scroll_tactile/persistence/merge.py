@@ -1,4 +1,4 @@
-"""How two memories become one: which rows of the other come in, which are left out, and which are refused."""
+"""Merging another memory into ours: which of its rows are appended, which are left out, and which are refused."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ Choice = Literal["same", "ours", "theirs"]
 
 @dataclass(frozen=True)
 class MergeRules:
-    """How another memory comes in.
+    """How another memory is merged into ours.
 
-    once: leave out streams that both observed, of one material with one content hash. one_name: refuse touches that are
-    there under another name, or came under one before, and leave out those that came before under theirs: what was
-    learned from sources. clipped: contents that clipping made, of which the refusal says so. default_source: of
-    touches that say none. thorough: see `Gate`.
+    once: leave out streams that both observed, of one material with one content hash. one_name: as in learning from
+    files, a content has one name, the first in either memory: touches under another name are refused, repeats under the
+    same name left out. clipped: contents that clipping produced; their refusals mention it. default_source: for touches
+    without a source. thorough: see `Gate`.
     """
 
     once: bool = True
@@ -46,12 +46,13 @@ class MergeRules:
 
 @dataclass(frozen=True)
 class MergePlan:
-    """What another memory would bring: rows to be appended, in order.
+    """What a merge will append to our journal, in order.
 
-    rows: heads of its journal. compaction: what stands for those that it compacted. shared: streams that both observed,
-    and that came twice. left_out: those of them that are counted once, and what is refused. refused: touches that are
-    there under another name, and why that is refused. descriptions: by material, those that we have not.
-    default_source: see `MergeRules`. newest: what a packed memory sums up.
+    source: the other memory. rows: heads of its journal that are appended. compaction: its compaction checkpoint, which
+    stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
+    rows that are not appended: shared streams that count once, and refused ones. refused: touches that have another
+    name already, each with the reason. descriptions: material → the description that is taken over. default_source: see
+    `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be added in place of its rows.
     """
 
     source: MemoryStore
@@ -73,11 +74,11 @@ class MergePlan:
         contents: ListedContents | StoredContents,
         rules: MergeRules,
     ) -> Self:
-        """Look through both journals; contents: which touches we have.
+        """Plan a merge from both journals. contents: which touches ours has.
 
-        Raises MismatchError where theirs cannot be a part of ours, or describes a material otherwise and nobody chose,
-        ObservationError where a touch cannot be left out, DamageError for what opening theirs refuses, and for a shared
-        stream that is not what its key says, here or there.
+        Raises MismatchError where the two recipes differ, or their descriptions and `descriptions` is "same";
+        ObservationError where a touch that must be left out was compacted; DamageError for a damaged row of theirs, and
+        for a shared stream whose readings do not hash to its key, in either memory.
         """
         _require_mergeable(ours, memory, theirs)
         compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
@@ -112,11 +113,11 @@ class MergePlan:
         summed = newest if theirs.is_packed else None
         return cls(theirs, found, rows, shared, left_out, refused, described, rules.default_source, summed)
 
-    def append_to(self, ours: Store, memory: Memory, each: Callable[[int, int], object]) -> int:
-        """Append the rows to our journal and add them to our memory; the number of observations that came in.
+    def append_to(self, ours: Store, memory: Memory, progress: Callable[[int, int], object]) -> int:
+        """Append the rows to our journal and add them to our memory; returns the number of observations added.
 
-        The caller opens a batch around it, and where a row does not pass the gate none of them is kept. each: called
-        with (rows done, rows in all).
+        The caller opens a batch around it: where one row does not pass the gate none is kept. progress: called with
+        (rows done, rows in all).
         """
         compaction = self.compaction
         # A compaction checkpoint comes in as one row, and the merges before it are a part of it.
@@ -137,13 +138,13 @@ class MergePlan:
             elif memory.exemplars is not None and "nbytes" in attributes:
                 memory.exemplars.add(label, key, head.sequence)
             memory.sequence = head.sequence
-            each(done, total)
+            progress(done, total)
         if sums is not None:
             memory.join(sums, exemplars=False)
         return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
 
     def _sums(self, memory: Memory) -> Memory | None:
-        """What the rows taught, of those that are not left out; None where only replaying them tells."""
+        """The sums of the rows that come in, from the packed memory's own; None where the rows must be replayed."""
         source = self.source
         if self.newest is None or source.compacted:
             return None
@@ -174,16 +175,16 @@ class MergePlan:
 
 
 def _row(contents: ListedContents | StoredContents, head: Head) -> int | None:
-    """Our row of a touch that both have under one name; None where we have it not."""
+    """Our row of their touch, under the same name; None where ours has none."""
     return contents.find(head.label, head.key)
 
 
 def _by_first_names(
     incoming: Sequence[Head], contents: ListedContents | StoredContents, compacted: int, clipped: Collection[bytes]
 ) -> tuple[list[tuple[Head, str]], set[int]]:
-    """The touches that are there, or came just before, under another name, and why each is refused.
+    """The touches that our memory, or an earlier row of theirs, has under another name, each with the reason.
 
-    And the rows of those that came before under their own, where they can be left out.
+    Also the sequences of repeats: rows of theirs that an earlier one has under the same name, unless compacted.
     """
     came: dict[bytes, str] = {}
     refused: list[tuple[Head, str]] = []
@@ -217,7 +218,7 @@ def _cannot_be_left_out(
 def _descriptions(
     ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
-    """Those of their descriptions that come in."""
+    """Their descriptions that are taken over."""
     theirs_now = dict(cast(dict[str, Description], {} if compaction is None else compaction.attributes["descriptions"]))
     for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
         apply_description(theirs_now, head)
@@ -258,7 +259,7 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
 
 
 def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> Checkpoint | None:
-    """Their newest checkpoint. Raises DamageError where what does not come in would not pass the gate of theirs."""
+    """Their newest checkpoint. Verifies the rows that stay behind, too: raises DamageError where one fails the gate."""
     for wrong in wrong_retractions(theirs.path, heads):
         raise wrong
     for head in heads:
@@ -268,7 +269,7 @@ def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int])
 
 
 def _without_configuration(part: Any) -> Any:
-    """The part of an identity, of an embedding without its configuration: its weights' file may have any name."""
+    """A part of an identity; an embedding's without its configuration, as its weights' file may have any name."""
     return part.model_copy(update={"configuration": None}) if isinstance(part, EmbeddingIdentity) else part
 
 

@@ -1,4 +1,4 @@
-"""What a journal says of observations: what became of them, and which of them can be retracted."""
+"""The observations in a journal: their state, and which of them can be retracted."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
         )
     found = [head.sequence for head in _retractable(store, memory, material)]
     if len(found) != count:
-        for _ in store.heads(memory.compacted):  # one that is damaged was passed over
+        for _ in store.heads(memory.compacted):  # raises DamageError for a damaged row, which `_retractable` skips
             pass
         raise ObservationError(
             f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
@@ -88,16 +88,16 @@ def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
     return [head.sequence for head in mine]
 
 
-def is_from(said: str | None, source: str) -> bool:
-    """Whether an observation that says where it comes from comes from there: a file, or what it lies in."""
+def is_from(recorded: str | None, source: str) -> bool:
+    """Whether an observation's recorded source is this one: the same file, or a file in this folder or address."""
     place = source.rstrip("/")
-    # Behind a file's name come readings in brackets, or a topic; behind a folder's a file.
+    # A file's name is followed by an interval in brackets or a topic, a folder's by a file.
     ends = "/[ " if "." in place.rpartition("/")[2] else "/"
-    return said is not None and (said == source or said.startswith(tuple(place + end for end in ends)))
+    return recorded is not None and (recorded == source or recorded.startswith(tuple(place + end for end in ends)))
 
 
 def observations(store: Store) -> list[Observation]:
-    """All observations of a journal, in order, and what became of them."""
+    """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
 

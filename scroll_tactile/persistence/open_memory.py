@@ -30,22 +30,23 @@ Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
 """Arrays and attributes."""
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
-SNAPSHOT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
-LOOKS = 5  # of a reader at a memory that is written to meanwhile, before it is read anew
-MATERIALS_A_ROW = 16  # and where there are many materials, as many rows as a part of them: a checkpoint has all
+CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
+REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
+# A checkpoint writes all materials. With very many, it waits for one row for each so many of them.
+MATERIALS_PER_ROW = 16
 
 
 class OpenMemory:
     """The memory of one learner and the store that keeps it; `Ledger` has the changes.
 
     load: reads the memory from the store, or makes an empty one without a store. bare: whether rows of observations
-    hold readings alone, to be embedded again when they are read. contents: which touches a memory without a store has;
-    None where nothing says.
+    hold readings alone, to be embedded again when they are read. contents: the touches of a memory without a store;
+    None where they are not known.
 
-    lock: held by whoever reads or changes the memory. version: grows with each change of what was observed.
-    described: grows with each change of a description. added: where `follow` is set, what was observed and retracted
-    since it was last cleared; None where that is too much, or more has changed. saves: whether checkpoints are written;
-    without them the journal still has all.
+    lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
+    grows with each change of a description. added: if `follow` is set, the touches observed and retracted since the
+    list was last cleared; None where these are too many, or something else has changed. saves: whether checkpoints are
+    written; the journal alone has every row, too.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class OpenMemory:
 
     @property
     def memory(self) -> Memory:
-        """The memory; after a change that was cut short, by ctrl-C, say, it is read again, or the change is undone."""
+        """The memory. If a change was cut short, by ctrl-C for instance, it is read again, or the change is undone."""
         if not self._whole:
             if self._undo is not None:
                 self._undo()
@@ -90,11 +91,11 @@ class OpenMemory:
             return what(self.memory, self.store)
 
     def contents(self) -> ListedContents | StoredContents:
-        """Which touches the memory has, by their content; whoever calls holds the lock.
+        """Which touches the memory has, by their content; the caller holds the lock.
 
         Raises StoreClosedError for a snapshot of a memory that was closed before anybody asked.
         """
-        _ = self.memory  # where a change was cut short, it is read again
+        _ = self.memory  # reads it again if a change was cut short
         if self.store is not None:
             return StoredContents(self.store, self._memory)
         if self._contents is None:
@@ -110,7 +111,7 @@ class OpenMemory:
             return self.contents().names(key)
 
     def copied_contents(self) -> ListedContents | None:
-        """All that `contents` has, to be changed apart; None where nobody knows."""
+        """A copy of `contents` that changes independently; None where they are not known."""
         known = self._contents is not None or (self.store is not None and not self._closed)
         return self.contents().copy() if known else None
 
@@ -120,8 +121,8 @@ class OpenMemory:
     ) -> Iterator[None]:
         """A change of the memory and its journal: where it is cut short, the memory is read again before its next use.
 
-        revert: undoes in the memory what the journal refused; None where only reading again can. undo: of a memory
-        without a path, which cannot be read again, takes back what was done of the change.
+        revert: undoes the change in the memory if the journal refuses it; None: the memory is read again. undo: does so
+        for a memory without a path, which cannot be read again.
         """
         self._undo, self._whole = undo, False
         try:
@@ -129,7 +130,7 @@ class OpenMemory:
         except StoreError:
             if revert is not None:
                 revert()
-                self._whole = not self._batching  # a batch that fails loses all that was added in it before
+                self._whole = not self._batching  # in a batch, earlier changes are lost too, and not reverted here
             raise
         self._whole = True
 
@@ -147,7 +148,7 @@ class OpenMemory:
             raise StoreClosedError(f"the memory {where} is closed: open its path again")
 
     def require_store(self, doing: str) -> Store:
-        """The store. Raises InputError where there is none: what asks for it needs the journal."""
+        """The store. Raises InputError where there is none, for an operation that needs the journal."""
         self.require_open()
         if self.store is None:
             raise InputError(
@@ -157,7 +158,7 @@ class OpenMemory:
         return self.store
 
     def require_writing(self) -> None:
-        """Raise, before any work is done, what would keep a checkpoint from being written."""
+        """Raise, before any work is done, if no checkpoint could be written."""
         self.require_open()
         if self.store is None:
             return
@@ -170,7 +171,7 @@ class OpenMemory:
     def _pass_over_failures(self, store: Store) -> None:
         try:
             store.flush()
-        except StoreError as error:  # of an earlier checkpoint: the next commit would raise it instead of committing
+        except StoreError as error:  # an earlier checkpoint's: otherwise the next commit would raise it
             logger.warning("%s: no checkpoint could be written: %s", store.path, error)
 
     def refresh(self) -> bool:
@@ -183,10 +184,9 @@ class OpenMemory:
             if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.compacted):
                 return False
             try:
-                # A checkpoint that came between the reads may be of rows behind these, and hold a tuned model from
-                # before them.
-                for _ in range(LOOKS):
-                    if store.compacted != memory.compacted or store.last - memory.sequence > SNAPSHOT_EVERY:
+                # A checkpoint that was written between the reads may contain later rows than were read here.
+                for _ in range(REFRESH_ATTEMPTS):
+                    if store.compacted != memory.compacted or store.last - memory.sequence > CHECKPOINT_EVERY:
                         break
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     with self._mutation():
@@ -199,12 +199,13 @@ class OpenMemory:
             self._changed()
             return True
 
-    def _snapshot_if_due(self) -> None:
+    def _checkpoint_if_due(self) -> None:
         if self.saves:
-            self.save_behind(max(SNAPSHOT_EVERY, len(self._memory.statistics.materials) // MATERIALS_A_ROW))
+            materials = len(self._memory.statistics.materials)
+            self.checkpoint_in_background(max(CHECKPOINT_EVERY, materials // MATERIALS_PER_ROW))
 
-    def save_behind(self, rows: int) -> None:
-        """Write a checkpoint, in the background, where so many rows or more are behind the last; whatever `saves`."""
+    def checkpoint_in_background(self, rows: int) -> None:
+        """Write a checkpoint in a thread, if so many rows or more came since the last; also where `saves` is False."""
         if self.store is None or self._batching or self._memory.sequence - self._saved < rows:
             return
         arrays, attributes = self._memory.to_arrays()
@@ -217,25 +218,25 @@ class OpenMemory:
         del arrays
         give_back_scratch()
 
-    def _snapshot(self) -> None:
+    def _write_checkpoint(self) -> None:
         if self.store is not None:
             arrays, attributes = self._memory.to_arrays()
             self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
             self.store.commit(arrays, last_sequence=self._saved, attributes=attributes)
 
     def derived(self, name: str) -> Checkpoint | None:
-        """What was kept under a name of the checkpoint that the memory was loaded from; None where there is nothing."""
+        """The arrays stored under a name beside the checkpoint that the memory was loaded from, if any."""
         if self.store is None or self._closed:
             return None
         found = self.store.derived(name)
         return found if found is not None and found.number == self.memory.checkpoint else None
 
     def saved_since(self, memory: Memory) -> bool:
-        """Whether the store has another newest checkpoint than the one that the memory was loaded from."""
+        """Whether a checkpoint was written since the one that the memory was loaded from."""
         return self.store is not None and self.store.newest != memory.checkpoint
 
     def close(self, name: str, derived: Callable[[], Derived | None]) -> None:
-        """As `TactileLearner.close`. derived: makes what is kept under a name beside the checkpoint."""
+        """As `TactileLearner.close`. derived: gives arrays to store under a name, with the newest checkpoint."""
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
@@ -247,14 +248,14 @@ class OpenMemory:
                 if store.mode == "write" and self.saves and self._whole:
                     if self._memory.sequence > self._saved:
                         self._pass_over_failures(store)
-                        self._snapshot()
+                        self._write_checkpoint()
                     self._keep(store, name, derived)
             finally:
                 store.close()
                 give_back_scratch()
 
     def _keep(self, store: Store, name: str, derived: Callable[[], Derived | None]) -> None:
-        """Keep what follows from the memory; where that fails it will be made again."""
+        """Store what is derived from the memory; a failure is logged only, as the next user derives it again."""
         try:
             if (made := derived()) is not None:
                 store.keep_derived(name, made[0], last_sequence=self._memory.sequence, attributes=made[1])

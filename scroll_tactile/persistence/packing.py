@@ -1,4 +1,4 @@
-"""A memory packed into one file, and what such a file brings to another memory: its sums, and its rows."""
+"""Packing a memory into one file, and the sums that such a file adds to another memory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def pack_memory(
         packed.kept = packed.exemplars = None
     with reported(path, "packing a memory"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # What a failing disk does not let go of says nothing of what was packed.
+        # The packed file is whole even where a failing disk does not let its draft be removed.
         made = TemporaryDirectory(
             dir=path.parent, prefix=f"{path.name}.", suffix=".partial", ignore_cleanup_errors=True
         )
@@ -61,15 +61,15 @@ def pack_memory(
 
 
 def _append(into: Store, store: Store, head: Head, source: str | None, *, arrays: bool, readings: bool) -> Head:
-    """Append a touch to a packed memory; its row there. Raises StoreError."""
-    said = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
-    said |= {} if source is None or SOURCE in said else {SOURCE: source}
+    """Append a touch to a packed memory and return its row there. Raises StoreError."""
+    attributes = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
+    attributes |= {} if source is None or SOURCE in attributes else {SOURCE: source}
     own = store.record(head.sequence).arrays if arrays else None
-    return into.append(head.kind, head.label, head.key, attributes=said, arrays=own, time=head.time)
+    return into.append(head.kind, head.label, head.key, attributes=attributes, arrays=own, time=head.time)
 
 
 def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
-    """The exemplars among some touches, as a memory of this making has them."""
+    """The exemplars among some touches, for a memory with the recipe of `memory`."""
     exemplars = memory.empty_like().exemplars
     if exemplars is not None:
         exemplars.update((head.label, head.key, head.sequence) for head in touches if "nbytes" in head.attributes)
@@ -77,19 +77,19 @@ def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
 
 
 def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_out: Collection[int]) -> Memory | None:
-    """What the touches of a packed memory taught, without some of them, exactly; None where only replaying them tells.
+    """The sums of a packed memory without some of its touches, exactly; None where its rows must be replayed instead.
 
-    found: its newest checkpoint. memory: any of that making. Raises DamageError, also where the sums are not those of
-    the touches that it names.
+    found: its newest checkpoint. memory: any with the same recipe. Raises DamageError, also where the sums count other
+    touches than the rows name.
     """
     if found.last_sequence != source.last:
         return None
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]
-    said = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
+    counts = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
     if len(heads) != sum(1 for head in source.heads() if head.kind != DESCRIBE):
         return None
-    if observed.ndim != 1 or said != Counter(head.label for head in heads):
+    if observed.ndim != 1 or counts != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
     sums = memory.empty_like().fill(found.arrays, found.attributes)
     if not left_out:
@@ -97,8 +97,8 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     gone, rest = memory.empty_like(), memory.empty_like()
     for sequence in left_out:
         record = source.record(sequence)
-        columns, codes = memory.codes(record)
-        gone.statistics.add(record.label, codes, columns)
+        steps, codes = memory.codes(record)
+        gone.statistics.add(record.label, codes, steps)
     rest.statistics = sums.statistics - gone.statistics
     rest.exemplars = None  # the rows have them
     rest.choose([head for head in heads if head.sequence not in left_out], source.record, sums)

@@ -1,12 +1,12 @@
-"""Carrying a memory over to another embedding, or to another version of its own, from the readings in its journal.
+"""Re-embedding a memory: with another embedding, or another version of its own, from the readings in its journal.
 
 The new memory is written beside the old one, row for row, and takes its place when it is whole:
 
-1. `name.reembedding` grows in batches. A run that was cut short goes on behind the last.
-2. It is given the name `name.reembedded`: it is whole.
-3. The old memory is given the name `name.before`, and the new one its own.
+1. `name.reembedding` grows in batches. A run that was cut short resumes after the last one.
+2. It is renamed to `name.reembedded`: now it is complete.
+3. The old memory is renamed to `name.before`, and the new one to `name`.
 
-Where there is nothing under the memory's name, step 3 was cut short: whoever opens it ends it.
+Where nothing has the memory's name, step 3 was cut short: the next opening completes it.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from store.lock import WriterLock
 __all__ = ["Reembedding"]
 
 ROWS_TOGETHER = 64  # rows that wait for the disk together
-CARRIED_EVERY = 256  # rows, after which a run that goes on does not embed them again
+CHECKPOINT_EVERY = 256  # rows between checkpoints of the new memory: a resumed run embeds no more than these again
 
 
 class Reembedding:
     """The memory that takes the place of another one.
 
-    source: the store of the other one. recipe: of the new one. encode: embeds readings: the columns of the touch, and
-    its rows of codes by scale.
+    source: the store of the old one. recipe: of the new one. encode: readings → the steps of the touch, and its rows of
+    codes by scale.
 
-    Raises MismatchError where not every observation has its readings, DamageError where a checkpoint counts touches
-    that no row has, StoreError.
+    Raises MismatchError where an observation has no readings, DamageError where a checkpoint counts touches that no row
+    has, StoreError.
     """
 
     def __init__(self, source: Store, recipe: Recipe, encode: Callable[[Readings], tuple[int, Codes]]) -> None:
@@ -59,7 +59,9 @@ class Reembedding:
         self.recipe = recipe
         self._source, self._encode, self._bare = source, encode, identity.embedding.bare
         folder = beside(source.path, "reembedding")
-        if is_there(whole := beside(source.path, "reembedded")):  # as far as it goes: rows may have come since
+        if is_there(
+            whole := beside(source.path, "reembedded")
+        ):  # it was complete; the old memory may have more rows now
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
         self._draft = MemoryStore.open(folder, identity=identity.to_json())
@@ -70,7 +72,7 @@ class Reembedding:
         self._memory = load(Memory(recipe, lambda readings: encode(readings)[1]), self._draft)
 
     def copy(self, progress: Callable[[str, int, int], object]) -> None:
-        """Embed the rows that the new memory does not have yet; the old one can be used meanwhile.
+        """Embed the rows that the new memory does not have yet; the old one stays usable meanwhile.
 
         progress: called with (what is being done, rows done, rows in all).
         """
@@ -80,8 +82,8 @@ class Reembedding:
                 for record in islice(self._source.records(after=memory.sequence), ROWS_TOGETHER):
                     self._carry(record)
             refill(memory, draft)
-            if memory.sequence - memory.saved >= CARRIED_EVERY:
-                self._snapshot()
+            if memory.sequence - memory.saved >= CHECKPOINT_EVERY:
+                self._write_checkpoint()
             progress("embedding", draft.last, self._source.last)
 
     def _carry(self, record: Record) -> None:
@@ -90,8 +92,8 @@ class Reembedding:
         if record.kind == OBSERVE:
             readings = unpack_readings(record.arrays)
             assert readings is not None
-            columns, codes = self._encode(readings)
-            attributes |= {"columns": columns, "nbytes": readings.nbytes}
+            steps, codes = self._encode(readings)
+            attributes |= {"columns": steps, "nbytes": readings.nbytes}
             arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
         head = self._draft.append(
             record.kind, record.label, record.key, attributes=attributes, arrays=arrays, time=record.time
@@ -99,21 +101,19 @@ class Reembedding:
         assert head.sequence == record.sequence
         replay(self._memory, Record(**vars(head), arrays=arrays), self._draft, codes)
 
-    def _snapshot(self) -> None:
+    def _write_checkpoint(self) -> None:
         arrays, attributes = self._memory.to_arrays()
         self._draft.commit(arrays, last_sequence=self._memory.sequence, attributes=attributes)
         self._memory.saved = self._memory.sequence
 
     def put_in_place(self) -> Path:
-        """Close both memories and exchange them; the folder in which the old one then lies.
+        """Close both memories and exchange them; returns the folder of the old one.
 
-        The caller has copied all rows. Raises StoreError where the old one was written since, in another process.
+        The caller has copied all rows. Raises StoreError where another process has written to the old one since.
         """
-        self._snapshot()
-        folder, last_sequence = (
-            self._source.path.resolve(),
-            self._draft.last,
-        )  # resolved: a link goes on leading to the memory
+        self._write_checkpoint()
+        folder = self._source.path.resolve()  # a link to the memory stays one
+        last_sequence = self._draft.last
         for store in (self._draft, self._source):
             store.close()
         whole, before, count = beside(folder, "reembedded"), beside(folder, "before"), 1
@@ -135,7 +135,7 @@ class Reembedding:
         return before
 
     def close(self) -> None:
-        """Release the files; what was copied stays, for a run that goes on."""
+        """Release the files; the copied rows stay, for a run that resumes."""
         self._draft.close()
 
 

@@ -1,4 +1,4 @@
-"""How a memory follows its journal: it is loaded from a store, row by row, and chooses samples again from there."""
+"""Replaying a journal into a memory: at opening, after each new row, and to choose samples again."""
 
 from __future__ import annotations
 
@@ -70,18 +70,18 @@ def _loaded(memory: Memory, store: Store) -> Memory:
 def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = None) -> list[Added] | None:
     """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.
 
-    Every row becomes a part of the memory here, whether it was just written, read again or embedded anew. codes: of an
-    observation, where they are known; None to make them. Call `refill` after the last row. Raises CapacityError before
-    anything is added.
+    Every row is added to the memory here, whether it was just written, read again or embedded anew. codes: of an
+    observation; None: they are read from the row, or made from its readings. Call `refill` after the last row. Raises
+    CapacityError before anything is added.
     """
     changed: list[Added] | None = []
     if record.kind == OBSERVE:
-        columns = cast(int, record.attributes["columns"])
+        steps = cast(int, record.attributes["columns"])
         codes = memory.codes(record)[1] if codes is None else codes
         source = record.sequence if only_readings(record.arrays) else None
         wanted = memory.kept is not None and memory.kept.wants(record.label, record.key)
         readings = unpack_readings(record.arrays) if wanted else None
-        memory.add(record.label, record.key, columns, codes, record.sequence, source, readings)
+        memory.add(record.label, record.key, steps, codes, record.sequence, source, readings)
         changed = [(record.label, codes, 1)]
     elif record.kind == RETRACT:
         gone = unspanned(record.attributes["sequences"])
@@ -121,7 +121,7 @@ def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> A
 
 
 def _join(memory: Memory, record: Record) -> None:
-    """Add another memory of the same making: a row with the arrays and attributes of its compaction checkpoint."""
+    """Add another memory of the same recipe, from a row with the arrays and attributes of its compaction checkpoint."""
     other = memory.empty_like().fill(record.arrays, record.attributes, source=record.sequence)
     memory.join(other, exemplars="exemplar-readings" in record.arrays)
 
@@ -133,13 +133,13 @@ def apply_description(descriptions: dict[str, Description], row: Head | Record) 
 
 
 def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Added] | None:
-    """Apply the rows that a writer appended, and take a tuned model that it made; what changed, see `replay`."""
+    """Apply rows that a writer appended, and take over its tuned model; returns the changes as `replay` does."""
     changed = [replay(memory, record, store) for record in records]
     refill(memory, store)
     newest = store.latest() if store.newest != memory.checkpoint else None
     if newest is not None and newest.last_sequence <= memory.sequence:
         memory.checkpoint = newest.number
-        # Of all kinds: a damaged row that is passed over may be a retraction.
+        # Heads of all kinds are read: filtered ones skip damaged rows, and such a row may be a retraction.
         behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.last_sequence))
         gone = min(retracted_by(behind), default=None)
         if gone is None or gone > cast(int, newest.attributes["tuned_last_sequence"]):
@@ -148,14 +148,14 @@ def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> l
 
 
 def refill(memory: Memory, store: Store) -> None:
-    """Choose sample and exemplars again without what was retracted; does nothing where they held none of it."""
+    """Choose sample and exemplars again after a retraction; does nothing if no retracted touch was among them."""
     if memory.stale:
         # Rows that a writer appended since this memory was read are left for the next `load`.
         memory.chosen = _chosen(memory, store, memory.sequence).chosen
 
 
 def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
-    """The memory of the observations up to a row that are not retracted: what a compaction at that row keeps."""
+    """The memory of all observations up to a row, without retracted ones: a compaction at that row keeps it."""
     made, later = _chosen(memory, store, last_sequence), memory.empty_like()
     for head in store.heads(memory.compacted):  # whoever compacts has read all
         if head.sequence <= last_sequence:
@@ -180,8 +180,8 @@ def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
 def _behind_compaction(memory: Memory, store: Store, last_sequence: int) -> list[Head]:
     """The rows up to one from which samples are chosen.
 
-    A damaged row may be of any kind: without it other touches would be chosen, and be saved as if they were the right
-    ones. So DamageError is raised; only who reads, and saves nothing, gets what is left, with a warning.
+    A damaged row may be of any kind. Without it other touches would be chosen, and a writer would save them: it gets
+    DamageError. A reader, which saves nothing, gets the remaining rows and a warning.
     """
     try:
         return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
@@ -199,14 +199,14 @@ def _behind_compaction(memory: Memory, store: Store, last_sequence: int) -> list
 
 
 def _compaction_samples(memory: Memory, store: Store) -> Memory:
-    """A memory with what the compaction checkpoint holds; an empty one without any."""
+    """A memory filled from the compaction checkpoint; an empty one if there is none."""
     fresh = memory.empty_like()
     require_compaction(memory, store)
     try:
         if (compaction := store.compaction()) is not None:
             fresh.fill(compaction.arrays, compaction.attributes, source=0)
     except DamageError as damage:
-        # The statistics are whole without it; a memory that did not open would lose them too.
+        # The statistics are complete without it: better to open with fewer samples than not at all.
         logger.warning(
             "%s; no other touch can take the place of a retracted one: repair the memory (scroll-tactile memory "
             "repair)",
@@ -226,10 +226,9 @@ def _compaction_samples(memory: Memory, store: Store) -> Memory:
 
 
 def _counted(memory: Memory, store: Store) -> Counter[tuple[str, bytes]]:
-    """How often each stream was observed, by material and key, among the compacted and without what was retracted.
+    """(material, key) → how often the compacted rows observed the stream, without retracted observations.
 
-    The compaction checkpoint was made without what a later row retracts of it, and a retraction may have been lost to
-    damage since.
+    `memory.is_gone` is asked as well: a row that retracts one of them may have been lost to damage.
     """
     rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
     return Counter((head.label, head.key) for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence))

@@ -11,7 +11,7 @@ import numpy as np
 from scroll_tactile.embeddings.protocol import TOGETHER
 from scroll_tactile.embeddings.resnet import folded
 from scroll_tactile.embeddings.runtimes import onnx_model
-from scroll_tactile.embeddings.vision import MOST_COLUMNS, Vision, pool_windows, to_planes
+from scroll_tactile.embeddings.vision import MOST_STEPS, Vision, pool_windows, to_planes
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
@@ -108,7 +108,7 @@ class _Scores(nn.Module):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         planes = to_planes(image[None, :, : self.columns])
-        whole = [scale for scale in self.scales if scale.width >= TOGETHER and self.columns <= MOST_COLUMNS]
+        whole = [scale for scale in self.scales if scale.width >= TOGETHER and self.columns <= MOST_STEPS]
         maps = self._maps(planes) if whole else []
         logits = torch.zeros(1)
         for scale, (origin, slopes, offsets) in zip(self.scales, self.readouts, strict=True):

@@ -1,8 +1,8 @@
-"""The composition of a touch: heads for each constituent over the readouts of a model, and their weights.
+"""The composition of a touch, by a ridge regression (a head) for each constituent over the readouts of a model.
 
-A touch may be of a material that was observed: then its composition is that material's, weighed by the probabilities
-of the materials. Or it is of one never observed: then the heads answer, ridge regressions over the materials. The
-novelty tells the two apart. Heads and novelty are calibrated on the sampled touches: each is scored by readouts that
+If a touch is of an observed material, its composition is the mean of the materials' descriptions, weighted by their
+probabilities. If it is of a new material, the heads predict it. The novelty weighs these
+two cases. Heads and novelty are calibrated on the sampled touches: each is scored by readouts that
 never observed it, and by heads that never observed its material. A material described after it was touched gives the
 same as one described before, to the bit.
 """
@@ -49,10 +49,10 @@ class MaterialSpace:
 
 @dataclass(frozen=True)
 class ConstituentHead:
-    """What the materials observed say of one constituent of a touch of another.
+    """Predicts one constituent of a touch of a new material from the observed ones.
 
-    places: of the materials that it knows. weights: (α, b). curve: from its value to a probability, for a presence; a
-    share has none.
+    places: of the materials whose target is known. weights: (α, b). curve: from its value to a probability, for a
+    presence; a share has none.
     """
 
     places: npt.NDArray[np.intp]
@@ -80,8 +80,8 @@ class StageHeads:
 class HeadFitter:
     """Fits the heads of one stage and evaluates them on N sampled touches, each held out of the readouts.
 
-    materials: of the touches. z: of the stage, (N, C). known_novelty: among all materials, (N,). new_novelty: among all
-    but the touch's own, (N,).
+    materials: of the touches. z: of the stage, (N, C). known_novelty: the touches' novelty, (N,). new_novelty: the same
+    without the touch's own material, (N,).
     """
 
     def __init__(self, model: Model, stage: int) -> None:
@@ -119,16 +119,16 @@ class HeadFitter:
             for gamma, (predicted, truth) in evaluated.items()
             if len(predicted)
         }
-        # Ties go to the larger γ, the tamer head.
+        # Ties go to the larger γ, the more regularised head.
         gamma = min(sorted(losses, reverse=True), key=losses.__getitem__) if losses else DEFAULT_GAMMA
         weights = self._system(gamma, places).weights(values)
-        # A half stays a half. Leaving a material out makes what it has rarer among the others, and where presence
-        # begins, fitted on few such heads, came out on the wrong side: letters never touched 72 % right in place of 75.
+        # The curve passes one half where the prior does. Leaving a material out makes its constituents rarer among the
+        # others, so a fitted offset is biased: with one, 72 % of new letters were right in place of 75.
         curve = fit_curve(*evaluated[gamma], PRESENCE, turning=False) if curved else None
         return ConstituentHead(places, weights, curve)
 
     def _evaluated(self, known: Mapping[str, float], gamma: float) -> tuple[FloatArray, FloatArray]:
-        """What heads that never observed the material of a touch predict of it, and what is true."""
+        """The predictions for each touch by a head without its material, and the true targets."""
         places = self.space.places(known)
         predicted, truth = [], []
         if len(places) >= 3:
@@ -138,7 +138,7 @@ class HeadFitter:
             others = {
                 self.space.names[place]: system.weights_without(weights, i)
                 for i, place in enumerate(places)
-                if np.ptp(np.delete(values, i)) > 0  # what is left is no task otherwise
+                if np.ptp(np.delete(values, i)) > 0  # otherwise the remaining targets are all equal
             }
             for material, z in zip(self.materials, self.z, strict=True):
                 if (head := others.get(material)) is not None:
@@ -164,7 +164,7 @@ class Composer:
 
     @classmethod
     def of(cls, model: Model, memory: Memory) -> Composer:
-        """Fit the heads of what is described in a memory over what was observed there, and the model made of it."""
+        """Fit the heads of all constituents described in a memory, over the model of the same memory."""
         targets = targets_of(memory.descriptions)
         with one_thread():
             fitters = [HeadFitter(model, stage) for stage in range(len(model.calibrations))]
@@ -181,16 +181,16 @@ class Composer:
     def compose(
         self, wanted: Sequence[str], feels_like: Mapping[str, float], encoded: Encoded, expected: float
     ) -> tuple[tuple[Constituent, ...], float]:
-        """Each constituent that is wanted, and the probability that the touch is of a material never observed.
+        """The requested constituents, and the probability that the touch is of a new material.
 
-        feels_like: probability of each material observed. encoded: the touch, with the scales of `scales_for`.
-        expected: the probability of a material never observed before the touch.
+        feels_like: probability of each observed material. encoded: the touch, with the scales of `scales_for`.
+        expected: the prior probability of a new material.
         """
         stage = self._stage(encoded.steps)
         heads = self.stages[stage]
         z = _combined(self.model, stage, self.spaces[stage].names, encoded.means)
         new = float(heads.novel(self.model.novelty(stage, encoded.means, self.model.names)))
-        # Bayes: the curve is that of as many new touches as known ones.
+        # Bayes: the curve was fitted to as many new touches as known ones, a prior of one half.
         odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected
         return self._constituents(wanted, heads, feels_like, z, unfamiliar), unfamiliar
@@ -233,7 +233,7 @@ class Composer:
 
 
 def _summing_to_one(constituents: list[Constituent], targets: Mapping[str, Target]) -> list[Constituent]:
-    """Shares that sum to one; where some share is unknown, to at most one."""
+    """The constituents with shares scaled to sum to one, or, where some share is unknown, to at most one."""
     shares = [constituent.share for constituent in constituents if targets[constituent.name].share]
     total = sum(share for share in shares if share is not None)
     if total == 0 or (total <= 1 and None in shares):
@@ -242,7 +242,7 @@ def _summing_to_one(constituents: list[Constituent], targets: Mapping[str, Targe
 
 
 def _space_of(model: Model, stage: int, names: list[str]) -> MaterialSpace:
-    """The materials that the readouts of a stage rested on when they were fitted, as they see them."""
+    """The reference materials of the readouts of a stage, in the order of the names."""
     readouts = [model.readouts[scale] for scale in model.stages[stage]]
     known = [[readout.names[place] for place in readout.reference] for readout in readouts]
     gram = np.zeros((len(names), len(names)))
@@ -263,7 +263,7 @@ def _combined(model: Model, stage: int, names: Sequence[str], means: Mapping[Sca
 
 
 def _weights(model: Model, stage: int) -> FloatArray:
-    """The weight of each scale of a stage, summing to one; equal, where the calibration gives none any."""
+    """The weight of each scale of a stage, summing to one; equal weights if the calibration's are all zero."""
     weights = model.calibrations[stage].weights
     total = float(weights.sum())
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))

@@ -1,13 +1,17 @@
-"""The model of a memory as it is now: followed from touch to touch, and fitted again beside, so that no call waits.
+"""The model of a memory in its present state: updated touch by touch, and fitted anew in threads, so that no call
+waits.
 
-Right after an observation the readouts are those of all that was observed (see `readouts.readout`). They can follow so
-many touches; before that many have come a thread solves them again, from the integers. What else is fitted, the
-shrinkage and the table, follows when the memory has grown by three sixteenths: a sixteenth before, another thread
-begins to fit it. No call waits for that one, but in the smallest of memories, where each touch counts: touches that
-come faster than it fits have an earlier calibration a little longer.
+Three things happen at different rates:
 
-A writer keeps the model beside its last checkpoint, and who opens the memory then reads it. It cannot follow (see
-`prediction.stored`): when touches come or go its readouts are solved again.
+- Each observation updates the readouts at once (`Readout.follow`), so they always rest on all observations.
+- A readout can be updated by a limited number of touches. Before it is full, a thread solves it again from the integer
+  sums (a renewal).
+- Shrinkage, calibration and the table of moments are fitted in another thread (a fit). It begins when the memory has
+  grown by two sixteenths, and its model is adopted from three sixteenths on. If touches come faster, the earlier
+  calibration stays a little longer. In memories of at most FEW touches a call waits for the fit.
+
+A writer stores the model beside its last checkpoint, and the next opening reads it. A stored model cannot be updated
+(see `prediction.stored`): when touches come or go, its readouts are solved again.
 """
 
 from __future__ import annotations
@@ -41,14 +45,14 @@ logger = logging.getLogger(__name__)
 
 __all__ = ["CurrentModel", "FrozenModel"]
 
-BEGIN, ADOPT = 2, 3  # sixteenths of the touches that a model was fitted to: then the next is begun, and answers
-LEAST = 2  # touches, in the smallest of memories
-FEW = 16  # touches: of a memory with no more the calibration is worth waiting for
-MOST_BEHIND = 256  # touches: their codes are kept, and more of them could hardly be followed
+BEGIN, ADOPT = 2, 3  # growth in sixteenths of the touches fitted to: a fit begins, and its model is adopted
+LEAST = 2  # touches of growth at which a model is adopted at the earliest
+FEW = 16  # touches: in a memory with no more, a call waits for the fit
+MOST_BEHIND = 256  # touches that a model can lag behind: their codes are kept until it takes them in
 
 
 class FrozenModel:
-    """Holds a model as it is, whatever is observed meanwhile: a copy is followed, for as long as somebody has this."""
+    """Keeps a model unchanged while this object lives: later touches update a copy."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -56,28 +60,28 @@ class FrozenModel:
 
 @dataclass
 class _Job:
-    """A model that a thread makes, and what came since it was begun; None where that was too much to be followed."""
+    """A model that a thread makes. since: the touches that came since it was begun; None if they are too many."""
 
     future: Future[Model]
     since: list[Added] | None = field(default_factory=list)
 
     @property
     def ready(self) -> bool:
-        """Whether it is there, and can be followed to the memory as it is."""
+        """Whether the model is made, and can be updated to the present memory."""
         return self.since is not None and self.future.done() and self.future.exception() is None
 
 
 class CurrentModel:
-    """The model of one memory. Whoever calls holds the ledger's lock."""
+    """The model of one memory. The caller holds the ledger's lock."""
 
     def __init__(self, settings: Settings, extractor: FeatureExtractor) -> None:
         self._kind, self._extractor, self._reading = settings.readout, extractor, extractor
         self._version = -1
         self._model: Model | None = None
-        self._stored: Model | None = None  # the model as it was read
-        self._looked = False  # whether there is any
-        self._exact = False  # whether the model was fitted to the memory as it is, here, and not followed
-        self._behind: list[Added] | None = []  # what came since the model; None where it cannot be followed
+        self._stored: Model | None = None  # the model that was read from the disk
+        self._tried_stored = False  # whether the disk was read
+        self._exact = False  # whether the model was fitted here to the present memory, without updates since
+        self._behind: list[Added] | None = []  # the touches that the model lacks; None if it cannot take them in
         self._fit: _Job | None = None
         self._renewal: _Job | None = None
         self._workers: dict[str, ThreadPoolExecutor] = {}
@@ -86,7 +90,7 @@ class CurrentModel:
         self._lent: list[ReferenceType[FrozenModel]] = []
 
     def frozen(self, ledger: Ledger) -> FrozenModel:
-        """The present model, which stays as it is for as long as what is returned is held."""
+        """The present model, unchanged for as long as the returned object lives."""
         model = self.present(ledger)
         lent = self._holder(model)
         if lent is None:
@@ -96,7 +100,7 @@ class CurrentModel:
         return lent
 
     def _holder(self, model: Model) -> FrozenModel | None:
-        """What holds a model as it is, if anything does."""
+        """The object that keeps a model unchanged, if there is one."""
         return next((lent for one in self._lent if (lent := one()) is not None and lent.model is model), None)
 
     def present(self, ledger: Ledger) -> Model:
@@ -107,16 +111,16 @@ class CurrentModel:
 
     def _present(self, ledger: Ledger) -> Model:
         memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
-        self._look(ledger)
+        self._load_stored(ledger)
         self.take_in(ledger)
-        # Until the model is whole again: following that is cut short leaves it between two states.
+        # No model while it is updated: an update that is cut short leaves it between two states.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
         before = model
         if model is not None and (behind is None or self._due(model, memory)):
             model = None
         if model is not None and behind:
             self._exact = False
-            # In place where nobody holds it: to copy one takes as long as half a prediction.
+            # Updated in place unless it is frozen: a copy takes as long as half a prediction.
             model = model.copy() if self._holder(model) is not None else model
             if not model.follow(memory, behind):
                 model = None
@@ -125,21 +129,21 @@ class CurrentModel:
         return present
 
     def reading(self, ledger: Ledger) -> FeatureExtractor:
-        """The extractor that reads the touches to be predicted: it may have its banks from the disk."""
-        self._look(ledger)
+        """The extractor for touches to be predicted: its kernel banks may come from the disk."""
+        self._load_stored(ledger)
         self.take_in(ledger)
         return self._reading
 
-    def disbelieve(self) -> None:
-        """Let go what was read: its banks give other features than the memory was made with."""
+    def discard_stored(self) -> None:
+        """Drop the stored model and its banks: they give other features than the memory was made with."""
         self._reading, self._model, self._stored = self._extractor, None, None
         self._fit = self._renewal = None
 
-    def _look(self, ledger: Ledger) -> None:
-        """Begin with the model that was kept of the memory, where there is one."""
-        if self._looked or self._model is not None:
+    def _load_stored(self, ledger: Ledger) -> None:
+        """Start with the model that was stored beside the checkpoint, if there is one."""
+        if self._tried_stored or self._model is not None:
             return
-        self._looked, memory = True, ledger.memory
+        self._tried_stored, memory = True, ledger.memory
         if ledger.added is None:
             return
         try:
@@ -155,13 +159,14 @@ class CurrentModel:
             self._behind = [] if kept.last_sequence == memory.sequence else None
         give_back_scratch()
 
-    def kept(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
-        """What `prediction.stored` writes of the model that would answer now; None where there is none.
+    def arrays_to_store(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
+        """Arrays and attributes of the present model, to be stored by `prediction.stored`; None if there is none to
+        store.
 
-        None, too, where one was read and nothing has changed since, and of a small memory that has no present one.
+        That is: no model was made, the stored one is still current, or a small memory's model is out of date.
         """
         memory, model = ledger.memory, self._model
-        self.close()  # what the threads make is there then
+        self.close()  # waits for the threads
         self.take_in(ledger)
         if model is None or (model is self._stored and self._behind == [] and not ledger.saved_since(memory)):
             return None
@@ -172,17 +177,22 @@ class CurrentModel:
         return made[0] | banks_to_arrays(self._reading.embedding), made[1]
 
     def prepare(self, ledger: Ledger) -> None:
-        """Begin to make the next model where enough has come since the last. Raises nothing: an observation is kept."""
+        """Start a fit or a renewal if enough touches came since the last. Raises nothing: the observation is stored."""
         self.take_in(ledger)
         model, memory = self._model, ledger.memory
         if model is None:
             return
         lag = abs(memory.statistics.touches - model.fitted_to)
-        # Where there is no memory or no thread for it, or the ridge has too many materials, a prediction says so.
+        # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
         with suppress(MemoryError, InputError, RuntimeError):
             if self._fit is None and lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16):
                 self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._reading))
-            if self._renewal is None and self._behind and model.crowded(self._behind) and _has_all_of(memory, model):
+            if (
+                self._renewal is None
+                and self._behind
+                and model.needs_renewal(self._behind)
+                and _has_all_of(memory, model)
+            ):
                 self._renewal = _Job(self._worker("renewal").submit(Renewal.of(model, memory).solve))
 
     def _worker(self, name: str) -> ThreadPoolExecutor:
@@ -191,31 +201,33 @@ class CurrentModel:
         return self._workers[name]
 
     def settle(self, ledger: Ledger) -> Model:
-        """The model that is fitted to the memory as it is: a function of what was observed, and of nothing else."""
+        """The model fitted to the present memory: a function of the set of observations alone."""
         memory = ledger.memory
         self.take_in(ledger)
         if self._model is None or self._behind != [] or not self._exact:
             self._model, self._fit, self._renewal = None, None, None
-            self._reading = self._extractor  # nothing of it rests on what was read
+            self._reading = self._extractor  # the fitted model uses nothing that was read from the disk
             self._model, self._behind = self._fitted(memory), []
         return self._model
 
     def close(self) -> None:
-        """End the threads; a later prediction begins others where it needs them."""
+        """End the threads; a later prediction starts new ones if it needs them."""
         workers, self._workers = self._workers, {}
         for worker in workers.values():
             worker.shutdown()
 
     def take_in(self, ledger: Ledger) -> None:
-        """Note what has changed since it was last noted."""
+        """Take the changes of the memory since the last call into `_behind` and the jobs."""
         if self._process != os.getpid():  # a forked process has not the threads
             self._process, self._workers, self._fit, self._renewal = os.getpid(), {}, None, None
         if ledger.version == self._version:
             return
         if self._model is not None and self._holder(self._model) is None:
-            self._model.read(ledger.memory.statistics)  # lets a snapshot go, which would keep all that changes
+            self._model.read(
+                ledger.memory.statistics
+            )  # releases a snapshot, which would keep a copy of all that changes
         added = ledger.added if self._model is not None else None
-        # Until all is noted nothing can be followed: cut short in between, it would be noted twice, or never.
+        # Unset until all is noted: cut short in between, a touch would be noted twice, or never.
         behind, jobs = self._behind, (self._fit, self._renewal)
         self._behind, self._fit, self._renewal = None, None, None
         self._version = ledger.version
@@ -227,19 +239,19 @@ class CurrentModel:
             self._behind, (self._fit, self._renewal) = _with(behind, added), jobs
 
     def _due(self, model: Model, memory: Memory) -> bool:
-        """Whether another model takes its place: it is late, and the next is there or worth waiting for."""
+        """Whether the model is to be replaced: it is out of date, and the next is ready or worth waiting for."""
         late = abs(memory.statistics.touches - model.fitted_to) >= max(LEAST, ADOPT * model.fitted_to // 16)
         if late and model.fitted_to <= FEW:
             return True
         if self._fit is not None and self._fit.future.done() and not self._fit.ready:
-            self._fit = None  # it cannot be followed: another is begun
-        # Not only where it can follow no further: until then two models would be held most of the time.
-        pressed = any(readout.pressed for readout in model.readouts.values())
-        ready = pressed and self._renewal is not None and self._renewal.ready
+            self._fit = None  # it failed, or too many touches came since: another is begun
+        # Before the readouts are full: otherwise two models would be in memory most of the time.
+        nearly_full = any(readout.nearly_full for readout in model.readouts.values())
+        ready = nearly_full and self._renewal is not None and self._renewal.ready
         return ready or (late and self._fit is not None and self._fit.ready)
 
     def _next(self, memory: Memory, before: Model | None) -> Model:
-        """The model that takes the place of the one before: as a thread fitted it, or with readouts solved again."""
+        """The model that replaces the one before: fitted by a thread, or with its readouts solved again."""
         fit, renewal = self._fit, self._renewal
         if fit is not None and fit.ready:
             self._fit = None
@@ -253,7 +265,7 @@ class CurrentModel:
             return self._fitted(memory)
         if renewal is not None and renewal.since is not None:
             self._renewal = None
-            if renewal.future.exception() is None:  # it waits, for a part of what solving them here takes
+            if renewal.future.exception() is None:  # may wait, but less long than solving them here takes
                 model = renewal.future.result()
                 if model.follow(memory, renewal.since):
                     self._exact = False
@@ -269,7 +281,7 @@ class CurrentModel:
 
     def composer(self, ledger: Ledger, model: Model) -> Composer:
         """The heads of all constituents that were described, over a model of this memory."""
-        if model.fusion is not None and not model.held_out:  # it was read, and heads rest on touches held out
+        if model.fusion is not None and not model.held_out:  # a stored model has no held-out touches, which heads need
             model = self.settle(ledger)
         state = model, ledger.version, ledger.described
         if self._composer is None or self._composer[:3] != state:
@@ -283,7 +295,7 @@ def _has_all_of(memory: Memory, model: Model) -> bool:
 
 
 def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:
-    """The list with some more in it; None where it would be too long."""
+    """The list extended by more touches; None if it would be too long."""
     if touches is None or len(touches) + len(more) > MOST_BEHIND:
         return None
     touches.extend(more)

@@ -1,4 +1,4 @@
-"""From a touch to its features: quantised for what is observed, their means for what is evaluated."""
+"""From a touch to its features: quantised where it is observed, averaged where it is predicted."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Encoded:
     """A touch as it is evaluated.
 
     stream: the whole touch. image: (C, T) in [-1, 1], of as much of it as is judged. means: scale → mean features in
-    the codes' unit, (d,). seconds: how much touch is judged.
+    grid units, (d,). seconds: how much touch is judged.
     """
 
     stream: Stream
@@ -49,17 +49,17 @@ class Encoded:
 
 
 class WindowCache:
-    """Features of the finished windows of one touch that is still growing, so that none is embedded twice.
+    """Features of the complete windows of a touch in progress, so that no window is embedded twice.
 
-    A row is given again where the steps that it was made of are, to the bit, those of the last image.
+    A cached row is used while the steps that it was made of are the same, to the bit, in the present image.
     """
 
     def __init__(self) -> None:
         self._image: Image = np.empty((0, 0), np.float32)
         self._rows: dict[tuple[int, int], npt.NDArray[np.floating]] = {}
 
-    def turn(self, image: Image) -> None:
-        """Keep the rows that hold for an image (C, T)."""
+    def update(self, image: Image) -> None:
+        """Drop the rows that are not valid for an image (C, T)."""
         steps, same = min(self._image.shape[1], image.shape[1]), 0
         if steps and len(self._image) == len(image):
             changed = (self._image[:, :steps] != image[:, :steps]).any(axis=0)
@@ -68,7 +68,7 @@ class WindowCache:
         self._image = image
 
     def missing(self, windows: Extent) -> Extent:
-        """Of windows, width → first steps, those without a row; no width without any."""
+        """Those of the windows, width → first steps, without a cached row."""
         absent = {
             width: [start for start in starts if (width, start) not in self._rows] for width, starts in windows.items()
         }
@@ -77,7 +77,7 @@ class WindowCache:
     def joined(
         self, windows: Extent, absent: Extent, embedded: Mapping[int, npt.NDArray[np.floating]]
     ) -> dict[int, npt.NDArray[np.floating]]:
-        """Width → features (windows, d): those embedded, at the `absent`, with the rows that were kept."""
+        """Width → features (windows, d): the newly embedded ones, at `absent`, and the cached ones."""
         steps = self._image.shape[1]
         fresh = {
             (width, start): row
@@ -92,9 +92,9 @@ class WindowCache:
 class FeatureExtractor:
     """Makes features of touches, by a sensor, an embedding, a plan of windows and an augmentation; it learns nothing.
 
-    check: of the embedding's fingerprint, where it was made again for a memory.
+    check: of the embedding's fingerprint, if the embedding was made from the memory's configuration.
 
-    Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image that is not its.
+    Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image of another shape.
     """
 
     def __init__(
@@ -141,11 +141,11 @@ class FeatureExtractor:
         return self
 
     def verifying(self) -> AbstractContextManager[None]:
-        """As `verified`, beside what the block does, at the end of which it raises."""
+        """As `verified`, in a thread while the block runs; raises at the end of the block."""
         return nullcontext() if self.check is None else self.check.beside(self._embedding, own=self._own)
 
     def stream(self, readings: Readings) -> Stream:
-        """The sound stream of some readings; of a camera's, the frames in contact.
+        """The validated stream of some readings; of a camera's, the frames in contact.
 
         Raises StreamError: see `validate` and `pressed`.
         """
@@ -157,7 +157,7 @@ class FeatureExtractor:
         return image_of(stream, self._rest) if self._sensor.camera else tactile_image(stream)
 
     def learned(self, stream: Stream) -> tuple[int, Codes]:
-        """What a memory learns of a `stream`: its columns, and the `codes` that it adds. Raises as `verified`."""
+        """What a memory learns of a `stream`: its steps, and the `codes` that it adds. Raises as `verified`."""
         image = self.verified().image(stream)
         return image.shape[1], self.codes(image, stream.key)
 
@@ -192,10 +192,11 @@ class FeatureExtractor:
         scales_for: Callable[[int], Sequence[Scale]],
         cache: WindowCache | None = None,
     ) -> Encoded:
-        """What is evaluated of a `stream`: windows of its part within the longest touch learned, and views of it all.
+        """The features to predict a `stream` by: windows within the length of the longest learned touch, views of all
+        of it.
 
-        longest: its steps. scales_for: the scales to be read of a touch of so many steps. cache: of the same touch
-        when it was shorter.
+        longest: that length in steps. scales_for: steps → the scales to be read. cache: of the same touch when it was
+        shorter.
         """
         within = self._within(stream, longest)
         image = self.image(within)
@@ -205,7 +206,7 @@ class FeatureExtractor:
     def means(
         self, image: Image, scales: Sequence[Scale], whole: Image | None = None, cache: WindowCache | None = None
     ) -> dict[Scale, npt.NDArray[np.float64]]:
-        """A touch's mean features in the codes' unit, (d,) by scale. whole: what is viewed, `image` unless given."""
+        """A touch's mean features in grid units, (d,) by scale. whole: what is viewed, `image` unless given."""
         places = self._plan.places(image.shape[1])
         # Not rounded: the grid is for sums, and would only add its error here.
         return {
@@ -223,8 +224,8 @@ class FeatureExtractor:
     ) -> dict[Scale, npt.NDArray[np.floating]]:
         """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales.
 
-        places: of the windows of each scale, those that are embedded; all unless given. Of the many with which a touch
-        begins, half are never scored. cache: of the image when it had fewer steps.
+        places: the windows of each scale that are embedded; all unless given, though half of the dense ones at the
+        beginning are never scored. cache: of the image when it had fewer steps.
         """
         wanted = self._plan.scales if scales is None else scales
         extent = self._plan.extent(image.shape[1])
@@ -246,7 +247,7 @@ class FeatureExtractor:
     def _whole(
         self, image: Image, windows: Extent
     ) -> tuple[dict[int, npt.NDArray[np.floating]], dict[Scale, npt.NDArray[np.floating]]]:
-        """The features of windows of a whole touch, and its own by view, (1, d): as it is, and by competing kernels."""
+        """The features of windows of a whole touch, and of its views but SHAPE, (1, d) each."""
         width, every = self._plan.whole, {**windows, self._plan.whole: [0]}
         if not self._plan.competes:
             embedded = self._embedded(image, every)
@@ -261,8 +262,8 @@ class FeatureExtractor:
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of windows, of which only those are embedded that have no row; of the steps that they need."""
-        cache.turn(image)
+        """The features of windows; only those without a cached row are embedded, and only the steps that these need."""
+        cache.update(image)
         absent = cache.missing(windows)
         if not absent:
             return cache.joined(windows, absent, {})
@@ -272,7 +273,7 @@ class FeatureExtractor:
         return cache.joined(windows, absent, self._embedded(part, shifted))
 
     def _views(self, image: Image) -> dict[Scale, Image]:
-        """The pictures of a whole touch by view; of a touch of the default length the first is the image itself."""
+        """The images of a whole touch by view; WHOLE is the image itself for a touch of the default length."""
         whole = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
         return {WHOLE: whole, SHAPE: shape_image(whole)}
 
@@ -282,7 +283,7 @@ class FeatureExtractor:
     def _sound(
         self, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
     ) -> dict[int, npt.NDArray[np.floating]]:
-        """What an embedding gave for windows. Raises EmbeddingError for features of another shape."""
+        """The features of windows, checked: raises EmbeddingError for another shape."""
         for width, features in embedded.items():
             expected = (len(windows[width]), self._embedding.dimension)
             if features.shape != expected:
@@ -298,12 +299,12 @@ class FeatureExtractor:
         touches of 4 s are right in 93.5 % when they are read to their end.
         """
         frame = self._plan.widths[0] if self._sensor.camera else 1
-        before = 1 if isinstance(self._rest, str) else 0  # the resting image is no column
+        before = 1 if isinstance(self._rest, str) else 0  # the resting image is not in the tactile image
         return stream.first((longest // frame + before) / self._sensor.rate)
 
 
 def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
-    """The readings that kept levels stand for; what was missing as the last before it."""
+    """The readings that kept levels stand for; a missing value repeats the last one before it."""
     low, high = sensor.limits
     lacking = levels == MISSING
     if lacking.any():

@@ -1,9 +1,9 @@
-"""Fitting: a model of a memory as it is, solved once, and read by touches that are held out of it.
+"""Fitting a model to the present memory: its readouts are solved, then calibrated on held-out touches.
 
-A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its prefixes, and it at other
-paces, are made of its kept levels. Readouts and kept touches, both without it, judge all of these, as they will judge a
-touch to come. The calibrations, and the weights of readouts and kept touches at each moment, are fitted to that, here
-and nowhere else: a prediction measures nothing, and all is a function of the set of touches.
+A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its prefixes, and its versions at
+other paces, are made from its kept levels. Readouts and kept touches, both without it, judge all of these, as they will
+judge a new touch. The calibrations, and the weights of readouts and kept touches at each moment, are fitted to that,
+here and nowhere else: a prediction fits nothing, and the model is a function of the set of touches.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ __all__ = ["PACES", "Draft", "Renewal", "at_pace"]
 
 FloatArray = npt.NDArray[np.float64]
 Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
-"""Scale → a touch's place in the sample → number → mean features in the codes' unit, (d,); see `held_out_scores`."""
+"""Scale → a touch's place in the sample → number → mean features in grid units, (d,); see `held_out_scores`."""
 
-PACES = (2.0, 1.41, 0.71, 0.5)  # times their own, at which touches are resampled: twice to half
+PACES = (2.0, 1.41, 0.71, 0.5)  # relative to a touch's own: it is resampled to be twice to half as fast
 
 
 @dataclass(frozen=True)
 class Renewal:
     """Solves the readouts of a model again, from the memory as it was when this was made; calibration and fusion stay.
 
-    It takes a tenth of what a fit takes, so that a model can follow touches that come faster than that.
+    It takes a tenth of the time of a fit: a model can keep up with touches that come too fast for fits.
     """
 
     model: Model
@@ -64,7 +64,7 @@ class Renewal:
 
     @classmethod
     def of(cls, model: Model, memory: Memory) -> Renewal:
-        """The renewal of a model whose materials are all there."""
+        """The renewal of a model whose materials are all in the memory."""
         tasks = {
             scale: Task.of(memory.statistics, scale, [readout.names[place] for place in readout.reference])
             for scale, readout in model.readouts.items()
@@ -72,7 +72,7 @@ class Renewal:
         return cls(model.copy({}), dict(model.readouts), tasks, memory)
 
     def solve(self) -> Model:
-        """Solve them, one after the other: each task is let go."""
+        """Solve the readouts one after the other; each task is freed."""
         with one_thread():
             for scale in sorted(self.tasks):
                 task = self.tasks.pop(scale)
@@ -83,7 +83,7 @@ class Renewal:
 
 @dataclass(frozen=True)
 class Draft:
-    """All that a model is fitted to, taken of a memory at one moment, so that fitting waits for nobody.
+    """The input of a fit, copied from a memory at one moment, so that fitting needs no lock.
 
     Raises InputError, from `of`, for the ridge of more materials than it can weigh.
     """
@@ -116,16 +116,16 @@ class Draft:
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
         views = [view for view in memory.plan.views if view in tasks]
         kept = memory.kept.touches() if memory.kept is not None and views else []
-        lengths = statistics.longest, statistics.usual_least
+        lengths = statistics.longest, statistics.fifth_percentile_length
         return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
 
     def fit(self, extractor: FeatureExtractor | None) -> Model:
-        """Solve the readouts and fit how they are read, once: the tasks are let go.
+        """Solve the readouts and fit calibration and weights. Can be called once: it frees the tasks.
 
-        extractor: reads kept touches; without it nothing is fitted to their prefixes, nor to them at other paces.
+        extractor: reads kept touches; without it nothing is fitted to their prefixes and other paces.
         """
         with one_thread():
-            # One after the other, each task let go: of all at once the memory would be twice a model's.
+            # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve(self.memory.statistics) for scale in sorted(self.tasks)}
             fit = _Fit(self, readouts, extractor)
             held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
@@ -154,7 +154,7 @@ class Draft:
 
 @dataclass(frozen=True)
 class _Fit:
-    """One fit: a draft, its readouts, solved, and what reads the prefixes of kept touches."""
+    """One fit: a draft, its solved readouts, and the extractor for prefixes of kept touches."""
 
     draft: Draft
     readouts: Mapping[Scale, Readout]
@@ -170,9 +170,9 @@ class _Fit:
     def calibrated(
         self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]
     ) -> tuple[Calibration, HeldOutProbabilities]:
-        """The calibration of some scales, and their probabilities of the held-out touches by it.
+        """The calibration of some scales, and the calibrated probabilities of the held-out touches.
 
-        number: the stage, or that of the query under which `held_out` has the scores.
+        number: the stage of the scores in `held_out`, or the number of their query.
         """
         found = StageScores(number, self.draft.sample, [held_out[scale] for scale in scales])
         readouts = [self.readouts[scale] for scale in scales]
@@ -215,17 +215,17 @@ class _Fit:
             return complete.held_out, fuse(
                 matcher, [*kept.prefixes(moments), complete], [alone], chosen, counts, weight
             )
-        # Every second one: what is decided early, by a share of wrong answers, rests on the moments and not on paces.
+        # Every second touch is enough: early decisions use the moments alone, not the paces.
         paced = [kept.paced(pace, chosen[::2], last) for pace in PACES]
         return complete.held_out, fuse(matcher, [*kept.prefixes(moments), complete], paced, chosen, counts, weight)
 
 
 @dataclass(frozen=True)
 class _KeptTouches:
-    """Kept touches, each judged by readouts and kept touches that lack it, as if it were new.
+    """Kept touches, each judged as if it were new: by readouts and kept touches without it.
 
-    chosen: the keys of those that are seen at all moments. levels, rows: by key, the levels (C, T) and the row among
-    the kept. places: by key, in the sample. matches: what the other kept touches say of each.
+    chosen: the keys of the touches that are judged at all moments. levels, rows: by key, the levels (C, T) and the row
+    among the kept. places: by key, in the sample. matches: of each with the other kept touches.
     """
 
     fit: _Fit
@@ -276,7 +276,7 @@ class _KeptTouches:
         return {scale: fit.held_out_scores(scale, queries) for scale in queries}
 
     def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
-        """The views and the kept touches on some of them, had they been made so many times as fast."""
+        """Views and kept touches on some of the touches, resampled to be so many times as fast."""
         fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
         assert extractor is not None
         queries: Queries = {scale: {} for scale in views}
@@ -294,6 +294,6 @@ class _KeptTouches:
 
 
 def at_pace(levels: LevelArray, pace: float) -> LevelArray:
-    """A touch as if it had been made so many times as fast: (C, T) to (C, T / pace)."""
+    """A touch resampled to be so many times as fast: (C, T) to (C, T / pace)."""
     steps = max(2, round(levels.shape[1] / pace))
     return at_places(levels, np.linspace(0, levels.shape[1] - 1, steps))

@@ -1,7 +1,7 @@
 """Fusion: weights of the readouts and the kept touches beside each other, fitted at each moment of a touch.
 
-Which of them is right depends on how much was felt: of BioTac's touches the kept ones are after 0.1 s in 81 % and the
-readouts in 54, after 0.5 s in 83 and 94. So at each moment m, the last of them "complete",
+Which of them is right depends on how much was felt: kept touches classify 81 % of BioTac's touches after 0.1 s and 83 %
+after 0.5 s, readouts 54 % and 94 %. So at each moment m, the last of them "complete",
 
     p_y = (1 − ε_m) q_y + ε_m / C,    q_y ∝ exp(g_m log d_y + β_m S_y),
 
@@ -51,11 +51,11 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
 MOST_HELD_OUT = 192  # touches, each compared with all kept ones at every moment
-PRIOR_TOUCHES = 0.5  # that the prior, g = 1 and half of the lone β, counts as
-ALONE_TOUCHES = 2.0  # that the prior of the kept touches by themselves counts as
-SHARED_TOUCHES = 10.0  # that the weights of a moment and its neighbours count as
+# How many touches a prior counts as: of the weights of neighbouring moments together (g = 1, half of the lone β), of
+# the kept touches by themselves, and of the weights of one moment, drawn to those of its neighbours.
+PRIOR_TOUCHES, ALONE_TOUCHES, SHARED_TOUCHES = 0.5, 2.0, 10.0
 LEAST_PRIOR = 1e-3
-PRIOR_OUTLIERS = 0.5  # touches more than those held out that are outliers
+PRIOR_OUTLIERS = 0.5  # of one more touch than the held-out ones
 LEAST_INFORMATION, LEAST_WEIGHT = 1e-3, 1e-9
 STEPS = 100  # of EM
 
@@ -77,7 +77,7 @@ def moments_of(milestones: Sequence[int], least: int, *, matched: bool) -> tuple
 
 @dataclass(frozen=True)
 class HeldOutMoment:
-    """What readouts and kept touches give at one moment, from `steps` on, of held-out touches.
+    """The results of readouts and kept touches on held-out touches at one moment, from `steps` on.
 
     stage, calibration: of the readouts. held_out: their probabilities. matches: of the kept touches, by key.
     """
@@ -116,10 +116,9 @@ def fuse(
 ) -> Fusion:
     """Fit the table to held-out touches.
 
-    judged: held-out touches by moment, ascending, the last of complete touches. paced: of complete ones at other paces,
-    ascending by steps. chosen: the keys of the touches that are seen at all moments. counts: of those that are seen
-    as complete ones, and how many touches each stands for. prior_weight: of the readouts' scores, where they are
-    taken as they are.
+    judged: results by moment, ascending, the last of complete touches. paced: of complete touches at other paces,
+    ascending by steps. chosen: the keys of the touches that are judged at all moments. counts: key → how many touches
+    each complete one stands for. prior_weight: of the readouts' scores, without calibration.
     """
     names, even = judged[-1].held_out.names, dict.fromkeys(chosen, 1.0)
     inputs = [_at(matcher, one, names, even) for one in judged[:-1]]
@@ -148,7 +147,7 @@ def _rows(
 
 
 def chosen_of(complete: HeldOutProbabilities, matcher: TouchMatcher | None) -> tuple[list[bytes], dict[bytes, float]]:
-    """The held-out touches that are seen at all moments, and how many touches each complete one stands for.
+    """The held-out touches that are judged at all moments, and how many touches each complete one stands for.
 
     First: at most MOST_HELD_OUT kept touches, evenly spaced by key. Second, by key: 1 for each of the least sure, where
     the weights matter most; the others share the count of all remaining touches.
@@ -230,11 +229,11 @@ def _fitted(
     return replace(moment, outlier_rate=_outlier_rate(own, inputs.logs.shape[1], inputs.counts))
 
 
-UNMATCHED = 1 / 16_000  # β where nothing can be held out: after one touch of each, prefixes are lost to a larger one
+UNMATCHED = 1 / 16_000  # β where nothing can be held out: a larger one misclassifies prefixes, with one touch of each
 
 
 def _worth(inputs: _FusionInputs) -> float:
-    """The β at which the kept touches by themselves put their best material ahead of the next by AHEAD logits."""
+    """The β at which the best material of the kept touches alone leads the next by AHEAD logits, in the median."""
     best = np.sort(inputs.scores, axis=1)[:, -2:]
     gap = float(np.median(best[:, 1] - best[:, 0]))
     return AHEAD / max(gap, AHEAD)
@@ -262,7 +261,7 @@ def _chances(moment: Moment, inputs: _FusionInputs) -> FloatArray:
 
 
 def _outlier_rate(own: FloatArray, materials: int, counts: FloatArray) -> float:
-    """ε of least log loss, where touches have such probabilities for their own material without it (EM)."""
+    """ε of least log loss (EM). own: the probabilities of the touches' own materials without ε."""
     total = float(counts.sum())
     rate = PRIOR_OUTLIERS / (total + 1)
     for _ in range(STEPS):

@@ -1,12 +1,12 @@
 """The prediction for a touch, or for several of one thing: readouts and kept touches judge each of them.
 
-The readouts alone judge a touch that they are sure of. One that lies far from all that was learned, that they are not
-sure of, or that has another length than those learned, is compared with kept touches as well (see `matching.matcher`):
-with their prefixes, and with the whole of each, as one made at another pace. These are two hypotheses, each judged by
-its own row of the `moment_table`, and they weigh exp(COUNTED e), e the log-likelihood gain per value.
-Channels that never change are filled in with what the kept touches have there, and the touch is judged again. The
-readouts weigh less the further the touch lies from what was learned (w, `Moment.distance_weight`), and the larger the
-share t of its deviation from kept touches that is noise (`Match.noise_share`):
+If the readouts are sure of a touch, they alone judge it. If they are unsure, or the touch lies far from all learned
+ones or is shorter or longer than these, it is matched with kept touches as well (see `matching.matcher`), under two
+hypotheses: it is a prefix of such a touch, or a whole one at another pace. Each hypothesis is judged by its own row of
+the `moment_table` and weighs exp(COUNTED e), e the log-likelihood gain per value. Channels that never change are filled
+in with what the kept touches have there, and the touch is judged again. The readouts weigh less the further the touch
+lies from what was learned (w, `Moment.distance_weight`), and the larger the share t of its deviation from kept touches
+that is noise (`Match.noise_share`):
 
     q_y ∝ exp(w g (1 − t) log d_y + β S_y),    p_y = (1 − ε) q_y + ε / C.
 """
@@ -40,7 +40,7 @@ FloatArray = npt.NDArray[np.float64]
 Touch = tuple[Encoded, Mapping[str, float] | None]
 """An encoded touch, and the logits of f* where it answers."""
 
-COUNTED = 30.0  # independent values that the gain per value counts as: neighbouring values are correlated
+COUNTED = 30.0  # the effective number of independent values in a touch: neighbouring values are correlated
 TINY = 1e-300
 
 
@@ -117,7 +117,7 @@ def judged(
     matches: list[tuple[Match, Hypothesis]] = [(matcher.match(levels), own)]
     if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
         whole = matcher.match(levels, whole=True)
-        if whole.log_likelihood_gain > 0:  # kept touches at its length explain it better than chance
+        if whole.log_likelihood_gain > 0:  # kept touches, resampled to its length, explain it better than chance
             matches.append((whole, "paced"))
     gains = np.array([match.log_likelihood_gain for match, _ in matches])
     filled = _filled(model, extractor, encoded, matches[int(gains.argmax())][0])
@@ -155,7 +155,7 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
 
 
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
-    """The judgement by the readouts. The kept touches name what differs in a novel touch."""
+    """The judgement by the readouts. For a novel touch its match names how it differs."""
     unusual = _of_length(model, encoded)
     if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - WITHIN):
         unusual = _unusual(model, encoded, model.matcher.match(_levels_of(encoded.stream)), hypothesis)
@@ -172,7 +172,7 @@ def _fused(
 ) -> Judgement:
     """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts.
 
-    own_time: whether it was compared with prefixes, and not with whole touches brought to its length.
+    own_time: whether it was matched with prefixes, and not with whole touches resampled to its length.
     """
     moment = alone.moment
     distance_weight = moment.distance_weight(alone.distance, own_time)
@@ -186,7 +186,7 @@ def _fused(
 
 
 def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
-    """What sets a touch apart from those that were learned, if the kept touches explain it so."""
+    """How a touch differs from the learned ones, by its length and its match with kept touches."""
     found: list[Unusual] = list(_of_length(model, encoded))
     if found and hypothesis == "paced":
         found = ["faster" if found == ["shorter"] else "slower"]
@@ -223,7 +223,7 @@ def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: 
 
 @dataclass(frozen=True)
 class HeldOutTouch:
-    """The answer to a touch by all others.
+    """The answer to a touch by a model without it.
 
     material, key: its own. names: the materials it was weighed among, in alphabetical order. probability: of each,
     shape (C,). novelty: see `Prediction`. threshold: a novelty above it is called unknown.

@@ -1,4 +1,4 @@
-"""The model: all that predictions need of a memory, fitted to it alone (see `prediction.fitting`), and followed."""
+"""The model: all that predictions need of a memory; `prediction.fitting` fits it, `Model.follow` updates it."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["prefix", "complete", "paced"]
 """What a touch may be: the prefix of a complete one, a complete one, or a complete one at another pace."""
 
-# Logits, to which the logarithm of the number of materials is added: materials further behind have less than 2e-8 of
-# the probability together, and are not read from the memory.
+# Logits behind the best material, to which the logarithm of the number of materials is added. Materials further behind
+# have less than 2e-8 of the probability together, and are not read from the memory.
 NEGLIGIBLE = 18.0
 
 
@@ -43,7 +43,7 @@ NEGLIGIBLE = 18.0
 def enough_memory() -> Iterator[None]:
     """Raise CapacityError where the system has no memory left for the readouts; what was observed is kept.
 
-    Raises ScrollTactileError where sums that came from elsewhere have no readout: see `memory.gate`.
+    Raises ScrollTactileError where sums that came from elsewhere have no readout: see `validation.gate`.
     """
     try:
         yield
@@ -79,15 +79,15 @@ class Judgement:
 class Model:
     """Everything that predictions need of one state of a memory.
 
-    names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there.
-    views: the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are
-    read, as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing
-    was learned. conformal: how typical others are of the kept touches. held_out: scale → the sampled touches held out;
-    sample: these. dependence: how far touches of one thing are correlated. least: the steps of all but the shortest
-    touches that were learned, longest: those of the longest. fitted_to: the touches that it was fitted to.
+    names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there. views:
+    the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are read,
+    as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing was learned.
+    conformal: conformal p-values by the kept touches. held_out: scale → scores of the sampled touches, each held out;
+    sample: these touches. dependence: the correlations of touches of one thing. least: the 5th percentile of the
+    learned touches' lengths in steps, longest: the maximum. fitted_to: the touches that it was fitted to.
 
     Any number of threads may use it at once; if it `reads_memory`, only the one that holds the memory's lock. `follow`
-    changes it in place: a copy follows while any thread uses it.
+    changes it in place: while any thread uses it, a copy follows.
     """
 
     kind: ReadoutName
@@ -117,13 +117,13 @@ class Model:
 
     @property
     def reads_memory(self) -> bool:
-        """Whether it has so many materials that it reads the requested ones from the memory."""
+        """Whether it has too many materials to hold, so that it reads the requested ones from the memory."""
         return len(self.names) > EAGER
 
     def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:
-        """Another model of the same state, for one of the two to follow; what following never changes, they share.
+        """A copy that follows independently; both share the parts that `follow` never changes.
 
-        readouts: others, in place of copies.
+        readouts: in place of copies of its own.
         """
         other = copy.copy(self)
         if readouts is None:
@@ -135,7 +135,7 @@ class Model:
         return other
 
     def read(self, statistics: Statistics | Snapshot) -> None:
-        """Set the statistics that materials are read from: of this model's state, or of the one it is to follow to."""
+        """Set the statistics that materials are read from: of this model's state, or of the one that it follows to."""
         for readout in self.readouts.values():
             readout.statistics = statistics
 
@@ -147,7 +147,7 @@ class Model:
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
 
-        The readouts are then those of all that was observed; calibration, and how far the scatter is shrunk, stay.
+        The readouts then rest on all observations; calibration and shrinkage stay as they were fitted.
         """
         self.read(memory.statistics)
         for scale in memory.statistics.scales:
@@ -164,7 +164,7 @@ class Model:
         return True
 
     def _follow_kept(self, memory: Memory, matcher: TouchMatcher) -> bool:
-        """Take in what is kept in the memory now; False where that is nothing."""
+        """Update the kept touches to those of the memory; False where none are left."""
         assert self.conformal is not None and self.fusion is not None and memory.kept is not None
         kept, held = {(material, key) for material, key, _ in memory.kept}, matcher.kept.held
         added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
@@ -172,14 +172,14 @@ class Model:
             return False
         if matcher.kept.follow(added, held - kept):
             self.conformal.follow(added, held - kept)
-        else:  # one is longer than all before it: what they say of themselves stays
+        else:  # one is longer than all before: the arrays are made anew, their natural deviation stays
             touches = memory.kept.touches()
             self.fusion = replace(self.fusion, matcher=TouchMatcher(KeptArrays.of(touches), matcher.deviation))
             self.conformal = Conformal.of(touches)
         return True
 
-    def crowded(self, behind: Sequence[Added]) -> bool:
-        """Whether five eighths of what the readouts can follow has come, with those that are still behind."""
+    def needs_renewal(self, behind: Sequence[Added]) -> bool:
+        """Whether a readout, with the touches still to be taken in, has used five eighths of its room for columns."""
         for scale, readout in self.readouts.items():
             columns = sum(len(codes[scale]) for _, codes, _ in behind if scale in codes)
             if 3 * (readout.system.rank + columns) > 5 * (readout.system.room - columns):
@@ -224,11 +224,11 @@ class Model:
     ) -> Judgement:
         """Weigh the candidates for a touch by the readouts alone.
 
-        means: for each of the scales of `scales_for`, mean features in the codes' unit, (d,). steps: observed so far.
+        means: for each of the scales of `scales_for`, mean features in grid units, (d,). steps: observed so far.
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
-        A material is weighed at the last stage at which it has rows, against all candidates there, and keeps that
-        probability. Later stages divide the rest among the candidates that reached them.
+        Each stage weighs the candidates that have rows there. Those without rows at a later stage keep their
+        probability; the later stages divide the remaining probability among the others.
         """
         moment = self.moment(hypothesis, steps)
         if hypothesis == "paced":  # every touch has views, of all of it
@@ -287,19 +287,19 @@ class Model:
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
         scales, calibration = self.scales(hypothesis, stage), self.calibration(hypothesis, moment, stage)
-        readouts, codes = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
+        readouts, features = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
         places = [self._places(scale, names) for scale in scales]
         if len(names) <= EAGER:
             exact = [
                 readout.scores(own, among, self.kind)
-                for readout, own, among in zip(readouts, codes, places, strict=True)
+                for readout, own, among in zip(readouts, features, places, strict=True)
             ]
             best = [int(among[int(scores.argmax())]) for among, scores in zip(places, exact, strict=True)]
-            weights, distance = self._weights_at(calibration, readouts, codes, best)
+            weights, distance = self._weights_at(calibration, readouts, features, best)
             return np.asarray(sum(weight * scores for weight, scores in zip(weights, exact, strict=True))), distance
-        best = [readout.nearest(own, among)[0] for readout, own, among in zip(readouts, codes, places, strict=True)]
-        weights, distance = self._weights_at(calibration, readouts, codes, best)
-        parts = list(zip(weights, readouts, codes, places, strict=True))
+        best = [readout.nearest(own, among)[0] for readout, own, among in zip(readouts, features, places, strict=True)]
+        weights, distance = self._weights_at(calibration, readouts, features, best)
+        parts = list(zip(weights, readouts, features, places, strict=True))
 
         def exactly(some: npt.NDArray[np.intp]) -> FloatArray:
             return np.asarray(
@@ -307,7 +307,7 @@ class Model:
             )
 
         def bounds(some: npt.NDArray[np.intp], fine: int) -> tuple[FloatArray, FloatArray]:
-            # One more scale each time, the views first: it is of them that the least is known before.
+            # One more scale at each level, the views first: their coarse bounds are the widest.
             found = [
                 readout.many.bounds(own, among[some], fine=len(parts) - i <= fine)
                 for i, (_, readout, own, among) in enumerate(parts)
@@ -325,17 +325,20 @@ class Model:
         self,
         calibration: Calibration,
         readouts: Sequence[Readout],
-        codes: Sequence[FloatArray],
+        features: Sequence[FloatArray],
         best: Sequence[int],
     ) -> tuple[FloatArray, float]:
         """The weight of each scale for a touch, (S,), and the distance of `Judgement`.
 
-        codes: of the touch, by scale; best: the place of the nearest material.
+        features: of the touch, by scale; best: the place of the nearest material.
         """
         if not np.isfinite(calibration.median_distances).all():
             return calibration.weights, 0.0
         distances = np.array(
-            [readout.diagonal_distance(own, place) for readout, own, place in zip(readouts, codes, best, strict=True)]
+            [
+                readout.diagonal_distance(own, place)
+                for readout, own, place in zip(readouts, features, best, strict=True)
+            ]
         )
         novel = measuring([readout.scale for readout in readouts])
         return calibration.weights_at(distances), float(calibration.relative(distances)[novel].min())
@@ -358,7 +361,7 @@ class Model:
         means: Mapping[Scale, FloatArray],
         names: Sequence[str],
     ) -> float:
-        """The standardised novelty of a touch judged at a stage, if it is one of these materials that it may be."""
+        """The standardised novelty of a touch judged at a stage, among these materials."""
         distances = self._distances(self.scales(hypothesis, stage), means, names)
         return float(self.calibration(hypothesis, moment, stage).novelty(distances))
 
@@ -375,7 +378,7 @@ class Model:
 
 
 def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:
-    """What of touches that came and went is of a scale."""
+    """The changes at one scale by touches that came and went."""
     return [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
 
 

@@ -32,20 +32,20 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 
-WITHIN = 0.95  # of held-out touches are within the limits
-SURE = 0.99  # of the readouts' probability: a touch with less is compared with kept ones
-APART = 1.25  # times a moment: the next is no nearer
+WITHIN = 0.95  # the share of held-out touches within the limits
+SURE = 0.99  # a touch whose highest probability by the readouts is less is matched with kept ones
+APART = 1.25  # the least ratio of the steps of neighbouring moments
 LEAST_SPREAD = 1e-9
 LEAST_DISTANCE_WEIGHT = 0.5  # the least weight at another pace, as a share of that at the distance limit
 
 
 @dataclass(frozen=True)
 class Moment:
-    """How a touch is judged from so many steps on.
+    """The weights and thresholds by which a touch is judged from a length on; symbols as in `judging` and `fusion`.
 
-    steps: from how many on; of the last moment, those of a complete touch. stage: of the readouts that judge.
-    calibration: how their scores are read. model_weight: g. match_weight: β at an information of 1, called r, see
-    `match_weight_at`. lone_match_weight: the same where noise or distance leaves the readouts no weight.
+    steps: that length; of the last moment, that of a complete touch. stage: of the readouts that judge. calibration: of
+    their scores. model_weight: g. match_weight: r, which is β at an information of 1, see `match_weight_at`.
+    lone_match_weight: r where noise or distance leaves the readouts no weight.
     outlier_rate: ε. model_outlier_rate: ε of the readouts' own probabilities. distance_limit: the relative distance
     that 19 of 20 complete touches stay below; infinite in other rows. mean_excess_loss, loss_spread: mean and standard
     deviation of the excess loss of known touches beside the kept ones.
@@ -75,7 +75,7 @@ class Moment:
     def distance_weight(self, distance: float, own_time: bool) -> float:
         """The weight of the readouts for a touch at a relative distance, in (0, 1]: less, the further it is off.
 
-        own_time: whether it is compared in its own time: then no less than 1 / limit, at another pace half of that.
+        own_time: as in `judging`: the weight is then 1 / limit at least, at another pace half of that.
         """
         if not (np.isfinite(self.distance_limit) and np.isfinite(distance)):
             return 1.0
@@ -85,7 +85,7 @@ class Moment:
     def suffices(self, probability: float, distance: float) -> bool:
         """Whether the readouts are enough, by their highest probability and by how far off the touch is.
 
-        Where no touch could be held out any probability suffices: a new touch then always looks noisy.
+        If no touch could be held out, any probability suffices: every new touch would look noisy to the kept ones.
         """
         return probability >= (SURE if self.model_outlier_rate else 0.0) and distance <= self.distance_limit
 
@@ -99,7 +99,7 @@ class Moment:
 
     @property
     def novelties(self) -> FloatArray:
-        """Those of the held-out touches that it was calibrated on, ascending."""
+        """The novelties of the held-out touches of the calibration, ascending."""
         return self.calibration.novelties
 
 
@@ -134,7 +134,7 @@ class Fusion:
         return self.moments[-1]
 
     def reaches(self, steps: int) -> bool:
-        """Whether a complete touch may be so long by its pace alone: about half to twice as long as usual."""
+        """Whether another pace can explain the length of a complete touch: half to twice the median, about."""
         return self.paced[0].steps <= APART * steps and steps <= APART * self.paced[-1].steps
 
     def at_pace(self, steps: int) -> Moment:
@@ -157,7 +157,7 @@ def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> F
 
 
 def tempered(chances: FloatArray, outlier_rate: float) -> FloatArray:
-    """Probabilities (…, C) of which a share is left for touches that are unlike all others."""
+    """Probabilities (…, C) mixed with a uniform share, the outlier rate."""
     return np.asarray((1 - outlier_rate) * chances + outlier_rate / chances.shape[-1])
 
 

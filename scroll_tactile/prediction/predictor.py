@@ -1,4 +1,4 @@
-"""The predictor: what answers from one memory that is open, whoever changes it meanwhile."""
+"""The predictor: it answers from one open memory, which other threads may change meanwhile."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ class LogitsReader(Protocol):
 
 
 class Predictor:
-    """What answers from one memory that is open: its extractor of features, its ledger and its current model.
+    """All objects of one open memory: its feature extractor, its ledger and its current model; it answers from them.
 
-    recipe: what the memory is made with. tuned_reader: made when a tuned model first answers. replaced: whether the
-    memory was embedded again since; another predictor has it then.
+    recipe: of the memory. tuned_reader: made when a tuned model first answers. replaced: whether the memory was
+    embedded again since; then another predictor has it.
     """
 
     def __init__(self, recipe: Recipe, extractor: FeatureExtractor, ledger: Ledger) -> None:
@@ -107,7 +107,7 @@ class Predictor:
         scene: Sequence[str] | None,
         reader_of: Callable[[Predictor], LogitsReader | None] | None = None,
     ) -> Prediction:
-        """As `TactileLearner.predict`. reader_of: gives what reads with the tuned model, where that is to answer."""
+        """As `TactileLearner.predict`. reader_of: gives the reader of the tuned model, if that is to answer."""
         if not streams:
             raise InputError("expected a stream to predict, or several of one thing; came none")
         touches = [self.extractor.stream(stream) for stream in streams]
@@ -119,7 +119,7 @@ class Predictor:
                 return partial(nothing_known, math.fsum({touch.key: touch.seconds for touch in touches}.values()))
 
             def read(touch: Stream) -> Touch:
-                encoded = extractor.encode(touch, model.longest, lambda columns: model.scales_for(candidates, columns))
+                encoded = extractor.encode(touch, model.longest, lambda steps: model.scales_for(candidates, steps))
                 if reader is None or not model.is_last(encoded.steps):
                     return encoded, None
                 return encoded, reader.logits_of(encoded.image, candidates)
@@ -139,8 +139,8 @@ class Predictor:
                 return lambda: Composition(nothing, 1.0, nothing_known(touch.seconds))
             composer = self.current.composer(self.ledger, model)
 
-            def scales_for(columns: int) -> list[Scale]:
-                return sorted({*model.scales_for(model.names, columns), *composer.scales_for(columns)})
+            def scales_for(steps: int) -> list[Scale]:
+                return sorted({*model.scales_for(model.names, steps), *composer.scales_for(steps)})
 
             def composed() -> Composition:
                 encoded = extractor.encode(touch, model.longest, scales_for)
@@ -153,9 +153,10 @@ class Predictor:
         return self._of_one_state(begin)
 
     def _of_one_state(self, begin: Callable[[Model, FeatureExtractor], Callable[[], Answer]]) -> Answer:
-        """An answer that rests on one state of the memory, which others may change while a touch is embedded.
+        """An answer from one state of the memory, which others may change while a touch is embedded.
 
-        begin: reads what it needs of the memory beside its model, and gives what reads the touch and answers.
+        begin: called with the lock held; reads from the memory, and returns a function that embeds the touch and
+        answers, which is called without the lock unless the model reads the memory.
         """
         reading = self._reading()
         try:
@@ -167,7 +168,7 @@ class Predictor:
                         return answered()
                 return answered()
         except EmbeddingMismatchError as error:
-            self._disbelieve(reading, error)
+            self._discard_stored(reading, error)
             return self._of_one_state(begin)
 
     def _answer(
@@ -179,31 +180,31 @@ class Predictor:
         with self.ledger.lock:
             return self.current.reading(self.ledger)
 
-    def _disbelieve(self, reading: FeatureExtractor, error: EmbeddingMismatchError) -> None:
-        """Let go what was read from the disk; raise the error where nothing was."""
+    def _discard_stored(self, reading: FeatureExtractor, error: EmbeddingMismatchError) -> None:
+        """Drop the stored model and banks; raise the error if none were in use."""
         if reading is self.extractor:
             raise error
         with self.ledger.lock:
-            self.current.disbelieve()
+            self.current.discard_stored()
 
     def reading(self) -> FeatureExtractor:
-        """The extractor that reads the touches that predictions are asked for, after its fingerprint was compared."""
+        """The extractor for touches to be predicted, with its fingerprint verified."""
         reading = self._reading()
         try:
             with reading.verifying():
                 return reading
         except EmbeddingMismatchError as error:
-            self._disbelieve(reading, error)
+            self._discard_stored(reading, error)
             return self.extractor.verified()
 
     def frozen(self) -> FrozenModel:
-        """The model of the memory as it is now, which stays as it is for as long as this is held."""
+        """The model of the present memory, unchanged for as long as the returned object lives."""
         with self.ledger.lock, enough_memory():
             return self.current.frozen(self.ledger)
 
     @contextmanager
     def turn(self, model: Model) -> Iterator[None]:
-        """To be held while a model is asked: some read the memory."""
+        """To be held while a model is used: holds the lock if the model reads the memory."""
         if not model.reads_memory:
             yield
             return
@@ -213,7 +214,7 @@ class Predictor:
     def answer_of(
         self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Encoded]
     ) -> Prediction:
-        """What a model that is held says of touches of one thing."""
+        """The prediction of a frozen model for touches of one thing."""
         with self.turn(model), enough_memory():
             return self._answer(model, extractor, candidates, [(touch, None) for touch in touches])
 
@@ -225,7 +226,7 @@ class Predictor:
     def close(self) -> None:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
-            self.ledger.close(NAME, lambda: self.current.kept(self.ledger))
+            self.ledger.close(NAME, lambda: self.current.arrays_to_store(self.ledger))
             self.current.close()
 
     def fitted(self) -> Model:
@@ -242,10 +243,10 @@ def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> Feature
 
 
 def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) -> Codes:
-    """The rows of codes of a touch whose readings a memory kept."""
+    """The rows of codes of a touch, from readings that the memory stored."""
     return extractor.learned(Stream(extractor.sensor, readings))[1]
 
 
 def nothing_known(seconds: float) -> Prediction:
-    """The prediction for so many seconds of touch where there is nothing that it could be."""
+    """The prediction for so many seconds of touch without any candidate."""
     return Prediction(None, 0.0, (), float("inf"), False, seconds)

@@ -40,7 +40,7 @@ def reembed_memory(
 def embed_again(
     predictor: Predictor, embedding: Embedding | None, progress: Callable[[str, int, int], object]
 ) -> tuple[Path, Predictor]:
-    """As `TactileLearner.reembed`; also what answers from the memory that took the place of the other."""
+    """As `TactileLearner.reembed`; also returns the predictor of the new memory."""
     ledger = predictor.ledger
     with ledger.lock:  # not in the midst of another thread's batch
         store = ledger.require_store("be embedded again")
@@ -62,12 +62,12 @@ def embed_again(
 
 
 def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
-    """What carries the memory in a store over to another embedding; None: to its own, made again."""
+    """The re-embedding of the memory in a store. embedding: None for its own, made again."""
     made = Identity.read(store)
     chosen = made.own_embedding(store.path) if embedding is None else embedding
-    # As many as were asked for, none too; where nobody asked, as many as are usual with the embedding that it gets.
-    usual = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
-    kept = Settings(exemplars=made.exemplars, kept_touches=None if usual else made.kept_touches)
+    # As many kept touches as its maker requested, none included; by default as many as the new embedding's default.
+    default = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
+    kept = Settings(exemplars=made.exemplars, kept_touches=None if default else made.kept_touches)
     recipe = Recipe.of(made.sensor, chosen, made.augmentation, kept)
     extractor = FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, recipe.augmentation)
     return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))

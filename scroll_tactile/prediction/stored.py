@@ -1,12 +1,12 @@
-"""The fitted model as arrays, beside the checkpoint that it is of: whoever opens the memory next fits nothing.
+"""The fitted model as arrays beside its checkpoint, so that the next opening needs no fit.
 
-It holds what predictions read, with the banks of kernels, and not K, the sample or the held-out touches: a model that
-was read follows nothing, and is renewed where touches come or go (see `prediction.current`). The levels of kept touches
+It has all that predictions read, with the banks of kernels, but not K, the sample or the held-out touches: a stored
+model cannot follow, and is renewed when touches come or go (see `prediction.current`). The levels of kept touches
 are the memory's.
 
-A file may come from elsewhere. Each array has the type and shape that the memory and the file itself ask for, and
-numbers stay within bounds, so that no prediction fails or takes more memory for it; whether they are those that were
-fitted nobody can tell. Numbers of another release, readout or memory are not read.
+A file may come from elsewhere. Types, shapes and bounds of its arrays are checked against the memory, so that no
+prediction fails or takes more memory because of it. Whether its numbers are the fitted ones cannot be checked. Models
+of another release, readout or memory are not read.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 NAME = "model"
-MADE_BY = f"{__version__}, 4"  # the release, and how it is written: the judge may differ in another
+MADE_BY = f"{__version__}, 4"  # the release, in which judging may differ, and the version of these arrays
 MOST_BANKS = 64
 OF_MOMENT = (
     "steps",
@@ -63,7 +63,7 @@ OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties", "
 
 
 def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
-    """Arrays and attributes of a model; None of one that nothing was fitted to, or that reads the memory."""
+    """Arrays and attributes of a model; None if nothing was fitted, or the model reads the memory."""
     fusion = model.fusion
     if fusion is None or model.reads_memory:
         return None
@@ -99,7 +99,7 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
 
 
 def banks_to_arrays(embedding: Embedding) -> dict[str, npt.NDArray[Any]]:
-    """The banks that an embedding of kernels has used; nothing of another."""
+    """The banks that an embedding of kernels has used; empty for other embeddings."""
     if not isinstance(embedding, Kernels):
         return {}
     found = embedding.banks()
@@ -110,9 +110,10 @@ def banks_to_arrays(embedding: Embedding) -> dict[str, npt.NDArray[Any]]:
 
 
 def with_banks(embedding: Embedding, arrays: Arrays) -> Embedding:
-    """An embedding that gives the same features and makes no banks, to predict with; Unexpected for what are none.
+    """An embedding with stored banks in place of making them, for predictions alone; raises Unexpected for invalid
+    ones.
 
-    What is learned is never embedded with it: a forged bank misleads predictions, and no memory.
+    Observations are never embedded with it: a forged bank can mislead predictions, but cannot change a memory.
     """
     if not isinstance(embedding, Kernels) or "banks" not in arrays:
         return embedding
@@ -155,7 +156,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     for field, expected in (("made_by", MADE_BY), ("readout", kind)):
         expect(about.get(field) == expected, field, expected, about.get(field))
     names: Any = about.get("names")
-    # Rows behind the checkpoint may have brought materials and taken some: that the model is renewed for.
+    # Rows after the checkpoint may have added materials or removed some: then the model is renewed.
     now = list(memory.statistics.materials)
     same = kept.last_sequence == memory.sequence
     expect(isinstance(names, list) and bool(names), "names", "materials", names)
@@ -191,9 +192,9 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
 
 
 class _ModelReader:
-    """Reads the parts of a model from arrays, and raises Unexpected for what they cannot be.
+    """Reads the parts of a model from arrays; raises Unexpected for invalid ones.
 
-    same: whether the memory is as it was then.
+    same: whether the memory has not changed since the model was stored.
     """
 
     def __init__(
@@ -204,7 +205,7 @@ class _ModelReader:
     def floats(
         self, field: str, shape: tuple[int | None, ...], least: float = -np.inf, most: float = np.inf
     ) -> FloatArray:
-        """Numbers within bounds, the infinite ones only where a bound is."""
+        """Numbers within bounds; infinity only where `most` is infinite."""
         found = array(self._arrays, field, ("float64",), shape)
         ends = np.isposinf(found) & (most == np.inf) & (least >= 0)
         expect(bool((np.isfinite(found) | ends).all()), field, "finite numbers", "others")
@@ -223,7 +224,7 @@ class _ModelReader:
         return whole(field, length, 1, most)
 
     def readouts(self) -> dict[Scale, Readout]:
-        """The readout of each scale that touches have rows of."""
+        """The readout of each scale at which touches have rows."""
         scales: Any = self._about.get("scales")
         able = {int(scale): scale for scale in self._memory.plan.scales}
         fits = isinstance(scales, list) and len(set(map(str, scales))) == len(scales)
@@ -253,7 +254,7 @@ class _ModelReader:
         return readout_from_arrays(scale, names, parts, statistics)
 
     def kept(self) -> tuple[TouchMatcher, Conformal]:
-        """What is made of the kept touches, of those that the memory has still."""
+        """Matcher and conformal sets of the kept touches that the memory still has."""
         memory = self._memory.kept
         if memory is None:
             raise Unexpected("kept-keys: expected none; there are some")
@@ -299,7 +300,7 @@ class _ModelReader:
     def table(
         self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], matcher: TouchMatcher | None
     ) -> tuple[list[Calibration], Fusion]:
-        """How scores are read at each stage that touches reached, and at each moment."""
+        """The calibration of each stage that touches reached, and the table of moments."""
         rows = array(self._arrays, "moments", ("float64",), (None, len(OF_MOMENT)))
         least = np.array([1, 0, 0, 1e-300, 1e-300, 0, 0, 0, -1e300, 1e-300])
         most = np.array([2**53, len(stages) - 1, 1e300, 1, 1, 1, 1, np.inf, 1e300, 1e300])

@@ -7,10 +7,10 @@ classes is white, each material counting as one row:
     [G_KK + γ I   1] [α]   [t]
     [1ᵀ           0] [b] = [0].
 
-The weights in feature space are W α = (S_w/N + λI)⁻¹ Mᵀ α: what Σ_y c_y t_yᵀ is to the paper's readout, with the
-scatter between materials, and not between touches, against it. A material of which a target is unknown is in no sum
-but the scatter within classes. With B the inverse of that matrix, the head without material i follows from it
-(Allen 1974, PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches of materials that the head does not know.
+The weights in feature space are W α = (S_w/N + λI)⁻¹ Mᵀ α. Mᵀ α takes the place of Σ_y c_y t_yᵀ in the paper's readout,
+and the scatter between materials that of the scatter between touches. A material whose target is unknown enters only
+the scatter within classes. With B the inverse of that matrix, the head without material i follows from it (Allen 1974,
+PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches whose materials are left out of the head.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def solve(gram: FloatArray, gamma: float) -> RidgeSystem:
     """Factorise the system of known materials with G_KK, shape (K, K), K ≥ 2, and γ, a share of G's diagonal."""
     count = len(gram)
     centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
-    # Materials that cannot be told apart at all have G = 0: then any γ says the mean.
+    # Materials with equal means have G = 0: then any γ predicts the mean of the targets.
     size = max(float(np.trace(centred)) / count, 1e-12)
     system = np.zeros((count + 1, count + 1))
     system[:count, :count] = (gram + gram.T) / 2 + gamma * size * np.eye(count)
@@ -80,8 +80,8 @@ def fit_curve(
 ) -> Curve:
     """The logistic curve of least log loss (Platt 1999), its slope not below 0, drawn to `prior` where touches are few.
 
-    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. rows: what the prior counts as. turning: whether the value
-    at which it passes a half may be another than the prior's.
+    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. rows: how many touches the prior counts
+    as. turning: whether the value at which it passes a half may differ from the prior's.
     """
     from scipy.special import expit
 

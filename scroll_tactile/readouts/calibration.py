@@ -6,15 +6,15 @@ arXiv 1706.04599):
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
-w⁰ the prior and ρ the touches that it counts as: first one weight is fitted that all scales have in common, and then
-one each that is drawn to it. Scores of held-out touches are nearly collinear, and by themselves the weights run into a
-corner: all on one scale, that a longer touch may spoil. Where a touch is viewed in several ways, a view has less weight
-the further the touch lies from its nearest material there: the view's scores count as min(1, u_k / r_k) s_k, r_k the
-squared Mahalanobis distance with diagonal scatter (`Readout.diagonal_distance`) and u_k its median over held-out
-touches. So a view that a change of speed, of zero or of length has spoilt leaves the decision to others.
+w⁰ the prior and ρ the number of touches that it counts as. First one weight common to all scales is fitted, then one
+for each scale, with the common one as its prior. Scores of held-out touches are nearly collinear, and by themselves the
+weights run into a corner: all on one scale, which a longer touch may distort. Where a touch is viewed in several ways,
+a view has less weight the further the touch lies from its nearest material there: the view's scores count as min(1, u_k
+/ r_k) s_k, r_k the squared Mahalanobis distance with diagonal scatter (`Readout.diagonal_distance`) and u_k its median
+over held-out touches. So a view that a change of speed, zero or length has distorted leaves the decision to the others.
 
 The novelty of known materials' touches is measured likewise, and an alarm's threshold is their conformal quantile (Vovk
-et al. 2005). All are functions of the statistics and the sample, so of what was observed and nothing else.
+et al. 2005). All of these are functions of the statistics and the sample, and so of the set of observed touches.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ FEWEST = 8  # held-out touches; with fewer, a stage keeps the threshold and the 
 PRIOR_WEIGHT = {
     "lda": 0.1,
     "ridge": 10.0,
-}  # of the scores of all scales together: what both sensors' data come to
-# Logits by which the mean of a material is ahead of the next one's where no touch can be held out, see `_unheld`: of
-# one touch of each, log loss was least from 1.5 to 2 on fifteen sets (BioTac, RoboSkin, letters, simulated events and
-# light contacts, eight series).
+}  # of the scores of all scales together, about as fitted on both sensors' data
+# Logits by which the mean of a material leads the next one where no touch can be held out, see
+# `_weight_without_held_out`. With one touch of each, log loss was least from 1.5 to 2 on fifteen sets (BioTac,
+# RoboSkin, letters, simulated events and light contacts, eight series).
 AHEAD = 2.0
 MOST_STEPS = 100
-PRIOR_TOUCHES = 0.5  # the prior counts as much as these
-COMMON_TOUCHES = 2.0  # that the weight common to all scales counts as
+PRIOR_TOUCHES = 0.5  # the prior counts as so many touches
+COMMON_TOUCHES = 2.0  # the common weight counts as so many, as the prior of each scale's
 LEAST_COMMON = 1e-3  # of the prior
 
 
@@ -93,11 +93,11 @@ class Calibration:
         return standard
 
     def measures(self, false_alarms: float) -> bool:
-        """Whether enough known touches were held out to say which novelty such a share of them exceeds."""
+        """Whether enough known touches were held out to estimate the threshold of this false-alarm rate."""
         return self._rank(false_alarms) <= len(self.novelties)
 
     def detects(self, false_alarms: float) -> bool:
-        """Whether touches of materials never observed are more often above the threshold of such a rate than below."""
+        """Whether most touches would lie above the threshold of this rate, had their materials never been observed."""
         return float(np.median(self.novelties_if_new)) > self.threshold(false_alarms)
 
     def threshold(self, false_alarms: float) -> float:
@@ -129,7 +129,7 @@ def calibrate_stage(
     novel = [readouts[place] for place in measuring([readout.scale for readout in readouts])]
     medians = np.full(scales, np.inf)
     if not found.places:
-        unheld = np.full(scales, _unheld(found.names, readouts, kind))
+        unheld = np.full(scales, _weight_without_held_out(found.names, readouts, kind))
         return Calibration(unheld, _assumed(novel), medians)
     scores, distances = found.scores(), found.distances().min(axis=2)
     if viewed:
@@ -142,7 +142,7 @@ def calibrate_stage(
     spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
     shape = np.stack([distances.mean(axis=0), spread], axis=1)
     unsorted = Calibration(weights, shape, medians).novelty(distances)
-    # The mean of scales that agree only in part spreads less than one: back to units of its own spread.
+    # The mean over scales that are not fully correlated has a spread below 1: rescale it to 1.
     shape[:, 1] *= max(float(unsorted.std()), 1e-9)
     scaled = Calibration(weights, shape, medians)
     novelties, if_new = (np.sort(scaled.novelty(of)) for of in (distances, found.distances_if_new()))
@@ -207,8 +207,8 @@ def fit_weights(
 ) -> FloatArray:
     """Weights ≥ 0 of least log loss, a convex problem, drawn to the prior where touches are few.
 
-    scores: of held-out touches, shape (touches, scales, classes). targets: the class of each. touches: that the prior
-    counts as. counts: how many touches each of them stands for, shape (touches,); 1 unless given.
+    scores: of held-out touches, shape (touches, scales, classes). targets: the class of each. touches: how many the
+    prior counts as. counts: how many touches each of them stands for, shape (touches,); 1 unless given.
     """
     counted = np.ones(len(scores)) if counts is None else counts
     gap = scores - np.take_along_axis(scores, np.array(targets)[:, None, None], axis=2)
@@ -247,12 +247,12 @@ def fit_weights(
     return weights
 
 
-def _unheld(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName) -> float:
+def _weight_without_held_out(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName) -> float:
     """The weight of each scale where no touch can be held out, most materials having one.
 
-    Within-class scatter is then that within a touch alone, and touches of a material differ by far more: how far the
-    scores are to weigh nothing says but the scores between the materials. So a touch that is the mean of its
-    material is ahead by so many logits, and what lies between two materials is as likely to be either.
+    Within-class scatter is then that within single touches, and touches of one material differ by far more. So only the
+    distances between the materials can set the weight: a touch at the mean of its material gets AHEAD logits more than
+    the next material, and one halfway between two materials is as likely to be either.
     """
     share = PRIOR_WEIGHT[kind] / len(readouts)
     if kind == "ridge" or len(names) < 2:  # a ridge's scores are of targets of 0 and 1
@@ -269,7 +269,7 @@ def _unheld(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName
 
 
 def _assumed(readouts: Sequence[Readout]) -> FloatArray:
-    """Without held-out touches: the distances of the class means themselves, spread by their own mean size."""
+    """Mean and spread of novelty where too few touches are held out: from the distances of the class means alone."""
     shapes = []
     for readout in readouts:
         derived = readout.derived()

@@ -2,12 +2,12 @@
 
 Touches of one material err alike, so k of them are not k independent witnesses. With ρ the correlation of two, the
 log-probabilities of k count as those of k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and the mean of k
-novelties spreads by √((1 + (k − 1) ρ') / k) of what one does:
+novelties has √((1 + (k − 1) ρ') / k) times the standard deviation of one:
 
     log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
 
-ρ is fitted to pairs of held-out touches, by least log loss, and ρ' is their intraclass correlation. One touch is what
-it is by itself.
+ρ is fitted to pairs of held-out touches, by least log loss, and ρ' is their intraclass correlation. For one touch both
+formulas leave its own values.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["Dependence", "dependence_of"]
 FloatArray = npt.NDArray[np.float64]
 
 DEFAULT = 0.25  # ρ and ρ' where nothing is measured: about that of prefixes of BioTac's touches
-PRIOR_TOUCHES = 2.0  # pairs that ρ counts as
+PRIOR_TOUCHES = 2.0  # the prior of ρ counts as so many pairs
 TINY = 1e-300
 
 

@@ -1,4 +1,4 @@
-"""The means of the materials that a readout holds, and what is solved for them."""
+"""The means m of the materials that a readout holds in memory, and K⁻¹ m."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ Places = npt.NDArray[np.intp]
 
 
 class HeldMeans:
-    """Materials by their place in a readout, with all that scores need of each.
+    """The held materials of a readout.
 
-    rows: place → row. means: m about the readout's origin, solved: K⁻¹ m, both (H, d). sizes: mᵀ K⁻¹ m, (H,).
+    rows: place in the readout → row here. means: m about the readout's origin, solved: K⁻¹ m, both (H, d).
+    sizes: mᵀ K⁻¹ m, (H,).
     """
 
     def __init__(self, places: Sequence[int], pairs: FloatArray, sizes: FloatArray) -> None:
@@ -50,12 +51,12 @@ class HeldMeans:
         self.means, self.solved = self._room[:count, 0], self._room[:count, 1]
 
     def add(self, places: Sequence[int] | Places, means: FloatArray, solved: FloatArray) -> None:
-        """Hold more materials, with their means and K⁻¹ times these, (k, d) each."""
+        """Add materials, with their means and K⁻¹ times these, (k, d) each."""
         first = len(self.rows)
         last = first + len(means)
         if last > len(self._room):
-            # Room for half as many more, if there are any: requested materials come one by one. All of it
-            # before any is kept: there may be no memory for it.
+            # Requested materials come one by one, so room is made for half as many more. It is allocated before
+            # anything changes: that may fail for lack of memory.
             room = np.empty((last if not first else last + last // 2, 2, means.shape[1]))
             room[:first] = self._room[:first]
             self._room = room
@@ -65,19 +66,19 @@ class HeldMeans:
         self.rows |= {int(place): first + i for i, place in enumerate(places)}
 
     def keep(self, first: Places) -> None:
-        """Let all go but the first, which are at these places."""
+        """Keep the first rows, which are at these places, and drop the others."""
         self.rows = {int(place): i for i, place in enumerate(first)}
         self._cut(len(first))
         self.sizes = self.sizes[: len(first)]
 
     def copy(self) -> HeldMeans:
-        """Another of the same: what is added there is not added here."""
+        """A copy that changes independently."""
         return HeldMeans(self.places, np.stack([self.means, self.solved], axis=1), self.sizes.copy())
 
 
 def class_means(counts: IntArray | FloatArray, sums: Sums, origin: FloatArray) -> FloatArray:
-    """The means of materials about an origin, shape (C, d), in codes."""
-    # About the integers next to the origin, exactly: a class mean keeps the digits that its distance from it needs.
+    """The means of materials about an origin, shape (C, d), in grid units."""
+    # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
     near = np.rint(origin)
     means: FloatArray = (sums - np.outer(counts.astype(np.int64), near.astype(np.int64))) / counts[:, None]
     means -= origin - near

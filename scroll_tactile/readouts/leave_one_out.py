@@ -1,22 +1,23 @@
-"""Leave-one-out scores: of each sampled touch by a readout that never observed it.
+"""Leave-one-out scores: each sampled touch is scored by a readout that never observed it.
 
-Its rows are taken out of the statistics. A touch of k rows with mean x̄, of a material of n rows with mean m, adds to
-S_w the columns U of `system`: its rows about their mean and its way √(n k / (n − k)) (x̄ − m). Without it, by Sherman,
-Morrison and Woodbury (1950; Bartlett 1951 for a row),
+The touch's rows are taken out of the statistics. A touch of k rows with mean x̄, of a material of n rows with mean m,
+adds to S_w the columns U of `system`: its rows about their mean and the scaled shift √(n k / (n − k)) (x̄ − m). Without
+it, by Sherman, Morrison and Woodbury (1950; Bartlett 1951 for a row),
 
     K'⁻¹ = K⁻¹ − K⁻¹ Uᵀ E U K⁻¹,    E = (U K⁻¹ Uᵀ − I)⁻¹,    m' = m − k / (n − k) (x̄ − m),
 
 so that all of its scores follow from products with K⁻¹ of its rows and of the means: one inverse serves for all. The
-covariance of the whole, T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ, loses it alike, and the paper's ridge by its leverage
-matrix B: with Y the targets of the rows and F their fitted scores, (I − B)⁻¹ (F − B Y). P and γ stay what they are.
+touch leaves the total scatter T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ in the same way. It leaves the paper's ridge by
+its leverage matrix B: its scores are (I − B)⁻¹ (F − B Y), Y the targets of the rows and F their fitted scores. P and γ
+stay as they are.
 
-A held-out touch is further away from its own material than one to come will be: of n touches' mean, where one is new,
-the squared distance is expected to be 1 + 1/n of the scatter's, where one of the n is left out 1 + 1/(n − 1). So it is
-brought to 1 − 1/n² of what it is, n the touches of the material, where calibration would otherwise rest on touches that
-look less like their own than new ones will.
+A held-out touch lies further from its own material than a new touch will. The squared distance to the mean of n touches
+is expected to be (1 + 1/n) times the scatter for a new touch, and (1 + 1/(n − 1)) times for a held-out one of the n. So
+it is multiplied by their ratio, 1 − 1/n²: calibration would otherwise expect new touches to look less like their own
+material than they do.
 
-A touch of which the statistics hold more rows than the sample (copies) leaves with as many of its own: one that was
-observed several times leaves with all of them.
+Where the statistics hold more rows of a touch than the sample does (copies, or one touch observed several times), its
+sampled rows stand for all of them.
 """
 
 from __future__ import annotations
@@ -116,11 +117,11 @@ def held_out_scores(
     kind: ReadoutName,
     queries: Mapping[int, Mapping[int, FloatArray]] | None = None,
 ) -> HeldOutScores:
-    """Leave each sampled touch out of the readout of a scale, which has followed nothing yet.
+    """Leave each sampled touch out of the readout of a scale, as it was solved: no touch came to it since.
 
-    stages: the scales that judge at each stage, ascending. queries: by the touch's place in the sample, by any number,
-    what is scored in place of its own rows, codes (d,): numbers then stand for stages. Touches of materials that have
-    no others are not there.
+    stages: the scales that judge at each stage, ascending. queries: place of the touch in the sample →
+    any number → mean features in grid units, (d,), scored in place of its own rows; the numbers then stand for stages.
+    The result lacks touches that are the only one of their material.
     """
     names = [readout.names[place] for place in readout.reference]
     own = {name: i for i, name in enumerate(names)}
@@ -153,7 +154,7 @@ def held_out_scores(
 
 
 def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:
-    """Which of a sampled touch's rows are of a scale. stages: the scales that judge at each, ascending."""
+    """The indices of a sampled touch's rows at a scale. stages: the scales that judge at each, ascending."""
     return [
         i for i, (stage, place, _) in enumerate(touch.pairs.tolist())
         if stage < len(stages) and place < len(stages[stage]) and stages[stage][place] == scale
@@ -161,7 +162,7 @@ def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale
 
 
 class _Leaving:
-    """Takes touches out of one readout that was just made; all of M touches with k rows each at once.
+    """Takes touches out of one readout as it was solved; M touches with k rows each at once.
 
     All products are taken between whitened vectors, L⁻¹ x with K = L Lᵀ. Those of T follow from them (Woodbury): with
     B = √(N p_y) (m_y − μ) whitened and A Aᵀ = I + B Bᵀ, xᵀ T⁻¹ y = x·y − (A⁻¹ B x)·(A⁻¹ B y).
@@ -173,7 +174,7 @@ class _Leaving:
         means, _ = readout.means_solved()
         self.counts = readout.counts[readout.reference]
         self.total = float(self.counts.sum())
-        # The whole is that of the reference materials alone, weighed as if they were all.
+        # The total scatter is that of the reference materials, scaled to the rows of all materials.
         self.excess = float(readout.counts.sum()) / self.total
         with one_thread():
             self.means = readout.system.whiten(means)
@@ -189,9 +190,9 @@ class _Leaving:
         own: npt.NDArray[np.intp],
         queries: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Scores, z, distances, each of shape (M·q, R), without the rows of each touch; two more distances, (M·q,).
+        """Scores, z and distances, (M·q, R) each, without the rows of each touch; then two distances, (M·q,) each.
 
-        The two: the relative one without its whole material, and the diagonal one.
+        These two: the relative distance without the touch's whole material, and the diagonal distance.
 
         rows: that each touch added, about the origin, (M, k, d). weights: the rows of the statistics that it stands
         for, (M,). own: its material among the reference, (M,). queries: what is scored, about the origin, (M, q, d);
@@ -243,7 +244,7 @@ class _Leaving:
         weights: FloatArray,
         own: npt.NDArray[np.intp],
     ) -> FloatArray:
-        """What each row's own material gains if it is no further away than from a new touch, in LDA scores, (M, k).
+        """The rise of each row's own LDA score where its distance is brought to that of a new touch, (M, k).
 
         white: the rows, whitened, (M, k, d). leaving, inner: the columns that leave K, whitened, and E.
         """
@@ -274,9 +275,9 @@ class _Leaving:
     def _whole(
         self, white: FloatArray, scored: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The squared length of what is scored about the mean of all under T without its touch, (M, q).
+        """The squared length of each query about the total mean, by T without its touch, (M, q).
 
-        And B of the touch's rows, (M, k, k), and of what is scored with them, (M, q, k). leaving: the columns that
+        Also B of the touch's rows, (M, k, k), and of its queries with them, (M, q, k). leaving: the columns that
         leave K, whitened, shape (M, k, d).
         """
         count, half, queries = white.shape[1], white - self.center, scored - self.center
@@ -292,13 +293,13 @@ class _Leaving:
         return whole, leverage, across
 
     def _whole_without_material(self, scored: FloatArray, leaving: FloatArray, own: npt.NDArray[np.intp]) -> FloatArray:
-        """As the first of `_whole`, but without the material of the touch; of it the scatter within stays, (M, q)."""
+        """The first result of `_whole`, also without the material's mean, but with its inner scatter, (M, q)."""
         counts, middle = self.counts[own], self.means[own] - self.center
         rest = self.total - counts
         if not rest.all():
             return np.full(scored.shape[:2], np.nan)
-        way = np.sqrt(self.excess * counts * self.total / rest)[:, None] * middle
-        columns = np.concatenate([leaving, way[:, None]], axis=1)
+        shift = np.sqrt(self.excess * counts * self.total / rest)[:, None] * middle
+        columns = np.concatenate([leaving, shift[:, None]], axis=1)
         moved = scored - self.center + (counts / rest)[:, None, None] * middle[:, None]
         return self._length_without(moved, columns, -np.ones(columns.shape[1]))
 
@@ -327,8 +328,8 @@ class _Leaving:
         targets = np.zeros_like(fitted)
         targets[np.arange(len(own)), :, own] = 1.0
         scores = queries + across @ np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - targets)
-        # With the shares of all touches, as a new one is judged: that a material lacks the very touch that is judged
-        # would be all that a heavily shrunk ridge says, and its scores would have no weight.
+        # The shares of all touches, as for a new touch. A heavily shrunk ridge returns little but the shares: without
+        # the held-out touch its material's would be lower, and calibration would give such scores no weight.
         counts = self.counts - weights[:, None] * np.eye(len(self.counts))[own]
         shares = counts / (self.total - weights)[:, None]
         return np.asarray(scores + (self.readout.shares - shares)[:, None, :])
@@ -340,6 +341,6 @@ class _Leaving:
         return np.asarray(self.readout.shares + z @ self.derived.background)
 
 
-def _columns(rows: FloatArray, share: FloatArray, way: FloatArray) -> FloatArray:
-    """The contrasts of the rows of each touch and its way, shape (M, k, d)."""
-    return np.concatenate([share * (contrasts(rows.shape[1]) @ rows), way[:, None]], axis=1)
+def _columns(rows: FloatArray, share: FloatArray, shift: FloatArray) -> FloatArray:
+    """The contrasts of the rows of each touch and its scaled shift, shape (M, k, d)."""
+    return np.concatenate([share * (contrasts(rows.shape[1]) @ rows), shift[:, None]], axis=1)

@@ -1,14 +1,14 @@
-"""Many materials in two coarse copies: bounds of all scores find the few among which exact scores decide.
+"""Many materials in two coarse copies: bounds of all scores select the few whose exact scores are computed.
 
 With K = L Lᵀ, u_y = L⁻¹ m_y and v = L⁻¹ x a score is u_y·v − |u_y|² / 2. P, of r orthonormal rows, keeps the directions
-in which the materials differ most. What is left beyond them of u_y and v, a_y and b, is first bounded by its lengths,
-and then, of materials that this does not exclude, read from bytes q_y in steps of h_y:
+in which the materials differ most. The residuals of u_y and v beyond these, a_y and b, are first bounded by their
+lengths; then, for materials that this does not exclude, a_y is approximated by bytes q_y in steps of h_y:
 
     u_y·v = (P u_y)·(P v) + a_y·b,    |a_y·b| ≤ |a_y| |b|,    |a_y·b − h_y q_y·b| ≤ |a_y − h_y q_y| |b|.
 
 After touches that came since K was inverted, K⁻¹ = L⁻ᵀ (I − B) L⁻¹ (see `system`): then v is (I − B) L⁻¹ x, the size of
 a material is |u_y|² − u_yᵀ B u_y, and no eigenvalue of B is larger than a bound β: the score rises by β |u_y|² / 2 at
-most. The copies stay as they are, but of the materials that changed.
+most. Only the copies of materials that changed are made again.
 """
 
 from __future__ import annotations
@@ -66,14 +66,14 @@ class PruningTable:
         self.lost[places] = _lengths(rest - steps[:, None] * quantised)
 
     def copy(self) -> PruningTable:
-        """Another of the same materials: what is put there is not put here."""
+        """A copy that changes independently."""
         other = copy.copy(self)
         for name in ("near", "bytes", "sizes", "far", "steps", "lost"):
             setattr(other, name, getattr(self, name).copy())
         return other
 
     def put(self, places: Places, whitened: FloatArray) -> None:
-        """The materials at some places have other means, u of shape (k, d), or are new there."""
+        """Replace the means of the materials at some places, or append them; whitened: u, (k, d)."""
         if (more := int(places.max()) + 1 - len(self.sizes)) > 0:
             for name in ("near", "bytes", "sizes", "far", "steps", "lost"):
                 array = getattr(self, name)
@@ -85,9 +85,9 @@ class PruningTable:
         near = self.directions @ white
         rest = white - near @ self.directions
         size, length = np.sqrt(white @ white), np.sqrt(rest @ rest)
-        # What products in single precision round, and what double precision does, also where scores are exact.
+        # Rounding errors of the products in single precision, and of the exact scores in double precision.
         rounded = np.sqrt(self.sizes) * ((len(near) + 16) * UNIT * size) + self.sizes * (most_lost / 2)
-        with np.errstate(invalid="ignore"):  # of few columns some BLAS report a NaN that is not there
+        with np.errstate(invalid="ignore"):  # some BLAS report a NaN that is not there, for few columns
             products = self.near @ near.astype(np.float32)
         guess = products.astype(np.float64) - self.sizes / 2
         most = gamma * (guess + self.far * length + rounded)
@@ -96,11 +96,11 @@ class PruningTable:
 
 @dataclass
 class Compared:
-    """A touch beside all of many materials, by place.
+    """The bounds of one touch's scores for all materials, by place.
 
-    solved: K⁻¹ x, (d,). guess: of the scores, (C,). most: what they are at most, (C,). rest: b, of some length.
-    known: which of the guesses are exact, (C,).
-    rounded: what of `most` is for rounding and for what came since, over γ, (C,).
+    solved: K⁻¹ x, (d,). guess: estimates of the scores, (C,). most: their upper bounds, (C,). rest: b; length: its own.
+    known: which estimates are exact, (C,). rounded: the part of `most`, over γ, for rounding and for columns that came
+    since K was inverted, (C,).
     """
 
     table: PruningTable
@@ -116,7 +116,7 @@ class Compared:
         self.known, self._fine = np.zeros((2, len(self.guess)), dtype=np.bool_)
 
     def take(self, places: Places, scores: FloatArray) -> None:
-        """Take the exact scores of some materials in place of guesses: they are known then."""
+        """Replace the estimates of some materials by their exact scores."""
         self.guess[places], self.known[places], self._fine[places] = scores, True, True
         self.most[places] = scores + UNIT * (np.abs(scores) + self.gamma * self.table.sizes[places])
 
@@ -134,7 +134,7 @@ class Compared:
 
 
 class _Materials(Protocol):
-    """A readout of many materials, as far as their bounds rest on it; see `readout.Readout`."""
+    """The part of `readout.Readout` that the bounds of many materials need."""
 
     names: list[str]
     reference: Places
@@ -148,11 +148,11 @@ class _Materials(Protocol):
 
     def read_means(self, places: Iterable[int]) -> FloatArray: ...
 
-    def scores(self, codes: FloatArray, places: Places, kind: Literal["lda"]) -> FloatArray: ...
+    def scores(self, features: FloatArray, places: Places, kind: Literal["lda"]) -> FloatArray: ...
 
 
 class ManyMaterials:
-    """All materials of one readout in coarse copies, with the touch that was compared with them last."""
+    """All materials of one readout in coarse copies, with the bounds of the last touch."""
 
     def __init__(self, readout: _Materials, table: PruningTable | None = None) -> None:
         self._readout, self._table = readout, table
@@ -164,24 +164,24 @@ class ManyMaterials:
         return ManyMaterials(readout, None if self._table is None else self._table.copy())
 
     def forget(self) -> None:
-        """The readout changes: bounds are found again."""
+        """Drop the bounds: the readout changes."""
         self._compared = self._most_lost = None
 
     def put(self, places: Places, whitened: FloatArray) -> None:
-        """The materials at some places have other means, L⁻¹ m of shape (k, d), or are new there."""
+        """Replace the means of the materials at some places, or append them; whitened: L⁻¹ m, (k, d)."""
         if self._table is not None:
             self._table.put(places, whitened)
 
-    def bounds(self, codes: FloatArray, places: Places, *, fine: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Guesses of the scores "lda" of some materials, and what they are at most, each of shape (k,)."""
-        compared = self._beside(codes)
+    def bounds(self, features: FloatArray, places: Places, *, fine: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Estimates of the scores "lda" of some materials, and their upper bounds, (k,) each."""
+        compared = self._beside(features)
         if fine:
             compared.refine(places)
         return compared.guess[places], compared.most[places]
 
-    def exact(self, codes: FloatArray, places: Places) -> FloatArray:
-        """The scores "lda" of any materials, which are not held for it, for codes of shape (d,), shape (k,)."""
-        compared, readout = self._beside(codes), self._readout
+    def exact(self, features: FloatArray, places: Places) -> FloatArray:
+        """The scores "lda" of any materials for features (d,), shape (k,), without holding these materials."""
+        compared, readout = self._beside(features), self._readout
         unknown = places[~compared.known[places]]
         with one_thread():
             for first in range(0, len(unknown), READ_AT_ONCE):
@@ -192,20 +192,20 @@ class ManyMaterials:
                 compared.take(some, readout.gamma * (means @ compared.solved - sizes / 2))
         return compared.guess[places]
 
-    def _beside(self, codes: FloatArray) -> Compared:
-        """Codes (d,) beside all materials; the latest are kept."""
+    def _beside(self, features: FloatArray) -> Compared:
+        """The bounds for features (d,); those of the last features are cached."""
         readout = self._readout
-        if self._compared is None or self._compared[0] is not codes:
+        if self._compared is None or self._compared[0] is not features:
             with one_thread():
                 if self._table is None:
                     self._table = self._tabled()
                 if self._most_lost is None:
                     self._most_lost = readout.system.most_lost
-                white = readout.system.towards((codes - readout.origin)[None])
+                white = readout.system.towards((features - readout.origin)[None])
                 solved = readout.system.solve_whitened(white)[0]
                 compared = self._table.compared(white[0], self._most_lost, readout.gamma, solved)
-            compared.take(readout.reference, readout.scores(codes, readout.reference, "lda"))  # they are held
-            self._compared = codes, compared
+            compared.take(readout.reference, readout.scores(features, readout.reference, "lda"))  # they are held
+            self._compared = features, compared
         return self._compared[1]
 
     def _tabled(self) -> PruningTable:
@@ -229,10 +229,10 @@ def likeliest(
     margin: float = 0.0,
     finest: int = 1,
 ) -> tuple[Places, FloatArray]:
-    """Those of some materials that may come within a margin of the highest score, in their order, and their scores.
+    """The materials that may come within a margin of the highest score, in their order, and their exact scores.
 
-    bounds: gives of some materials guesses of their scores, and what these are at most, from 0 on ever finer ones up to
-    `finest`. exact: gives their scores.
+    bounds: (places, level) → estimates of their scores and upper bounds, finer with each level from 0 to `finest`.
+    exact: places → their scores.
     """
     guess, most = bounds(places, 0)
     first = places[np.argpartition(-guess, min(FIRST, len(guess)) - 1)[:FIRST]]

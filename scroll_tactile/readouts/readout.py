@@ -55,10 +55,10 @@ def held_at_first(reference: Places, count: int) -> Places:
 
 
 class Numbers(NamedTuple):
-    """What a readout was solved with and for.
+    """The numbers that a readout was solved with.
 
-    reference: places. origin: shape (d,), in codes. counts: rows, shape (C,). share: ρ. penalty: P. precision: one over
-    the variance of each feature within materials as it was solved, shape (d,).
+    reference: places. origin: shape (d,), in grid units. counts: rows, shape (C,). share: ρ. penalty: P. precision: one
+    over the variance of each feature within materials as it was solved, shape (d,).
     """
 
     reference: Places
@@ -71,10 +71,10 @@ class Numbers(NamedTuple):
 
 @dataclass(frozen=True)
 class Derived:
-    """What ridge and novelty need of a readout as it is at one moment.
+    """The matrices that ridge and novelty need of a readout in its present state.
 
-    gram: G of the reference materials about their mean, shape (R, R). background: H. towards: what is taken off z
-    beside its mean to bring it about the mean of the reference materials, shape (R,).
+    gram: G of the reference materials about their mean, shape (R, R). background: H. towards: subtracted from z, after
+    its mean, to move its origin to the mean of the reference materials, shape (R,).
     """
 
     gram: FloatArray
@@ -83,14 +83,14 @@ class Derived:
 
 
 class Readout:
-    """The readout of one scale: of a task, and of the touches that came and went since.
+    """The readout of one scale: solved from a task, then updated by the touches that came and went since.
 
-    names: the materials; one is known by its place among them. The numbers are those of `Numbers`.
+    names: the materials; a place is an index into them. The other attributes are those of `Numbers`.
 
-    Any number of threads may read one of at most EAGER materials at once, and one thread one of more. It follows
-    where nobody reads it: otherwise a copy does.
+    Any number of threads may read a readout of at most EAGER materials at once, a larger one only one thread. `follow`
+    changes it in place: while any thread reads it, a copy follows.
 
-    Some materials are held, with all that scores need: the reference first. The others are read from `statistics`.
+    It holds the means of some materials, the reference first, and reads those of the others from `statistics`.
     """
 
     def __init__(
@@ -123,8 +123,8 @@ class Readout:
         return np.asarray(counts / counts.sum())
 
     @property
-    def pressed(self) -> bool:
-        """Whether three quarters of them have."""
+    def nearly_full(self) -> bool:
+        """Whether the system has taken in more than three quarters of the columns that it has room for."""
         return self.system.rank > 3 * self.system.room
 
     def means_solved(self) -> tuple[FloatArray, FloatArray]:
@@ -137,7 +137,7 @@ class Readout:
         self.held_means.add(places, means, self.system.solve(means))
 
     def held(self, places: Sequence[int] | Places) -> Places:
-        """Where the materials at some places are held; those that were not are from now on."""
+        """The rows of some materials among the held ones; holds those that were not held yet."""
         absent = [int(place) for place in places if int(place) not in self.held_means.rows]
         if absent:
             if len(self.held_means.rows) + len(absent) > MOST_HELD:
@@ -150,8 +150,8 @@ class Readout:
     def follow(self, changes: Sequence[Change]) -> bool:
         """Take in touches that came and went, which the statistics have already.
 
-        Returns False where all has to be solved again: they are too many, outweigh what it was solved from, or a
-        material went.
+        Returns False where all has to be solved again: the touches are too many, they outweigh the scatter that it was
+        solved from, or a material lost its last one.
         """
         if sum(len(rows) for _, rows, _ in changes) > self.system.room:
             return False
@@ -172,20 +172,20 @@ class Readout:
                         if place is None or self.counts[place] <= len(rows):
                             return False
                         self._follow({material: rows - self.origin}, -1)
-        except np.linalg.LinAlgError:  # nearly all that it was solved from went
+        except np.linalg.LinAlgError:  # nearly all touches that it was solved from were retracted
             return False
         return self.system.sound
 
     def copy(self) -> Readout:
-        """Another readout of the same: what comes to it does not come to this one."""
+        """A copy that follows independently."""
         other = self._branch()
         other._derived, other._many = self._derived, None if self._many is None else self._many.copy(other)
         return other
 
     def without(self, material: str, rows: npt.NDArray[np.float64]) -> Readout:
-        """Another readout, that never had a touch of these rows, codes (k, d); of a material that has others.
+        """A copy that never observed a touch of these rows, codes (k, d); its material has other touches.
 
-        Whoever calls has BLAS on one thread.
+        The caller has set BLAS to one thread.
         """
         other = self._branch()
         other.held([other.places[material]])
@@ -193,7 +193,7 @@ class Readout:
         return other
 
     def _branch(self) -> Readout:
-        """Another readout with nothing derived, which follows by itself."""
+        """A copy without derived matrices that follows independently."""
         numbers = Numbers(self.reference, self.origin, self.counts.copy(), self.share, self.penalty, self.precision)
         system, held = self.system.branch(), self.held_means.copy()
         return Readout(self.scale, self.names, self.statistics, system, held, numbers, dict(self.places))
@@ -211,7 +211,7 @@ class Readout:
             self._hold([place], class_means(self.counts[[place]], total, self.origin))
 
     def _follow(self, changed: Mapping[str, FloatArray], sign: int) -> None:
-        """Take in rows of some materials, (k, d) about the origin, at once: one product in place of many thin ones."""
+        """Take in rows of several materials, (k, d) about the origin, in one product: that is faster."""
         held_means = self.held_means
         columns, known, fresh = [], [], []
         for material, came in changed.items():
@@ -239,14 +239,14 @@ class Readout:
 
     def _new_place(self, material: str, count: int) -> int:
         place = self.places[material] = len(self.names)
-        if len(self.reference) == place:  # all materials, and this one too
+        if len(self.reference) == place:  # the reference is all materials, so this one joins it
             self.reference = np.append(self.reference, place)
         self.names.append(material)
         self.counts = np.append(self.counts, float(count))
         return place
 
     def _border(self, columns: FloatArray, sign: int) -> None:
-        """Take columns into K, with all that is solved of it."""
+        """Add columns to K, and update all that was solved with it."""
         if not len(columns):
             return
         leaving, corner = self.system.border(columns, sign)
@@ -257,13 +257,13 @@ class Readout:
 
     @property
     def many(self) -> ManyMaterials:
-        """All of many materials, of which not all are held, by bounds of their scores."""
+        """Bounds of the scores of all materials, where these are too many to hold."""
         if self._many is None:
             self._many = ManyMaterials(self)
         return self._many
 
     def derived(self) -> Derived:
-        """What the answers of this moment need, made again after a change."""
+        """The matrices of the present state, made again after a change."""
         if self._derived is None:
             shares, (means, solved) = self.shares, self.means_solved()
             with one_thread():
@@ -276,38 +276,38 @@ class Readout:
             self._derived = Derived(gram, (background + background.T) / 2, onto - size)
         return self._derived
 
-    def _reference_z(self, codes: FloatArray) -> FloatArray:
+    def _reference_z(self, features: FloatArray) -> FloatArray:
         """z of the reference materials about the origin, shape (R,)."""
-        return np.asarray(self.gamma * (self.held_means.solved[: len(self.reference)] @ (codes - self.origin)))
+        return np.asarray(self.gamma * (self.held_means.solved[: len(self.reference)] @ (features - self.origin)))
 
-    def scores(self, codes: FloatArray, places: Sequence[int] | Places, kind: ReadoutName) -> FloatArray:
-        """The scores of the materials at some places, not too many to hold, for codes of shape (d,), shape (k,)."""
+    def scores(self, features: FloatArray, places: Sequence[int] | Places, kind: ReadoutName) -> FloatArray:
+        """The scores of the materials at some places, not too many to hold, for features of shape (d,), shape (k,)."""
         if kind == "ridge":
-            near, beyond = self._beyond_nearest(codes)
+            near, beyond = self._beyond_nearest(features)
             scores = self.derived().background @ beyond
             scores[near] += 1.0
             return np.asarray(scores[self.held(places)])
-        return np.asarray(self.gamma * self._scores(codes, self.held(places)))
+        return np.asarray(self.gamma * self._scores(features, self.held(places)))
 
-    def _scores(self, codes: FloatArray, held: Places) -> FloatArray:
+    def _scores(self, features: FloatArray, held: Places) -> FloatArray:
         every, sizes = self.held_means.solved, self.held_means.sizes
-        row = codes - self.origin
+        row = features - self.origin
         z = (every @ row)[held] if 4 * len(held) > len(every) else every[held] @ row  # picking rows copies them
         return np.asarray(z - sizes[held] / 2)
 
-    def diagonal_distance(self, codes: FloatArray, place: int) -> float:
-        """The squared Mahalanobis distance of codes (d,) from a material's mean, by diagonal scatter as fitted.
+    def diagonal_distance(self, features: FloatArray, place: int) -> float:
+        """The squared Mahalanobis distance of features (d,) from a material's mean, by diagonal scatter as fitted.
 
         It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
         differs in.
         """
         held = self.held_means.rows.get(place)
         mean = self.read_means([place])[0] if held is None else self.held_means.means[held]
-        away = codes - self.origin - mean
+        away = features - self.origin - mean
         return float(np.square(away) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
-        """The scores of materials as weights (d, k) of codes about the origin, and offsets (k,); see `scores`."""
+        """The scores of materials as weights (d, k) of features about the origin, and offsets (k,); see `scores`."""
         held = self.held([self.places[name] for name in names])
         if kind == "lda":
             return self.gamma * self.held_means.solved[held].T, -self.gamma * self.held_means.sizes[held] / 2
@@ -316,35 +316,37 @@ class Readout:
         mixing = background - np.outer(background.sum(axis=1), self.shares)
         return weights @ mixing.T, np.asarray(self.shares[held] - background @ derived.towards)
 
-    def centred(self, codes: FloatArray) -> FloatArray:
+    def centred(self, features: FloatArray) -> FloatArray:
         """z of the reference materials about their mean, shape (R,)."""
-        z = self._reference_z(codes)
+        z = self._reference_z(features)
         return np.asarray(z - self.shares @ z - self.derived().towards)
 
-    def novelty(self, codes: FloatArray, places: Sequence[int] | Places) -> float:
-        """Relative Mahalanobis distance of codes (d,); the materials at `places` are those that may be the nearest."""
-        near, beyond = self._beyond_nearest(codes)
-        ahead = self.nearest(codes, places)[1] - float(self.scores(codes, self.reference[[near]], "lda")[0])
+    def novelty(self, features: FloatArray, places: Sequence[int] | Places) -> float:
+        """Relative Mahalanobis distance of features (d,), the nearest material taken among those at `places`."""
+        near, beyond = self._beyond_nearest(features)
+        ahead = self.nearest(features, places)[1] - float(self.scores(features, self.reference[[near]], "lda")[0])
         weighed = beyond @ self.derived().background @ beyond
         return float(weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
 
-    def _beyond_nearest(self, codes: FloatArray) -> tuple[int, FloatArray]:
+    def _beyond_nearest(self, features: FloatArray) -> tuple[int, FloatArray]:
         """The nearest of the reference materials, by its place among them, and v, shape (R,)."""
-        count, row = len(self.reference), codes - self.origin
+        count, row = len(self.reference), features - self.origin
         near = int((self.held_means.solved[:count] @ row - self.held_means.sizes[:count] / 2).argmax())
         beyond = self.gamma * (self.held_means.solved[:count] @ (row - self.held_means.means[near]))
         beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
         return near, np.asarray(beyond - self.shares @ beyond)
 
-    def nearest(self, codes: FloatArray, places: Sequence[int] | Places) -> tuple[int, float]:
+    def nearest(self, features: FloatArray, places: Sequence[int] | Places) -> tuple[int, float]:
         """Of the materials at some places the one of the highest score "lda", by its place, and that score."""
         chosen = np.asarray(places)
         if len(chosen) <= EAGER:
-            scores = self.scores(codes, chosen, "lda")
+            scores = self.scores(features, chosen, "lda")
         else:
             many = self.many
             chosen, scores = likeliest(
-                chosen, lambda some, fine: many.bounds(codes, some, fine=fine > 0), lambda some: many.exact(codes, some)
+                chosen,
+                lambda some, fine: many.bounds(features, some, fine=fine > 0),
+                lambda some: many.exact(features, some),
             )
         best = int(scores.argmax())
         return int(chosen[best]), float(scores[best])

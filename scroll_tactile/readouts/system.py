@@ -1,12 +1,12 @@
 """The system that a readout solves: inverted once from the exact statistics, and followed by Woodbury's identity.
 
 A touch of k rows with mean x̄, of a class of n rows with mean m, adds to the scatter within classes its rows about
-their mean and its way √(n k / (n + k)) (x̄ − m). With U all such columns since K was inverted and D their signs, −1 for
-what was retracted (Woodbury 1950):
+their mean and the scaled shift of the class mean, √(n k / (n + k)) (x̄ − m). Let U be all such columns since K was
+inverted, and D their signs, −1 where a touch was retracted (Woodbury 1950):
 
     (K + Uᵀ D U)⁻¹ = L⁻ᵀ (I − Wᵀ E W) L⁻¹,    K = L Lᵀ,    W = U L⁻ᵀ,    E = (D + W Wᵀ)⁻¹,
 
-at 2 d² operations a column; W is all that is kept of them. Nothing drifts: U grows to a part of d, and then K is
+at 2 d² operations a column; of the columns only W is stored. Nothing drifts: U grows to a part of d, and then K is
 inverted again from the integers.
 """
 
@@ -26,8 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 LARGEST_RANK = 3  # d over this: so many columns may come before K is inverted again
 LEAST_RANK = 32
 MORE = 64  # columns that room is made for at once
-# Of the condition of D + U K⁻¹ Uᵀ, by largest entries. What is lost of the digits goes with its square: touches much
-# louder than all before, or one retracted on which the scatter rests, have K inverted again: scores keep their 1e-9.
+# The condition number of D + U K⁻¹ Uᵀ, by largest entries; digits are lost with its square. So touches much larger than
+# all before, or the retraction of one that dominates the scatter, have K inverted again: scores stay accurate to 1e-9.
 LARGEST_CONDITION = 256.0
 BLOCKS = 8  # of rows of a triangle: then seven sixteenths of the square are left out
 FEW = 8  # rows that are solved for one by one: a fifth of the time of a product of matrices
@@ -43,14 +43,14 @@ def contrasts(count: int) -> FloatArray:
     return contrasts
 
 
-def columns_of(rows: FloatArray, way: FloatArray | None) -> FloatArray:
-    """What rows, shape (k, d), add to the scatter: their contrasts, and the way of the class mean if there is one."""
+def columns_of(rows: FloatArray, shift: FloatArray | None) -> FloatArray:
+    """The columns that rows, (k, d), add to the scatter: their contrasts, and the scaled shift of the class mean."""
     own = contrasts(len(rows)) @ rows if len(rows) > 1 else rows[:0]
-    return own if way is None else np.vstack([own, way])
+    return own if shift is None else np.vstack([own, shift])
 
 
 class System:
-    """K⁻¹ = L⁻ᵀ L⁻¹, and what came since. Whoever calls has BLAS on one thread.
+    """K⁻¹ = L⁻ᵀ L⁻¹, and the columns that came since. The caller has set BLAS to one thread.
 
     matrix: K, shape (d, d), of which the lower triangle is read. rank: the columns that came since.
 
@@ -70,14 +70,14 @@ class System:
 
     @classmethod
     def unkept(cls, dimension: int) -> System:
-        """A system whose K was not kept: it takes nothing in, and solves nothing."""
+        """A system whose K was not stored: it takes in no columns, and solves nothing."""
         system = cls(np.empty((0, 0)))
         system._most, system._white = 0, np.empty((0, dimension))
         return system
 
     @property
     def sound(self) -> bool:
-        """Whether what came does not outweigh what K was made of."""
+        """Whether the system is well-conditioned: the columns that came do not outweigh K."""
         largest = float(np.abs(self._e[: self.rank, : self.rank]).max(initial=0.0))
         return self._largest * largest <= LARGEST_CONDITION
 
@@ -98,9 +98,9 @@ class System:
         return self.solve_whitened(self.towards(rows))
 
     def towards(self, rows: FloatArray) -> FloatArray:
-        """Of each of the rows x, (k, d), what the whitened y is multiplied with for yᵀ (K + Uᵀ D U)⁻¹ x: (I − B) L⁻¹ x.
+        """(I − B) L⁻¹ x of each of the rows x, (k, d): its product with a whitened y is yᵀ (K + Uᵀ D U)⁻¹ x.
 
-        B = Wᵀ E W is what came since.
+        B = Wᵀ E W stands for the columns that came since.
         """
         white = self.whiten(rows)
         if self.rank:
@@ -113,7 +113,7 @@ class System:
         return self._inverse.transposed_times(white)
 
     def lost(self, white: FloatArray) -> FloatArray:
-        """uᵀ B u of each of some whitened rows u, (k, d): by so much less is its length as K⁻¹ measures it, (k,)."""
+        """uᵀ B u of each whitened row u, (k, d): how much the columns that came reduce its squared length, (k,)."""
         onto = white @ self._white[: self.rank].T
         return np.asarray(np.einsum("kr,kr->k", onto @ self._e[: self.rank, : self.rank], onto))
 
@@ -127,7 +127,7 @@ class System:
         return float(max(np.einsum("ij,ji->", power, power), 0.0) ** 0.125) * (1 + 1e-9) + 1e-9
 
     def whiten(self, rows: FloatArray) -> FloatArray:
-        """L⁻¹ times each of the rows, shape (k, d), not regarding what came since: their products are those of K⁻¹."""
+        """L⁻¹ times each of the rows, (k, d), without the columns that came since: their products are those of K⁻¹."""
         return self._inverse.times(rows)
 
     def _grow(self, rank: int) -> None:
@@ -137,7 +137,7 @@ class System:
         self._white, self._e, self._signs = white, e, signs
 
     def border(self, columns: FloatArray, sign: int) -> tuple[FloatArray, FloatArray]:
-        """Take in columns, shape (k, d), of one sign; gives W, (k, d), and C, (k, k): Wᵀ C W leaves the inverse."""
+        """Take in columns, (k, d), of one sign. Returns W, (k, d), and C, (k, k): the inverse falls by Wᵀ C W."""
         first, last = self.rank, self.rank + len(columns)
         if last > len(self._white):
             self._grow(last)
@@ -159,7 +159,7 @@ class System:
 class InverseTriangle:
     """L⁻¹ of K = L Lᵀ, shape (d, d), of which the lower triangle is read: in blocks of rows, without what is zero.
 
-    A block stays in the processor's cache for all rows that are multiplied by it, and nothing takes a square more.
+    A block stays in the processor's cache for all rows that are multiplied by it; no second (d, d) array is made.
 
     Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """

@@ -33,18 +33,18 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FIRST_KNOWN = 256  # materials
-# Below the first the solution would lose more digits than the 1e-9 that it is good for; above the second nothing would
-# be left of S. A memory of a million touches stays above the first.
+# Bounds of ρ. Below LEAST the solution would not be accurate to 1e-9; above LARGEST nothing would be left of S. A
+# memory of a million touches stays above LEAST.
 LEAST, LARGEST = 1e-4, 0.99
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a readout is solved from: the statistics at one moment, so that solving waits for nobody.
+    """The input of a readout's solution: the statistics at one moment, copied, so that solving needs no lock.
 
     packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
-    shape (C, d). reference: the places of the materials that novelty and calibration rest on. touches: n.
-    times: how many times as far as the formula says the scatter is shrunk.
+    shape (C, d). reference: the places of the materials that novelty and calibration use. touches: n. times: the
+    factor by which the shrinkage of the formula is multiplied.
     """
 
     scale: Scale
@@ -61,7 +61,7 @@ class Task:
         """The task of a scale that has rows. reference: materials, of which those with rows at the scale count."""
         names = statistics.names(scale)
         places = {name: place for place, name in enumerate(names)}
-        # It may be that no sampled touch has rows here: then the first materials that have.
+        # If no sampled touch has rows at this scale, the first materials with rows are the reference.
         known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
         own = np.array(known, dtype=np.intp)
         packed, (counts, sums) = statistics.second(scale).packed(), statistics.totals(scale)
@@ -91,7 +91,7 @@ class Task:
             share = shrinkage(matrix, self.touches, self.times) if like is None else like.share
         places = held_at_first(self.reference, len(self.names))
         means = class_means(self.counts[places], self.sums[places], origin)
-        # Single touches have no scatter: then the nearest mean answers.
+        # Single rows have no scatter: the readout then is the nearest mean.
         spread = trace / dimension * share / (1 - share)
         penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
         matrix[np.diag_indices(dimension)] += penalty
@@ -106,7 +106,7 @@ class Task:
 
 
 def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
-    """ρ, so many times, of a scatter in any unit, (d, d), of which the lower triangle is read, of so many touches."""
+    """ρ times `times`, within bounds. scatter: in any unit, (d, d), of which the lower triangle is read."""
     dimension = len(scatter)
     diagonal = np.diagonal(scatter)
     trace = float(diagonal.sum())

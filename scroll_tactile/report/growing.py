@@ -1,4 +1,4 @@
-"""How answers grow while a touch is felt, of touches that are left out; and when they are decided."""
+"""How the answers to held-out touches change while they are felt, and when they are decided."""
 
 from __future__ import annotations
 
@@ -55,10 +55,11 @@ class Growing:
 
 @dataclass(frozen=True)
 class Soon:
-    """What is said of touches left out after some seconds of each.
+    """How soon held-out touches are decided, and how many of the decisions are wrong.
 
-    seconds: of touch. right: the share of those touched so long whose likeliest material is the true one. decided,
-    wrong: the share of all that are decided by then, and that were decided and are wrong. count: of touches.
+    seconds: of touch, at each moment. right: the share of touches of that length whose likeliest material is the true
+    one. decided, wrong: the share of all touches that are decided by then, and that are decided wrongly. count: the
+    touches.
     """
 
     seconds: tuple[float, ...]
@@ -74,15 +75,15 @@ class Soon:
 
 
 def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float) -> Soon | None:
-    """How soon answers come, by touches left out of which beginnings are judged; None where none are kept for it."""
+    """How soon answers come, by prefixes of held-out touches; None where too few touches were held out."""
     if model.fusion is None or len(model.fusion.trajectories.targets) < FEWEST:
         return None
-    said, moments, rate = model.fusion.trajectories, model.fusion.moments[:-1], extractor.sensor.rate
-    done, wrong = np.zeros(len(said.targets), bool), np.zeros(len(said.targets), bool)
+    held_out, moments, rate = model.fusion.trajectories, model.fusion.moments[:-1], extractor.sensor.rate
+    done, wrong = np.zeros(len(held_out.targets), bool), np.zeros(len(held_out.targets), bool)
     right, decided, mistaken = [], [], []
     for i, moment in enumerate(moments):
         threshold = moment.threshold(false_alarms)
-        chances, novelty = said.chances[:, i], said.novelty[:, i]
+        chances, novelty = held_out.chances[:, i], held_out.novelty[:, i]
         reached = np.isfinite(novelty)
         best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
         for touch in np.flatnonzero(reached & ~done).tolist():
@@ -90,12 +91,12 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
             known = bool(novelty[touch] <= threshold)
             prediction = Prediction(name, chance, ((name, chance),), float(novelty[touch]), known, moment.steps / rate)
             if rule.decided(prediction, moment.steps):
-                done[touch], wrong[touch] = True, not known or best[touch] != said.targets[touch]
-        right.append(float((best == said.targets)[reached].mean()) if reached.any() else 0.0)
+                done[touch], wrong[touch] = True, not known or best[touch] != held_out.targets[touch]
+        right.append(float((best == held_out.targets)[reached].mean()) if reached.any() else 0.0)
         decided.append(float(done.mean()))
         mistaken.append(float(wrong.mean()))
     seconds = tuple(moment.steps / rate for moment in moments)
-    return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(said.targets))
+    return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(held_out.targets))
 
 
 def chosen(held_out: Sequence[HeldOutTouch], keys: Iterable[bytes], camera: bool) -> list[HeldOutTouch]:
@@ -132,9 +133,9 @@ def growing(
     for touch in touches:
         stream = extractor.stream(streams[touch.key])
         with _without(model, touch) as other:
-            said = list(_answers(learner, other, extractor, rule, stream))
-        decided = next((i for i, (columns, at) in enumerate(said) if rule.decided(at, columns)), None)
-        predictions = tuple(prediction for _, prediction in said)
+            answers = list(_answers(learner, other, extractor, rule, stream))
+        decided = next((i for i, (steps, at) in enumerate(answers) if rule.decided(at, steps)), None)
+        predictions = tuple(prediction for _, prediction in answers)
         found.append(Growing(touch.material, tuple(at.seconds for at in predictions), predictions, decided))
     return found
 
@@ -172,13 +173,13 @@ def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:
 def _answers(
     learner: TactileLearner, model: Model, extractor: FeatureExtractor, rule: DecisionRule, stream: Stream
 ) -> Iterator[tuple[int, Prediction]]:
-    """Columns and prediction at the rule's moments, or at some, and at the end."""
+    """Steps and prediction at the rule's moments, or at some parts of the touch, and at its end."""
     sensor, names = learner.sensor, model.names
     first = 1 if sensor.camera and capabilities_of(learner.embedding).rest is not None else 0  # the frame at rest
     parts = CAMERA_PARTS if sensor.camera else PARTS
     counts = {round(part * len(stream)) for part in parts} if len(rule.moments) < 2 else {*rule.moments, len(stream)}
     for count in sorted({min(max(fewest_readings(sensor), first + 1, count), len(stream)) for count in counts}):
-        beginning = stream.first(count / sensor.rate)
-        encoded = extractor.encode(beginning, model.longest, lambda columns: model.scales_for(names, columns))
+        prefix = stream.first(count / sensor.rate)
+        encoded = extractor.encode(prefix, model.longest, lambda steps: model.scales_for(names, steps))
         prediction = answer(model, extractor, names, [(encoded, None)], learner.settings.false_alarms)
         yield encoded.steps, prediction

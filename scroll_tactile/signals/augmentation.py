@@ -40,32 +40,32 @@ def flip(image: Image) -> Image:
 
 
 def resize(image: Image, factor: float) -> Image:
-    """The touch made slower (factor > 1) or faster: T · factor columns, at least one, by linear interpolation.
+    """The touch made slower (factor > 1) or faster: T · factor steps, at least one, by linear interpolation.
 
-    The first and the last column stay. Raises InputError for a factor that is not finite and positive, or another
+    The first and the last step stay. Raises InputError for a factor that is not finite and positive, or another
     image than float32 of shape (…, C, T).
     """
     _require_image(image)
     if not (math.isfinite(factor) and factor > 0):
         raise InputError(f"expected a finite factor above 0 to resize by; came {factor}")
-    columns = image.shape[-1]
-    places = np.linspace(0, columns - 1, max(1, round(columns * factor)))
-    before = np.minimum(places.astype(np.int64), max(columns - 2, 0))
+    steps = image.shape[-1]
+    places = np.linspace(0, steps - 1, max(1, round(steps * factor)))
+    before = np.minimum(places.astype(np.int64), max(steps - 2, 0))
     part = (places - before).astype(np.float32)
-    after = np.minimum(before + 1, columns - 1)
+    after = np.minimum(before + 1, steps - 1)
     resized: Image = image[..., before] * (1 - part) + image[..., after] * part
     return resized
 
 
-def crop(image: Image, start: int, columns: int) -> Image:
-    """The touch made for less long: `columns` columns from `start` on, shape (…, C, columns).
+def crop(image: Image, start: int, steps: int) -> Image:
+    """The touch cut off: `steps` steps from `start` on, shape (…, C, steps).
 
-    Raises InputError for columns that the image has not.
+    Raises InputError for steps that the image has not.
     """
     _require_image(image)
-    if start < 0 or columns < 1 or start + columns > image.shape[-1]:
-        raise InputError(f"expected a stretch of the image's {image.shape[-1]} columns; came {columns} from {start} on")
-    return np.ascontiguousarray(image[..., start : start + columns])
+    if start < 0 or steps < 1 or start + steps > image.shape[-1]:
+        raise InputError(f"expected a stretch of the image's {image.shape[-1]} columns; came {steps} from {start} on")
+    return np.ascontiguousarray(image[..., start : start + steps])
 
 
 def jitter(image: Image, noise: npt.NDArray[np.float32], drift: npt.NDArray[np.float32]) -> Image:
@@ -88,16 +88,16 @@ def jitter(image: Image, noise: npt.NDArray[np.float32], drift: npt.NDArray[np.f
     return jittered
 
 
-def fit(image: Image, columns: int) -> Image:
-    """The image's first `columns` columns; where it has fewer it goes on as its mirror image, back and forth.
+def fit(image: Image, steps: int) -> Image:
+    """The image's first `steps` steps; where it has fewer it goes on as its mirror image, back and forth.
 
-    Raises InputError for less than one column.
+    Raises InputError for less than one step.
     """
     _require_image(image)
-    if columns < 1:
-        raise InputError(f"expected 1 column or more to fit an image to; came {columns}")
+    if steps < 1:
+        raise InputError(f"expected 1 column or more to fit an image to; came {steps}")
     length = image.shape[-1]
-    places = np.arange(columns) % (2 * length)
+    places = np.arange(steps) % (2 * length)
     return np.ascontiguousarray(image[..., np.minimum(places, 2 * length - 1 - places)])
 
 
@@ -105,7 +105,7 @@ def fit(image: Image, columns: int) -> Image:
 class Change:
     """What one augmentation does; `apply` is a function of it and the image.
 
-    flip: whether time is reversed. speed: the factor of `resize`. keep: part of the columns that stays, in (0, 1].
+    flip: whether time is reversed. speed: the factor of `resize`. keep: part of the steps that stays, in (0, 1].
     place: where the rest is cut off, from 0 (all behind) to 1 (all in front). noise: standard deviation of the white
     noise. drift: of the slow offset. seed: of the noise's and the drift's values.
     """
@@ -128,17 +128,17 @@ class Change:
                 f"came {self}"
             )
 
-    def apply(self, image: Image, columns: int | None = None) -> Image:
-        """The changed image, float32 of shape (…, C, T'), in [-1, 1]; of `columns` columns where that is given.
+    def apply(self, image: Image, steps: int | None = None) -> Image:
+        """The changed image, float32 of shape (…, C, T'), in [-1, 1]; T' = `steps` where that is given.
 
-        Cut or continued by `fit` to that width. Raises InputError for another image than float32 of shape (…, C, T).
+        `fit` cuts or continues it to that length. Raises InputError for another image than float32 of shape (…, C, T).
         """
         made = flip(image) if self.flip else image
         made = resize(made, self.speed)
         kept = max(1, round(made.shape[-1] * self.keep))
         made = crop(made, round((made.shape[-1] - kept) * self.place), kept)
-        if columns is not None:
-            made = fit(made, columns)
+        if steps is not None:
+            made = fit(made, steps)
         rng = np.random.default_rng(self.seed)
         slow = rng.standard_normal((*made.shape[:-1], KNOTS), dtype=np.float32) * np.float32(self.drift)
         noise = rng.standard_normal(made.shape, dtype=np.float32) * np.float32(self.noise)
@@ -186,9 +186,9 @@ class Augmentation:
             seed=int(rng.integers(2**63)),
         )
 
-    def augment(self, image: Image, rng: np.random.Generator, *, columns: int | None = None) -> Image:
+    def augment(self, image: Image, rng: np.random.Generator, *, steps: int | None = None) -> Image:
         """The image with all four changes, drawn from `rng`; see `Change.apply`."""
-        return self.draw(rng).apply(image, columns)
+        return self.draw(rng).apply(image, steps)
 
     def streams(self, streams: Sequence[Stream], rng: np.random.Generator) -> list[Stream]:
         """Each of N streams as another touch of its material would have given it, drawn from `rng` for each alone.
@@ -220,14 +220,14 @@ def _long_enough(change: Change, least: int, image: Image) -> Image:
     return made if made.shape[-1] >= least else fit(made, least)
 
 
-def augment(image: Image, rng: np.random.Generator, *, columns: int | None = None) -> Image:
+def augment(image: Image, rng: np.random.Generator, *, steps: int | None = None) -> Image:
     """A tactile image of shape (C, T) as another touch of the same material would have given it.
 
-    All four augmentations at their default strengths, drawn from `rng`; float32 of shape (C, columns) in [-1, 1],
-    without `columns` as wide as its speed and duration make it. Raises InputError for another image than float32 of
-    shape (C, T), or less than one column.
+    All four augmentations at their default strengths, drawn from `rng`; float32 of shape (C, steps) in [-1, 1],
+    without `steps` as wide as its speed and duration make it. Raises InputError for another image than float32 of
+    shape (C, T), or less than one step.
     """
-    return Augmentation().augment(image, rng, columns=columns)
+    return Augmentation().augment(image, rng, steps=steps)
 
 
 def _require_image(image: Image) -> None:

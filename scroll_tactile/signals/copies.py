@@ -20,7 +20,7 @@ from scroll_tactile.signals.augmentation import Image, crop, resize
 
 __all__ = ["Augmented", "require_augmentable"]
 
-FEWEST = 2  # columns of a copy, however fast it is
+FEWEST = 2  # steps of a copy, however fast it is
 
 
 class Augmented(ValidatedFields):
@@ -54,9 +54,9 @@ class Augmented(ValidatedFields):
     def _paced(self, image: Image, pace: float) -> Image:
         faster = pace > 1 / 3
         factor = 1 + ((3 * pace - 1) / 2 if faster else 3 * pace) * (self.speed - 1)
-        columns = image.shape[1]
-        copy = resize(image, max(1 / factor if faster else factor, FEWEST / columns))
-        return crop(copy, 0, min(columns, copy.shape[1]))
+        steps = image.shape[1]
+        copy = resize(image, max(1 / factor if faster else factor, FEWEST / steps))
+        return crop(copy, 0, min(steps, copy.shape[1]))
 
 
 def require_augmentable(sensor: Sensor, augmentation: Augmented | None) -> None:

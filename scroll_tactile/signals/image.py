@@ -31,12 +31,12 @@ def tactile_image(stream: Stream, rest: npt.NDArray[np.float32] | None = None) -
     """Lay a stream out as an image of shape (C, T): float32, C-contiguous, without unit.
 
     The sensor's range [low, high], of each channel where it has its own, is mapped to [-1, 1]. A sensor's n channels
-    are the rows, its T readings the columns.
+    are the rows, its T readings the steps of time.
 
     A camera's frames are scanned as if they slid past: each is reduced by area averaging to at most 120 × 160,
     its columns follow one another on the time axis, frame after frame, and its rows × 3 colours are the
     channels. So C = 360 and T = 160 a frame for a GelSight, and an embedding that reads along time reads
-    texture across the frame. With a resting image, shape (height, width, 3), what is shown is the difference from it:
+    texture across the frame. With a resting image, shape (height, width, 3), the image shows the difference from it:
     half the range brighter is 1, half darker −1.
     """
     readings = _scan(stream.readings) if stream.sensor.camera else stream.readings
@@ -94,23 +94,23 @@ def _average(pixels: npt.NDArray[np.floating], size: int) -> npt.NDArray[np.floa
     return (sums - divided[:-1] + divided[1:]) * (size / length)
 
 
-def stretched(image: Image, columns: int) -> Image:
-    """An image (C, T) at so many columns, by linear interpolation: float32 of shape (C, columns).
+def stretched(image: Image, steps: int) -> Image:
+    """An image (C, T) resampled to so many steps of time by linear interpolation: float32 of shape (C, steps).
 
-    The first and the last column stay; an image of one column is repeated.
+    The first and the last step stay; an image of one step is repeated.
     """
-    before, part = np.divmod(np.arange(columns) * (image.shape[1] - 1), max(columns - 1, 1))
+    before, part = np.divmod(np.arange(steps) * (image.shape[1] - 1), max(steps - 1, 1))
     after = np.minimum(before + 1, image.shape[1] - 1)
-    weight = (part / max(columns - 1, 1)).astype(np.float32)
+    weight = (part / max(steps - 1, 1)).astype(np.float32)
     blended: Image = image[:, before] * (1 - weight) + image[:, after] * weight
     return blended
 
 
 def shape_image(image: Image) -> Image:
-    """Changes between columns above deviations from each channel's mean, companded: (C, T) to (2 C, T), in [-1, 1]."""
-    fine, columns = np.rint(image * FINE).astype(np.int64), image.shape[1]  # sums of float32 would be rounded
+    """Changes between steps above deviations from each channel's mean, companded: (C, T) to (2 C, T), in [-1, 1]."""
+    fine, steps = np.rint(image * FINE).astype(np.int64), image.shape[1]  # sums of float32 would be rounded
     changes = np.diff(fine, axis=1, prepend=fine[:, :1])
-    means = (2 * fine.sum(axis=1, keepdims=True) + columns) // (2 * columns)  # halves up, whatever the offset
+    means = (2 * fine.sum(axis=1, keepdims=True) + steps) // (2 * steps)  # halves up, whatever the offset
     return _companded(np.concatenate([changes, fine - means]) / FINE)
 
 

@@ -1,4 +1,4 @@
-"""Windows and views: what of a stream is embedded, at a few scales.
+"""Windows and views: the parts of a stream that are embedded, at a few scales.
 
 An embedding of a whole stream is lost when a touch is shorter or longer than those learned from. So a stream is read in
 windows of 0.3 s and of three quarters of the usual duration, and each of these scales has statistics of its own. A
@@ -37,7 +37,7 @@ __all__ = [
     "scales",
     "scored",
     "stages",
-    "whole_columns",
+    "whole_steps",
 ]
 
 SHORTEST = 0.3  # seconds
@@ -45,10 +45,10 @@ LONGEST = 0.75  # of the usual duration: a usual touch has several windows of it
 ENOUGH = 0.65  # of a window: a touch half the usual one is read with the kernels of the wide windows as far as it goes
 FEWEST = 9  # readings in a window, the taps of one kernel
 MOST_WINDOWS = 64  # of a scale in one stream: a touch of hours is sampled evenly, at bounded cost
-MOST_COLUMNS = 1024  # of a whole touch: what is finer than a thousandth of it is for windows
-FRAMES = 160  # columns of a camera's frame in its tactile image, at most
+MOST_STEPS = 1024  # of a whole touch: windows read what is finer than a thousandth of it
+FRAMES = 160  # steps of a camera's frame in its tactile image, at most: the columns of its pixels
 
-Extent = dict[int, list[int]]  # width of windows → their first columns
+Extent = dict[int, list[int]]  # width of windows → their first steps
 
 VIEWS = {"whole": 2**20, "shape": 2**20 + 1, "competing": 2**20 + 2}  # their numbers on disk: no window is as wide
 
@@ -60,7 +60,7 @@ ScaleKind = Literal["window", "whole", "shape", "competing"]
 class Scale:
     """A kind of features that has statistics of its own.
 
-    kind: "window" for windows of `width` columns; without a width the views of a whole touch: "whole" for it as it is,
+    kind: "window" for windows of `width` steps; without a width the views of a whole touch: "whole" for it as it is,
     "competing" for it read by competing kernels, "shape" for what `signals.image` makes of it.
 
     Scales are ordered by their number, which names their arrays on disk; `str` and `int` of a scale give it. A window's
@@ -101,7 +101,7 @@ def measuring(scales: Sequence[Scale]) -> list[int]:
 
 
 def scales(sensor: Sensor) -> tuple[int, ...]:
-    """The widths of windows in columns of the tactile image, ascending: BioTac (30, 300), RoboSkin (15, 56).
+    """The widths of windows in steps of time of the tactile image, ascending: BioTac (30, 300), RoboSkin (15, 56).
 
     A camera has one: a frame. So has a sensor whose touches are too short for two.
     """
@@ -114,37 +114,37 @@ def scales(sensor: Sensor) -> tuple[int, ...]:
     return (shortest, longest) if two else (shortest,)
 
 
-def whole_columns(sensor: Sensor) -> int:
-    """The columns that a whole touch is stretched to, those of a usual one within bounds; 0 for a camera: no views."""
-    return 0 if sensor.camera else min(max(sensor.readings, FEWEST), MOST_COLUMNS)
+def whole_steps(sensor: Sensor) -> int:
+    """How many steps a whole touch is resampled to: those of a default one, within bounds. 0 for a camera: no views."""
+    return 0 if sensor.camera else min(max(sensor.readings, FEWEST), MOST_STEPS)
 
 
 @lru_cache(maxsize=1024)  # asked three times a touch
-def extent(columns: int, widths: tuple[int, ...], *, partial: bool = True, frames: bool = False) -> Extent:
-    """The windows that are read of a touch of so many columns, at every scale that fits.
+def extent(steps: int, widths: tuple[int, ...], *, partial: bool = True, frames: bool = False) -> Extent:
+    """The windows that are read of a touch of so many steps, at every scale that fits.
 
     The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
-    rests on: their steps grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
+    rests on: their strides grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
     few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A touch that is shorter than a scale, but not
     much, is one window of it, if windows may be `partial`; of the shortest scale every touch is. A camera's windows are
     its `frames`, and lie across no two of them.
     """
     return {
-        width: _thinned(range(0, max(1, columns - width + 1), width))
+        width: _thinned(range(0, max(1, steps - width + 1), width))
         if frames
-        else _starts(columns, width, dense=width == widths[0])
-        for width in fitting(columns, widths, partial=partial)
+        else _starts(steps, width, dense=width == widths[0])
+        for width in fitting(steps, widths, partial=partial)
     }
 
 
-def fitting(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
-    """The widths of which a touch of so many columns has a window."""
+def fitting(steps: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
+    """The widths of which a touch of so many steps has a window."""
     enough = ENOUGH if partial else 1.0
-    return [width for width in widths if width == widths[0] or columns >= enough * width]
+    return [width for width in widths if width == widths[0] or steps >= enough * width]
 
 
-def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
-    room = max(0, columns - width)
+def _starts(steps: int, width: int, *, dense: bool) -> list[int]:
+    room = max(0, steps - width)
     if not dense:
         return _thinned(range(0, room + 1, max(1, width // 6, min(width // 2, room // 2))))
     begin = [0]
@@ -155,16 +155,16 @@ def _starts(columns: int, width: int, *, dense: bool) -> list[int]:
 
 
 def _thinned(rest: range, begin: Sequence[int] = ()) -> list[int]:
-    """At most MOST_WINDOWS of them, evenly, of `begin` and then the rest: of hours it is long."""
+    """At most MOST_WINDOWS first steps, evenly spaced among `begin` and then `rest`, long where a touch lasts hours."""
     count = len(begin) + len(rest)
     places = np.linspace(0, count - 1, MOST_WINDOWS).round().astype(int) if count > MOST_WINDOWS else range(count)
     return [begin[place] if place < len(begin) else rest[place - len(begin)] for place in map(int, places)]
 
 
 def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:
-    """Width → places of the windows whose scores are averaged when the first `length` columns have been observed.
+    """Width → places of the windows whose scores are averaged when the first `length` steps have been observed.
 
-    Those that lie within it; of the shortest only such as begin at least half a width after the one before:
+    They lie within it. A window of the shortest width also begins at least half a width after the one before:
     otherwise the densely read beginning would count for more than the rest.
     """
     widths = tuple(sorted(extent))
@@ -192,10 +192,10 @@ def milestones(widths: tuple[int, ...], *, partial: bool = True) -> tuple[int, .
     return tuple(sorted({*fit, *between}))
 
 
-def stages(columns: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
+def stages(steps: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
     """The lengths of a touch's stages: the milestones that it reached, the last replaced by its own length."""
-    reached = [length for length in milestones(widths, partial=partial) if length <= columns]
-    return [*reached[:-1], columns]
+    reached = [length for length in milestones(widths, partial=partial) if length <= steps]
+    return [*reached[:-1], steps]
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class WindowPlan:
 
     widths: of windows, ascending. partial: whether a touch of 0.65 of a wide window or more is read as far as it goes.
     judged: "all" scales that fit a touch, or the "widest" of them alone. shrinkage: how many times as far as the
-    formula says readouts are shrunk. frames: whether windows are a camera's frames. whole: the columns that a whole
+    formula says readouts are shrunk. frames: whether windows are a camera's frames. whole: the steps that a whole
     touch is stretched to for the views of it; 0 where there are none. competes: whether competing kernels read it, too.
     """
 
@@ -233,23 +233,23 @@ class WindowPlan:
         """All scales, ascending by number: windows, then views."""
         return self.windows + self.views
 
-    def extent(self, columns: int) -> Extent:
-        """The windows that are read of a touch of so many columns."""
-        return extent(columns, self.widths, partial=self.partial, frames=self.frames)
+    def extent(self, steps: int) -> Extent:
+        """The windows that are read of a touch of so many steps."""
+        return extent(steps, self.widths, partial=self.partial, frames=self.frames)
 
     def judging(self, length: int) -> list[Scale]:
-        """The windows that judge when so many columns have been observed; the views always do."""
+        """The windows that judge when so many steps have been observed; the views always do."""
         fit = fitting(length, self.widths, partial=self.partial)
         chosen = fit[-1:] if self.judged == "widest" else fit
         return [Scale("window", width) for width in chosen]
 
-    def scored(self, columns: int, length: int) -> dict[Scale, list[int]]:
-        """Of a touch of so many columns: scale → places of the windows that judge after the first `length`."""
-        places = scored(self.extent(columns), length, partial=self.partial)
+    def scored(self, steps: int, length: int) -> dict[Scale, list[int]]:
+        """Scale → places of the windows that judge a touch of so many steps after the first `length` of them."""
+        places = scored(self.extent(steps), length, partial=self.partial)
         return {scale: places[scale.width] for scale in self.judging(length)}
 
-    def scored_stages(self, columns: int) -> list[dict[Scale, list[list[int]]]]:
-        """For each stage that a touch of so many columns reached: scale → places of the windows that judge there.
+    def scored_stages(self, steps: int) -> list[dict[Scale, list[list[int]]]]:
+        """For each stage that a touch of so many steps reached: scale → places of the windows that judge there.
 
         The views judge a touch as a whole, at its last stage. Places come in groups, each learned as its mean: the
         narrow windows together, wide ones and a camera's frames one by one. One of these may be all that is judged: of
@@ -260,27 +260,27 @@ class WindowPlan:
         def grouped(scale: Scale, places: list[int]) -> list[list[int]]:
             return [[place] for place in places] if self.frames or scale.width > self.widths[0] else [places]
 
-        stages = [self.scored(columns, length) for length in self.stages(columns)]
+        stages = [self.scored(steps, length) for length in self.stages(steps)]
         groups = [{scale: grouped(scale, places) for scale, places in stage.items()} for stage in stages]
         groups[-1] |= {view: [[0]] for view in self.views}
         return groups
 
-    def places(self, columns: int) -> dict[Scale, list[int]]:
-        """Of a touch of so many columns: scale → places of the windows whose codes are averaged, at every scale."""
-        return dict(_places(self, columns))
+    def places(self, steps: int) -> dict[Scale, list[int]]:
+        """Scale → places of the windows of a touch of so many steps whose codes are averaged, at every scale."""
+        return dict(_places(self, steps))
 
     def milestones(self) -> tuple[int, ...]:
         """The lengths at which a touch reaches its stages."""
         return milestones(self.widths, partial=self.partial)
 
-    def stages(self, columns: int) -> list[int]:
+    def stages(self, steps: int) -> list[int]:
         """The lengths of a touch's stages, the last its own."""
-        return stages(columns, self.widths, partial=self.partial)
+        return stages(steps, self.widths, partial=self.partial)
 
 
 @lru_cache(maxsize=1024)
-def _places(plan: WindowPlan, columns: int) -> Mapping[Scale, list[int]]:
+def _places(plan: WindowPlan, steps: int) -> Mapping[Scale, list[int]]:
     """See `WindowPlan.places`."""
-    places = scored(plan.extent(columns), columns, partial=plan.partial)
+    places = scored(plan.extent(steps), steps, partial=plan.partial)
     windows = {Scale("window", width): chosen for width, chosen in places.items()}
     return windows | {view: [0] for view in plan.views}

@@ -1,4 +1,4 @@
-"""Codes: features rounded to a fixed grid, so that their sums are exact integers."""
+"""Codes: quantised features, integers in units of a fixed grid, so that their sums are exact."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def to_codes(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
 
 
 def in_units(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np.float64]:
-    """Features in the codes' unit, bound · 2⁻²⁰, not rounded; float64 of the same shape. Raises as `to_codes`."""
+    """Features in grid units, bound · 2⁻²⁰, not rounded; float64 of the same shape. Raises as `to_codes`."""
     scaled: npt.NDArray[np.float64] = np.multiply(features, 2.0**BITS / bound, dtype=np.float64)
     largest = np.abs(scaled).max(initial=0.0)
     if not largest <= 2.0**BITS:

@@ -65,17 +65,17 @@ class Statistics:
 
     @property
     def longest(self) -> int:
-        """The columns of the longest touch that is in it, 0 where there is none."""
+        """The length of the longest touch in steps, 0 where there is none."""
         return max(self._lengths, default=0)
 
     @property
-    def usual_least(self) -> int:
-        """The columns that nineteen of twenty touches have, 0 where there is none: less may be a beginning."""
+    def fifth_percentile_length(self) -> int:
+        """The 5th percentile of the touches' lengths in steps, 0 without touches: a shorter touch may be a prefix."""
         shorter = 0
-        for columns, touches in sorted(self._lengths.items()):
+        for steps, touches in sorted(self._lengths.items()):
             shorter += touches
             if 20 * shorter >= self.touches:
-                return columns
+                return steps
         return 0
 
     def add(self, material: str, codes: Codes, columns: int = 0) -> None:

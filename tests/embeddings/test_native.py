@@ -195,7 +195,7 @@ UNFIT = {
         "distances", ROW, np.zeros((1, 4), np.int16), np.ones(5, bool), np.zeros(2, np.int64), np.zeros(2, np.int64),
     ),
     "a guess that overflows": (
-        "distances", ROW, np.full((1, 5), 2049, np.int16), np.ones(5, bool), np.zeros(2, np.int64), np.zeros(2, np.int64),
+        "distances", ROW, np.int16([[2049] * 5]), np.ones(5, bool), np.zeros(2, np.int64), np.zeros(2, np.int64),
     ),
     "more rows than there are": (
         "distances", ROW, np.zeros((1, 5), np.int16), np.ones(5, bool), np.zeros(3, np.int64), np.zeros(3, np.int64),

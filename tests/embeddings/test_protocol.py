@@ -8,7 +8,7 @@ import pytest
 from scroll_tactile import Capabilities, Frames, Joined, Kernels, TactileLearner, sensors
 from scroll_tactile.embeddings.protocol import capabilities_of, embed_windows, parts_of, require_rest, window_plan
 from scroll_tactile.errors import EmbeddingError, InputError
-from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, whole_columns
+from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, whole_steps
 from scroll_tactile.testing import check_embedding
 
 
@@ -74,7 +74,7 @@ def test_the_plan_of_windows_follows_what_is_declared():
     assert window_plan(sensors.BIOTAC, joined) == views
     assert window_plan(sensors.BIOTAC, Joined(Kernels(dimension=64), Plain())).views == ()
     assert window_plan(sensors.GELSIGHT, Frames()).views == ()  # of cameras none
-    assert whole_columns(sensors.GELSIGHT) == 0
+    assert whole_steps(sensors.GELSIGHT) == 0
 
 
 def test_an_embedding_of_frames_is_refused_to_a_sensor_of_channels():

@@ -83,7 +83,7 @@ def prepared(home: Path, others: dict[str, State]) -> list[Memory]:
     learner = opened(path)
     for operation in HISTORY:
         if operation == ("checkpoint",):
-            learner._ledger._snapshot()
+            learner._ledger._write_checkpoint()
             continue
         state, result = after(states[-1], operation, others)
         assert perform(learner, operation, home) == result

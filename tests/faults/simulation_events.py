@@ -122,7 +122,7 @@ class OneMemory(World):
         def between() -> None:
             learner.observe(observation[1], KIT.stream(observation[2]), again=True)
             learner._ledger.require_writing()  # passes over the failure of an earlier checkpoint
-            learner._ledger._snapshot()
+            learner._ledger._write_checkpoint()
 
         def do() -> str:
             with interleaved(place, between):

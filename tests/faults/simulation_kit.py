@@ -61,7 +61,7 @@ def prepare() -> None:
     KIT.embeddings = {name: Tiny(name) for name in ("own", "other")}
     KIT.settings = {"sensor": PAD, "exemplars": 1, "kept_touches": 3, "embedding": KIT.embeddings["own"]}
     scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]
-    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY = SNAPSHOT_EVERY
     worked, known = FeatureExtractor.codes, dict[Any, Any]()
 
     def codes(self: FeatureExtractor, image: Any, key: bytes) -> Any:

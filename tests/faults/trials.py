@@ -21,7 +21,7 @@ SUCCESS = "success"
 
 def checkpoints_every(rows: int) -> None:
     """From here on, a memory in this process writes a checkpoint behind its back every so many rows."""
-    scroll_tactile.persistence.open_memory.SNAPSHOT_EVERY = rows
+    scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY = rows
 
 
 def copied(path: Path, to: Path) -> None:

@@ -39,7 +39,7 @@ def test_a_compaction_checkpoint_that_all_is_begun_from_again_has_what_was_said_
     learner.compact(keep=4)  # what was said comes behind it
     learner.describe("a", None)
     store = learner._ledger.store
-    learner._ledger._snapshot()
+    learner._ledger._write_checkpoint()
     compaction = store.compaction().number
     store.close()  # as if the power failed
     for folder in (path / "checkpoints").iterdir():

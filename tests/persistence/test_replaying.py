@@ -120,7 +120,7 @@ def test_a_reader_takes_an_f_star_where_it_is_another_one(tmp_path):
             assert reader.tuned_digest() == writer.tuned_digest() is not None
             tuned = reader.memory.tuned
             observe(writer, [("a", (9, 60))])
-            writer._ledger._snapshot()
+            writer._ledger._write_checkpoint()
             assert reader.refresh()
             assert reader.memory.tuned is tuned
             writer.fine_tune(epochs=1)
@@ -148,7 +148,7 @@ def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_p
 
 @pytest.mark.parametrize("made", ["kernels", "maps"], indirect=True)
 def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(open_memory, "SNAPSHOT_EVERY", 5)
+    monkeypatch.setattr(open_memory, "CHECKPOINT_EVERY", 5)
     killed = TactileLearner.open(tmp_path / "m", **made)
     observe(killed, OBSERVED)
     killed._ledger.store.close()

@@ -299,7 +299,7 @@ def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
     draft = Draft.of(learner.memory, "lda")
     for seed in range(12):
         learner.observe("a", touch("a", 60 + seed, 20))
-    assert learner.memory.statistics.usual_least == 20
+    assert learner.memory.statistics.fifth_percentile_length == 20
     assert draft.fit(learner._predictor.extractor).least == other.model().least == 50
 
 

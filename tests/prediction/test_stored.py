@@ -243,7 +243,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
         forge(path, change)
         with opened(path) as learner:
             model = learner._predictor.current
-            model._look(learner._ledger)
+            model._load_stored(learner._ledger)
             if model._model is None:
                 refused += 1
             else:

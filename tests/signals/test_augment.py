@@ -134,10 +134,10 @@ def test_strengths_do_not_change_what_is_drawn_after():
 def test_by_default_touches_change_and_only_by_the_generator_given():
     state = np.random.get_state()[1].tobytes()  # noqa: NPY002 - it is the one that must not be drawn from
     rng = np.random.default_rng(0)
-    first, second = augment(RAMP, rng, columns=40), augment(RAMP, rng, columns=40)
+    first, second = augment(RAMP, rng, steps=40), augment(RAMP, rng, steps=40)
     assert first.shape == second.shape == (2, 40)
     assert first.tobytes() != second.tobytes()
-    assert augment(RAMP, np.random.default_rng(0), columns=40).tobytes() == first.tobytes()
+    assert augment(RAMP, np.random.default_rng(0), steps=40).tobytes() == first.tobytes()
     assert np.random.get_state()[1].tobytes() == state  # noqa: NPY002
 
 

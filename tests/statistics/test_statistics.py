@@ -285,7 +285,7 @@ lengths = st.lists(st.sampled_from([1, 2, 9, 9, 40, 50, 400, 10**6]), max_size=6
 @few
 @given(lengths, lengths)
 @example([1, *[9] * 19], [9])
-def test_the_usual_least_is_the_length_that_nineteen_of_twenty_touches_have(first, second):
+def test_the_fifth_percentile_is_the_length_that_nineteen_of_twenty_touches_have(first, second):
     def observed(columns):
         statistics = Statistics(DIMENSION, SCALES)
         for i, length in enumerate(columns):
@@ -298,14 +298,14 @@ def test_the_usual_least_is_the_length_that_nineteen_of_twenty_touches_have(firs
         return max(had, default=0)
 
     a, b = observed(first), observed(second)
-    assert a.usual_least == least(first)
-    assert (a + b).usual_least == least(first + second)
-    assert ((a + b) - b).usual_least == least(first)
+    assert a.fifth_percentile_length == least(first)
+    assert (a + b).fifth_percentile_length == least(first + second)
+    assert ((a + b) - b).fifth_percentile_length == least(first)
     arrays, names = a.to_arrays()
-    assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).usual_least == least(first)
+    assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).fifth_percentile_length == least(first)
     for i, length in enumerate(first[:5]):
         a.remove("ab"[i % 2], {5: np.zeros((1, DIMENSION), np.int32)}, length)
-    assert a.usual_least == least(first[5:])
+    assert a.fifth_percentile_length == least(first[5:])
 
 
 def test_sums_that_need_more_than_32_bits_are_exact_and_can_be_undone():

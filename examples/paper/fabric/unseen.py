@@ -47,7 +47,7 @@ class UnseenHead:
     error: float
 
     def __call__(self, mean: FloatArray) -> int:
-        """The value that a touch feels like; mean: its mean features in the codes' unit, (d,). Ties go to the first."""
+        """The value that a touch feels like; mean: its mean features in grid units, (d,). Ties go to the first."""
         return self.values[int(np.argmax((mean - self.origin) @ self.weights + self.offsets))]
 
 

@@ -146,7 +146,7 @@ class TrainedNetwork:
             augmentation = self._augmentation
 
             def drawn(places: npt.NDArray[np.intp]) -> torch.Tensor:
-                changed = [augmentation.augment(images[i], random, columns=columns) for i in places]
+                changed = [augmentation.augment(images[i], random, steps=columns) for i in places]
                 return torch.from_numpy(np.stack([self._read(image) for image in changed])).to(self._device)
 
             return Batches(drawn, targets)

@@ -119,7 +119,7 @@ class Destination:
     def _save(self) -> None:
         ledger = None if self.learner is None else self.learner._ledger
         if ledger is not None:
-            ledger.save_behind(SAVED_EVERY)
+            ledger.checkpoint_in_background(SAVED_EVERY)
 
     def close(self) -> None:
         """Write a checkpoint, and close it. Raises InputError where nothing was learned; it is not there then."""

@@ -16,6 +16,7 @@ from store_builds import (
     damage,
     flip,
     folders,
+    in_turns,
     newest,
     same_arrays,
     state,
@@ -55,7 +56,7 @@ HARMS = {
 }
 
 
-@pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
+@pytest.mark.parametrize(("which", "harm"), in_turns(HARMS), ids=HARMS, indirect=["which"])
 def test_what_is_lost_with_it_is_nothing(either, which, harm):
     harm(either / "CURRENT")
     before = contents(either)
@@ -163,40 +164,29 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
         assert (opened.last, opened.latest()) == (LAST, None)
 
 
+def refuses_the_format(path):
+    before = contents(path)
+    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
+        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
+            call(path)
+    assert contents(path) == before
+
+
 @pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
 def test_a_newer_format_is_refused_and_not_touched(either, more):
     set_current(either, format=2, **more)
-    before = contents(either)
-    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
-        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
-            call(either)
-    assert contents(either) == before
+    refuses_the_format(either)
     flip(either / "CURRENT", -20)  # and where that is not what was written, nothing is said of a format
     with pytest.raises(DamageError):
         Store.open(either)
 
 
 def test_a_newer_log_is_refused_and_not_touched(plain):
-    file = log_of(plain)
-    data = bytearray(file.read_bytes())
+    data = bytearray(log_of(plain).read_bytes())
     data[6] = 2
     data[72:88] = payload_digest(bytes(data[:72]))
-    file.write_bytes(data)
-    before = contents(plain)
-    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
-        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
-            call(plain)
-    assert contents(plain) == before
-
-
-def test_a_memory_of_a_release_before_the_log_is_told_from_another_folder(tmp_path):
-    (tmp_path / "journal.sqlite").write_bytes(b"SQLite format 3\0" * 300)
-    (tmp_path / "generations" / "00000001").mkdir(parents=True)
-    before = contents(tmp_path)
-    for call in (lambda path: Store.open(path, identity={}), check_store, repair_store):
-        with pytest.raises(VersionError, match=r"made by a release 0\.x, .* learn it again from the recordings"):
-            call(tmp_path)
-    assert contents(tmp_path) == before
+    log_of(plain).write_bytes(data)
+    refuses_the_format(plain)
 
 
 def test_a_memory_of_the_first_releases_with_a_log_is_refused_by_name_and_not_touched(plain):
@@ -276,21 +266,6 @@ def test_wherever_it_is_cut_the_batch_behind_the_checkpoint_is_there_or_not_and_
                 assert [head.sequence for head in opened.heads()] == list(range(1, expected + 2))
 
 
-def test_an_older_frame_behind_the_end_is_damage_that_can_be_repaired(plain):
-    """Nothing can be read behind it: its number was long ago."""
-    file, frame = log_of(plain), frames_of(plain)[18]
-    data = file.read_bytes()
-    file.write_bytes(data + data[frame.offset : frame.end])
-    with pytest.raises(DamageError, match="repair the store"):
-        Store.open(plain)
-    with Store.open(plain, mode="read") as opened:
-        for _ in range(3):
-            assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
-    assert "damaged" in damage(plain)[0].what
-    assert repair_store(plain).kept == LAST
-    assert is_whole(plain, 0)
-
-
 def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):
     write_log(plain, [b"no row"])
     with pytest.raises(DamageError, match="no row"):
@@ -300,12 +275,3 @@ def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):
     assert damage(plain)
     assert repair_store(plain).kept == 15
     assert folders(plain) == ["00000001"]
-
-
-def test_a_log_of_holes_is_refused_at_once(plain):
-    with log_of(plain).open("r+b") as file:
-        file.truncate(2**43)
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match="are on the disk"):
-            Store.open(plain, mode=mode)
-    assert "are on the disk" in damage(plain)[0].what

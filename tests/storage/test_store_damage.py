@@ -120,15 +120,14 @@ SPOIL = {
 
 
 @pytest.mark.parametrize(("harm", "said"), SPOIL.values(), ids=SPOIL)
-@pytest.mark.parametrize("mode", ["read", "write"])
-def test_a_spoilt_checkpoint_is_named_and_the_compaction_checkpoint_taken(compacted, harm, said, mode, caplog):
+def test_a_spoilt_checkpoint_is_named_and_the_compaction_checkpoint_taken(compacted, harm, said, caplog):
     folder = newest(compacted)
     harm(folder)
     problems = check_store(compacted)
     assert said in " ".join(problem.what for problem in problems)
     assert all(problem.path.is_relative_to(folder) and str(problem.path) in problem.what for problem in problems)
     assert {problem.kind for problem in problems} == {"spare"}
-    with Store.open(compacted, mode=mode) as opened, caplog.at_level(logging.WARNING):
+    with Store.open(compacted) as opened, caplog.at_level(logging.WARNING):
         found = opened.latest()
     assert found.last_sequence == 6
     assert same_arrays(found.arrays, state(6))

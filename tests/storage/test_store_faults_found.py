@@ -2,11 +2,9 @@
 
 import errno
 import os
-import sys
-from pathlib import Path
 
 import pytest
-from forging import get_current, log_of, set_current, spoil_row
+from forging import get_current, log_of, set_current
 
 import store.archive
 import store.backup
@@ -22,16 +20,6 @@ def path(tmp_path):
         for i in range(3):
             store.append("kind", "label", bytes([i]), attributes={"i": i})
     return tmp_path / "s"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_a_check_leaves_no_file_open(path):
-    for damage in (False, True):
-        if damage:
-            spoil_row(path, 2, head=True)
-        check_store(path)
-        opened = [os.path.realpath(file) for file in Path("/proc/self/fd").iterdir()]
-        assert not [name for name in opened if name.startswith(str(path))]
 
 
 @pytest.mark.parametrize("module", [store.archive, store.backup], ids=["a reader", "a backup"])

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from forging import log_of
 from logs import ends as ends_of
-from store_builds import damage, flip, flip_row
+from store_builds import as_after_a_crash, damage, flip, flip_row
 
 from store import DamageError, Store, check_store, repair_store
+from store.framing import FRAME_BYTES
 from store.layout import CURRENT_FILE, log_path, read_current, write_current
 
 
@@ -74,6 +75,27 @@ def test_a_log_that_had_a_row_and_has_none_is_damaged_though_nobody_closed_it(tm
     path = crashed(tmp_path / "s", 3)
     cut(log_path(path, 1), ends(log_path(path, 1))[0])
     require_named(path, 1, 0)
+
+
+@pytest.mark.parametrize("by", [1, FRAME_BYTES, FRAME_BYTES + 1])
+def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, by):
+    with Store.open(tmp_path / "s", identity={}) as store:
+        for label in "ab":
+            store.append("add", label, b"")
+        store.commit({}, last_sequence=2)
+        store.append("add", "behind it", b"")
+        path = as_after_a_crash(store, tmp_path / "crashed")
+    cut(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
+    with pytest.raises(DamageError, match="repair the store"):
+        Store.open(path)
+    with Store.open(path, mode="read") as store:
+        assert store.last == 2
+        with pytest.raises(DamageError, match="row 2 is missing"):
+            list(store.records())
+    # Without the commit frame alone the row is whole, and the place tells of what is behind it.
+    assert [problem.kind for problem in damage(path)] == ["spare" if by <= FRAME_BYTES else "lost", "spare"]
+    assert repair_store(path).kept == 2
+    assert damage(path) == []
 
 
 def test_the_end_of_a_log_that_nobody_closed_may_be_torn_and_the_rows_before_it_are_there(tmp_path):

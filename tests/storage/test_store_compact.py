@@ -50,10 +50,6 @@ def opened(made, tmp_path):
         yield copy
 
 
-def path_of(file):
-    return str(Path(f"/proc/self/fd/{file}").readlink())
-
-
 def open_files():
     return len(list(Path("/proc/self/fd").iterdir()))
 
@@ -189,23 +185,6 @@ def test_whatever_rename_fails_all_that_was_acknowledged_is_there(made, tmp_path
             assert agrees(again, again.compacted)
             assert add(again, LAST + 1) == LAST + 1
         assert check_store(left) == []
-
-
-def test_what_another_log_needs_is_durable_before_the_first_is_removed(opened, monkeypatch):
-    """A power cut may undo whatever was not synced, in any order."""
-    events = []
-    sync, replace, unlink = os.fsync, os.replace, os.unlink
-    monkeypatch.setattr(os, "fsync", lambda file: (events.append(path_of(file)), sync(file)))
-    monkeypatch.setattr(os, "replace", lambda old, new: (events.append(("to", str(new))), replace(old, new)))
-    monkeypatch.setattr(os, "unlink", lambda path, **_: (events.append(("gone", str(path))), unlink(path, **_)))
-    home, first = str(opened.path), str(log_of(opened.path))
-    compact(opened, 5)
-    named, gone = events.index(("to", f"{home}/CURRENT")), events.index(("gone", first))
-    assert home in events[named:gone]
-    log = events.index(("to", f"{home}/log-00000002"))
-    assert home in events[log:named]
-    assert {f"{home}/log-00000002.new", f"{home}/CURRENT.new"} <= set(events[:named])
-    assert f"{home}/checkpoints" in events[:named]
 
 
 def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):

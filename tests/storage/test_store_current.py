@@ -10,7 +10,6 @@ from store_builds import (
     IDENTITY,
     LAST,
     add,
-    as_after_a_crash,
     commit,
     contents,
     damage,
@@ -24,9 +23,7 @@ from store_builds import (
 )
 
 from store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
-from store.framing import FRAME_BYTES
 from store.layout import log_path
-from store.log import LogReader
 from store.records import payload_digest
 
 
@@ -205,65 +202,6 @@ def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
         Store.open(tmp_path, mode="read")
     with Store.open(tmp_path, identity={"a": 2}) as opened:
         assert opened.identity == {"a": 2}
-
-
-# Logs that end early, or too late.
-
-
-@pytest.fixture(scope="module")
-def crashed(tmp_path_factory):
-    """A store as a killed writer left it: a checkpoint up to row 4 and one batch behind it, of two rows."""
-    home = tmp_path_factory.mktemp("crashed")
-    with Store.open(home / "s", identity=IDENTITY) as opened:
-        for number in range(1, 5):
-            opened.append("a", f"row {number}", b"")
-        opened.commit({}, last_sequence=4)
-        with opened.batch():
-            opened.append("a", "row 5", b"")
-            opened.append("a", "row 6", b"")
-        as_after_a_crash(opened, home / "c")
-    return home / "c"
-
-
-def test_wherever_it_is_cut_the_batch_behind_the_checkpoint_is_there_or_not_and_no_row_of_it_is_lost_unnamed(
-    crashed, tmp_path
-):
-    path = shutil.copytree(crashed, tmp_path / "s")
-    place, begin = get_current(crashed)["newest"]["place"][0], frames_of(crashed)[4].offset
-    with LogReader(log_of(crashed)) as log:
-        for _ in log.refresh():
-            end = log.place.offset
-    whole, current = log_of(path).read_bytes(), (path / "CURRENT").read_bytes()
-    ends = {place, place - FRAME_BYTES, end}
-    near = {at + by for at in ends for by in (-1, 0, 1)}
-    for cut in sorted({*range(begin, end, 20), *near} - {end + 1}):
-        (path / "CURRENT").write_bytes(current)  # as the crash left it, before a writer closed it
-        log_of(path).write_bytes(whole[:cut])
-        if cut < place:
-            with pytest.raises(DamageError, match="repair the store"):
-                Store.open(path)
-            with Store.open(path, mode="read") as opened:
-                assert opened.last == 4
-                with pytest.raises(DamageError, match="row 4 is missing"):
-                    list(opened.records())
-            if cut % 3 == 0:
-                # Then the row is whole, and the place tells of what is behind it.
-                without_commit = cut >= place - FRAME_BYTES
-                assert [problem.kind for problem in damage(path)] == ["spare" if without_commit else "lost", "spare"]
-                mended = shutil.copytree(path, tmp_path / str(cut))
-                assert repair_store(mended).kept == 4
-                assert damage(mended) == []
-                with Store.open(mended) as opened:
-                    assert opened.append("a", "b", b"").sequence == 5
-            continue
-        expected = 6 if cut == end else 4
-        with Store.open(path, mode="read") as opened:
-            assert (opened.last, len(list(opened.records()))) == (expected, expected)
-        if cut % 3 == 0 or cut == end:
-            assert damage(path) == []
-            with Store.open(path) as opened:
-                assert opened.append("a", "next", b"").sequence == expected + 1
-                assert [head.sequence for head in opened.heads()] == list(range(1, expected + 2))
 
 
 def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):

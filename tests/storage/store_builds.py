@@ -5,15 +5,7 @@ import tracemalloc
 from contextlib import contextmanager
 
 import numpy as np
-from forging import (
-    frames_of,
-    get_current,
-    group_of,
-    log_of,
-    read_log,
-    spoil_row,
-    write_log,
-)
+from forging import frames_of, get_current, group_of, log_of, read_log, spoil_row, write_log
 
 from store import Store, check_store
 from store.row_encoding import row_sequence

@@ -15,15 +15,7 @@ from folder_attacks import LINKS, as_link
 from forging import put_row
 from store_builds import LAST, add, as_after_a_crash, build, commit, contents, newest
 
-from store import (
-    DamageError,
-    LockedError,
-    NotAStoreError,
-    Store,
-    StoreError,
-    check_store,
-    repair_store,
-)
+from store import DamageError, LockedError, NotAStoreError, Store, StoreError, check_store, repair_store
 from store.files import read_regular, same_folder
 
 LOG = "log-00000001"

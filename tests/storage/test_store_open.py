@@ -9,26 +9,13 @@ from store_builds import contents
 
 import store.layout
 import store.store
-from store import (
-    LockedError,
-    NotAStoreError,
-    ReadOnlyError,
-    RecordError,
-    Store,
-    StoreClosedError,
-    check_store,
-)
+from store import LockedError, NotAStoreError, ReadOnlyError, RecordError, Store, StoreClosedError, check_store
 
 
 def test_a_new_store_keeps_its_identity_and_a_later_one_does_not_replace_it(tmp_path):
     path = tmp_path / "deep" / "er"
     with Store.open(path, identity={"for": ["this", 1]}) as made:
-        assert (made.identity, made.last, made.latest(), list(made.records())) == (
-            {"for": ["this", 1]},
-            0,
-            None,
-            [],
-        )
+        assert (made.identity, made.last, made.latest(), list(made.records())) == ({"for": ["this", 1]}, 0, None, [])
     with Store.open(path, identity={"for": "that"}) as again:
         assert again.identity == {"for": ["this", 1]}
     with Store.open(str(path), mode="read") as reader:

@@ -113,7 +113,7 @@ def test_a_reader_stays_as_it_was_where_a_row_is_damaged(tmp_path):
 def test_a_reader_takes_an_f_star_where_it_is_another_one(tmp_path):
     made = {"sensor": PAD, "embedding": SMALL, "exemplars": 4}
     with TactileLearner.open(tmp_path / "m", **made) as writer:
-        receipts = observe(writer, OBSERVED)
+        receipts = observe(writer, OBSERVED[:6])
         with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
             writer.fine_tune(epochs=1)
             assert reader.refresh()

@@ -184,6 +184,15 @@ def test_damage_is_proven_by_a_frame_wherever_it_begins(tmp_path):
             read(path)
 
 
+def test_an_opening_cuts_off_a_torn_end_and_syncs_what_is_before_it(copy, monkeypatch):
+    calls, sync = [], os.fsync
+    copy.write_bytes(copy.read_bytes() + b"torn")
+    size = copy.stat().st_size
+    monkeypatch.setattr(os, "fsync", lambda file: calls.append(os.fstat(file).st_size) or sync(file))
+    with LogWriter(copy):
+        assert calls == [size - 4, size - 4]
+
+
 @pytest.mark.parametrize(("frame", "lost"), [(0, 0), (2, 1), (7, 4), (8, 5), (9, 6)])
 @pytest.mark.parametrize("inserted", [False, True])
 def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):

@@ -8,7 +8,7 @@ from logs import BATCHES, KIND, append, build, read, rest
 
 from store import StoreError, StoreFullError
 from store.log import LogReader
-from store.log_writer import LogWriter
+from store.log_writer import AHEAD, LogWriter
 
 
 class Failing:
@@ -50,6 +50,7 @@ def test_a_failed_append_leaves_the_log_as_it_was(tmp_path, monkeypatch, name, c
             kept = [*BATCHES, *([b"%d" % i] for i in range(round_))]
             assert read(path) == kept
             log.append(KIND, b"%d" % round_)
+            assert path.stat().st_size == AHEAD  # the room ahead is made again
             assert read(path) == [*kept, [b"%d" % round_]]
 
 

@@ -204,6 +204,16 @@ def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
         assert opened.identity == {"a": 2}
 
 
+def test_behind_an_older_frame_at_the_end_nothing_can_be_read(plain):
+    frame = frames_of(plain)[18]
+    data = log_of(plain).read_bytes()
+    log_of(plain).write_bytes(data + data[frame.offset : frame.end])
+    with Store.open(plain, mode="read") as opened:
+        assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
+    assert repair_store(plain).kept == LAST
+    assert is_whole(plain, 0)
+
+
 def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):
     write_log(plain, [b"no row"])
     with pytest.raises(DamageError, match="no row"):

@@ -60,8 +60,10 @@ def test_exchanged_and_doubled_rows_are_found(plain, row):
     for change, said in ((swap, f"row {row} is missing"), (double, f"row {row + 1} is missing")):
         path = shutil.copytree(plain, plain.with_name(change.__name__))
         change_rows(path, change)
+        found = []
         with Store.open(path, mode="read") as opened, pytest.raises(DamageError, match=said):
-            list(opened.heads())
+            found.extend(head.sequence for head in opened.heads())
+        assert found == list(range(1, row + (change is double)))
 
 
 def test_missing_rows_are_named_and_their_numbers_not_given_again(plain):

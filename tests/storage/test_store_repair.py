@@ -275,6 +275,13 @@ def test_damaged_logs_are_never_written_over(plain):
     assert agrees(plain, kept=17, latest=15)
 
 
+def test_a_repaired_log_is_numbered_behind_those_that_were_put_aside(plain):
+    log_path(plain, 7).with_name("log-00000007.damaged").write_bytes(b"old")
+    flip_row(plain, 18)
+    repair_store(plain)
+    assert log_of(plain) == log_path(plain, 8)
+
+
 def test_while_a_writer_has_it_nothing_is_done(plain):
     with Store.open(plain):
         flip_row(plain, 18)

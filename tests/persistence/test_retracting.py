@@ -7,7 +7,7 @@ from touches import OBSERVED, PAD, SETTINGS, SmallSample, fed, filled, require_s
 from scroll_tactile import Capabilities, Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import FineTuneError, InputError, MismatchError, ObservationError, UnknownMaterialError
 from scroll_tactile.signals.stream import validate
-from store import CompactedError, DamageError, ReadOnlyError, Store, StoreError, repair_store
+from store import CompactedError, DamageError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
 
 
 @pytest.fixture
@@ -77,6 +77,24 @@ class TestTuned:
             with pytest.raises(FineTuneError, match="was retracted meanwhile"):
                 learner.fine_tune(epochs=1, progress=progress)
             assert learner.tuned_digest() is None
+
+    def test_it_outlives_a_retraction_that_fails_and_a_compaction_of_all(self, path, monkeypatch):
+        learner, receipts = filled(path, OBSERVED[:6])
+
+        def full(*_, **__):
+            raise StoreFullError("no space left")
+
+        with learner:
+            learner.fine_tune(epochs=1)
+            digest = learner.tuned_digest()
+            with monkeypatch.context() as broken, pytest.raises(StoreFullError):
+                broken.setattr(learner._ledger.store, "append", full)
+                learner.retract(receipts[0])
+            assert learner.tuned_digest() == digest is not None
+            require_same(learner, OBSERVED[:6])
+            learner.compact()
+        with TactileLearner.open(path, mode="read") as again:
+            assert again.tuned_digest() == digest
 
 
 class TestBatch:

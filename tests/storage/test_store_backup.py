@@ -68,13 +68,14 @@ def test_a_store_without_rows_or_with_a_log_is_copied_too(opened, tmp_path):
 
 
 def test_a_batch_that_is_not_over_is_not_in_it(opened, tmp_path):
-    add(opened, 1)
+    for number in (1, 2, 3):
+        add(opened, number)
     with opened.batch():
-        add(opened, 2)
+        add(opened, 4)
         opened.backup(tmp_path / "copy")
     with Store.open(tmp_path / "copy", mode="read") as copy:
-        assert copy.last == 1
-    assert read_current(tmp_path / "copy" / "CURRENT").last == 1  # a copy says where its log ends
+        assert copy.last == 3
+    assert read_current(tmp_path / "copy" / "CURRENT").last == 3  # a copy says where its log ends
 
 
 def test_a_checkpoint_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):

@@ -6,12 +6,10 @@ import itertools
 import json
 import os
 import shutil
-import socket
 import stat
-from pathlib import Path
 
 import pytest
-from folder_attacks import LINKS, as_link
+from folder_attacks import LINKS, as_link, no_file
 from forging import put_row
 from store_builds import LAST, add, as_after_a_crash, build, commit, contents, newest
 
@@ -163,29 +161,8 @@ def test_nothing_is_written_to_a_file_that_has_another_name(tmp_path, name):
     assert everything(tmp_path) == before
 
 
-def no_file(path, kind):
-    path.unlink(missing_ok=True)
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "device":
-        try:
-            os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 5))  # as /dev/zero
-        except PermissionError:
-            pytest.skip("this user may make no devices")
-    else:
-        here = Path.cwd()
-        os.chdir(path.parent)  # the name of a socket may have no more than 107 bytes
-        try:
-            with socket.socket(socket.AF_UNIX) as made:
-                made.bind(path.name)
-        finally:
-            os.chdir(here)
-
-
 FILES = [name for name, target in LINKS.items() if target in ("file", "log")]
-KINDS = ["pipe", "socket", "device", "folder"]
+KINDS = ["fifo", "socket", "folder", *(["device"] if os.geteuid() == 0 else [])]
 
 
 @pytest.mark.parametrize(("name", "kind"), list(zip(FILES, itertools.cycle(KINDS))))

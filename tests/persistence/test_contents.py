@@ -69,6 +69,14 @@ class TestOneContent:
 class TestChanges:
     """What is there is what was observed and not retracted, whatever was done in between."""
 
+    def test_what_was_taken_back_and_compacted_is_learned_again(self, tmp_path):
+        learner, receipts = filled(tmp_path / "m", OBSERVED)
+        learner.retract(receipts[8])
+        with learner:
+            assert learner.compact(keep=3).last_sequence == 9  # the row that was retracted is the last of them
+            assert learner.names_of(stream(OBSERVED[8][1])) == []
+            assert not learner.observe(*given(OBSERVED[8])).repeated
+
     def test_a_batch_that_is_lost_has_nothing_there(self, tmp_path, monkeypatch):
         learner, _ = filled(tmp_path / "m", OBSERVED[:4])
 

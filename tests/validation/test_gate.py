@@ -216,7 +216,7 @@ def of_another_key_and_retracted(path):
 
 SUMS = {
     "observations": [lambda a: a - 10, lambda a: a + 1, lambda a: a.astype(float), lambda a: a[:-1]],
-    "lengths": [lambda a: -a, lambda a: a * [0, 1], lambda a: np.concatenate([a, a]), lambda a: a[:, :1]],
+    "lengths": [lambda a: -a, lambda a: a - [0, 1], lambda a: np.concatenate([a, a]), lambda a: a[:, :1]],
     "rows-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a * 0],
     "sums-15": [lambda a: a + 2**62, lambda a: a[:, :-1], lambda a: a.astype(np.int32)],
     "second-15": [lambda a: -a, lambda a: a + 2**62, lambda a: a[:-1], lambda a: None],

@@ -7,7 +7,10 @@ reader look at what was done, in a process that may die of it.
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import socket
+import stat
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -157,6 +160,25 @@ def as_link(path: Path, target: Path) -> None:
         shutil.rmtree(path)
     path.unlink(missing_ok=True)
     path.symlink_to(target)
+
+
+def no_file(path: Path, kind: str) -> None:
+    """Put in a file's place, or where none is, a "fifo", a "socket", a "folder" or a "device", as /dev/zero is."""
+    path.unlink(missing_ok=True)
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "device":
+        os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 5))
+    else:
+        here = Path.cwd()
+        os.chdir(path.parent)  # the name of a socket may have no more than 107 bytes
+        try:
+            with socket.socket(socket.AF_UNIX) as made:
+                made.bind(path.name)
+        finally:
+            os.chdir(here)
 
 
 # A row: (what a memory says of it, what is other in it than in a sound one).

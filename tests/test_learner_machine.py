@@ -8,7 +8,7 @@ from faults.plans import KINDS
 from hypothesis import HealthCheck, settings
 
 History.TestCase.settings = settings(
-    max_examples=3, stateful_step_count=12, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=2, stateful_step_count=8, deadline=None, suppress_health_check=list(HealthCheck)
 )
 TestHistory = History.TestCase
 

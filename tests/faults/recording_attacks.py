@@ -9,7 +9,6 @@ import json
 import os
 import pickle
 import shutil
-import socket
 import struct
 import zipfile
 import zlib
@@ -21,6 +20,7 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from folder_attacks import no_file
 from made import TIP, buffer, lerobot
 from numcodecs import Blosc
 
@@ -136,18 +136,8 @@ def entry(name: str, kind: str, to: str = "/dev/zero") -> Attack:
 
 def special(place: Path, kind: str, watched: Path, to: str = "/dev/zero") -> None:
     """Make no file here: a FIFO, a socket, a folder, or a link to the watched file or a device."""
-    if kind == "fifo":
-        os.mkfifo(place)
-    elif kind == "socket":
-        here = Path.cwd()
-        os.chdir(place.parent)  # names of sockets are short
-        try:
-            with socket.socket(socket.AF_UNIX) as made:
-                made.bind(place.name)
-        finally:
-            os.chdir(here)
-    elif kind == "folder":
-        place.mkdir()
+    if kind in ("fifo", "socket", "folder"):
+        no_file(place, kind)
     else:
         place.symlink_to(watched if kind == "link" else to)
 

@@ -9,11 +9,12 @@ from contextlib import contextmanager
 from typing import Any
 
 import store.backup
+from faults.cases import Wrong
 from faults.learners import KIT
 from faults.model import after
 from faults.plans import draw, touch
 from faults.simulation_disk import abandon
-from faults.simulation_world import Machine, World, Wrong
+from faults.simulation_world import Machine, World
 
 SMALL = ("observe",) * 4 + ("retract", "describe", "forget")
 

@@ -8,11 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from faults.cases import Wrong
 from faults.learners import KIT
 from faults.model import State
 from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
 from faults.simulation_events import OneMemory
-from faults.simulation_world import Machine, Wrong
+from faults.simulation_world import Machine
 from store import StoreError, repair_store
 from store.layout import DERIVED, read_current
 

@@ -9,11 +9,12 @@ import random
 from pathlib import Path
 from typing import Any
 
+from faults.cases import Wrong
 from faults.learners import perform
 from faults.model import State, after
 from faults.simulation_disk import flip
 from faults.simulation_rot import Rotting
-from faults.simulation_world import Machine, Wrong
+from faults.simulation_world import Machine
 from store import StoreError
 
 MOST = 24  # touches of a memory that is merged

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from faults.cases import Wrong
 from faults.disks import Event
 from faults.learners import KIT, opened, perform
 from faults.model import Operation, Others, State, Then, after
@@ -26,10 +27,6 @@ from store import StoreError, check_store
 MACHINES = ("robot-1", "robot-2", "central")
 ERRORS = (errno.ENOSPC, errno.ENOSPC, errno.EIO)
 Fate = tuple[str, Any]
-
-
-class Wrong(Exception):
-    """What must not be."""
 
 
 @dataclass

@@ -310,14 +310,14 @@ def test_the_study_of_buffers_fine_tunes_on_each_way_of_choosing(monkeypatch):
 
     pad = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
     scene = Scene(sensor=pad)
-    labelled = [(name, i) for i in range(6) for name in scene.materials[:3]]
+    labelled = [(name, i) for i in range(4) for name in scene.materials[:2]]
     recordings = Recordings(
         name="simulated",
         sensor=pad,
         streams=[scene.touch(name, i) for name, i in labelled],
         materials=[name for name, _ in labelled],
         repetition=np.array([i for _, i in labelled]),
-        fold=np.array([i % 3 for _, i in labelled]),
+        fold=np.array([i % 2 for _, i in labelled]),
         ordered=True,
     )
     monkeypatch.setattr(buffers, "fine_tune", partial(buffers.fine_tune, epochs=1))

@@ -21,7 +21,6 @@ from store import Store
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 EMBEDDINGS = {
-    "kernels": lambda: Kernels(dimension=64),
     "seeded kernels": lambda: Kernels(dimension=64, seed=3),
     "joined": lambda: Joined(Kernels(dimension=64), Kernels(dimension=128, seed=1)),
 }
@@ -151,12 +150,12 @@ class TestSnapshots:
 
 
 def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
-    filled(tmp_path / "new").close()
-    prepare(tmp_path / "old", Kernels(), lambda identity: identity["embedding"].update(configuration=None))
-    filled(tmp_path / "old", embedding=Kernels()).close()
+    filled(tmp_path / "new", embedding=Kernels(dimension=64)).close()
+    prepare(tmp_path / "old", Kernels(dimension=64), lambda identity: identity["embedding"].update(configuration=None))
+    filled(tmp_path / "old", embedding=Kernels(dimension=64)).close()
     with TactileLearner.open(tmp_path / "new") as learner:
         assert learner.merge(tmp_path / "old", shared="twice").observations == 6
-    filled(tmp_path / "other", embedding=Kernels(dimension=64)).close()
+    filled(tmp_path / "other", embedding=Kernels(dimension=128)).close()
     with TactileLearner.open(tmp_path / "new") as learner, pytest.raises(MismatchError, match="embeddings differ"):
         learner.merge(tmp_path / "other", shared="twice")
 

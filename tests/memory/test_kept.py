@@ -70,7 +70,7 @@ def test_a_touch_without_readings_is_not_kept():
     assert not kept.touches()
 
 
-@pytest.mark.parametrize("theirs", [0, 3, None])
+@pytest.mark.parametrize("theirs", [0, None])
 def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_path, theirs):
     ours, _ = filled(tmp_path / "m", kept_touches=FEW)
     other, _ = filled(tmp_path / "other", SPARE, kept_touches=theirs)
@@ -87,20 +87,9 @@ def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_p
         assert held(ours) == before
 
 
-def test_a_memory_that_keeps_none_takes_in_one_that_keeps_some(tmp_path):
-    ours, _ = filled(tmp_path / "m", kept_touches=0)
-    other, _ = filled(tmp_path / "other", SPARE)
-    other.compact()
-    other.close()
-    with ours:
-        ours.merge(tmp_path / "other", shared="once")
-        assert kept_of(ours) is None
-        assert ours.materials["d"] == len(SPARE)
-
-
-@pytest.mark.parametrize("made", [None, 0, FEW])
+@pytest.mark.parametrize("made", [None, 0])
 def test_how_many_is_chosen_once(tmp_path, made):
-    learner, _ = filled(tmp_path / "m", kept_touches=made)
+    learner, _ = filled(tmp_path / "m", OBSERVED[:2], kept_touches=made)
     count = default_kept_touches(PAD, views=True) if made is None else made
     assert learner.settings.kept_touches == count
     learner.close()

@@ -33,12 +33,8 @@ def test_it_is_refused_and_left_as_it_is(path):
     [
         ("inspect", "M"),
         ("predict", "M", "T"),
-        ("observe", "M", "felt", "T"),
         ("observe", "M", "felt", "T", "--sensor", "biotac"),
-        ("memory", "check", "M"),
         ("memory", "repair", "M"),
-        ("memory", "reembed", "M"),
-        ("memory", "compact", "M", "--yes"),
         ("memory", "export", "M", "X"),
     ],
     ids=" ".join,

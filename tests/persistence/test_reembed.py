@@ -75,7 +75,7 @@ def test_it_is_what_the_other_embedding_would_have_made(path, other):
         require_carried(learner, SMALL)
 
 
-@pytest.mark.parametrize(("name", "stopped"), list(zip(OTHER, (1, 2, 3), strict=True)))
+@pytest.mark.parametrize(("name", "stopped"), [("exact", 1), ("its own", 3)])
 def test_a_run_that_was_cut_short_goes_on(path, name, stopped, monkeypatch):
     other = OTHER[name]()
     monkeypatch.setattr(reembed, "ROWS_TOGETHER", 4)

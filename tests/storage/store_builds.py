@@ -1,20 +1,11 @@
 """Stores to be harmed, how to harm them, and what they must hold; shared by the tests of this folder."""
 
 import shutil
-import subprocess
-import sys
-import textwrap
+import tracemalloc
+from contextlib import contextmanager
 
 import numpy as np
-from forging import (
-    frames_of,
-    get_current,
-    group_of,
-    log_of,
-    read_log,
-    spoil_row,
-    write_log,
-)
+from forging import frames_of, get_current, group_of, log_of, read_log, spoil_row, write_log
 
 from store import Store, check_store
 from store.row_encoding import row_sequence
@@ -112,16 +103,20 @@ def cut_rows(path, first):
     file.write_bytes(file.read_bytes()[: frames_of(path)[first].offset])
 
 
-def in_a_process(code, *arguments, memory=2**30, seconds=60):
-    """Run code in a process that may die, with this much memory more than it has after its imports."""
-    limited = f"""
-        import resource, sys
-        import numpy, store, numcodecs.zstd, zarr
-        held = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (held + {memory}, held + {memory}))
-    """
-    command = [sys.executable, "-c", textwrap.dedent(limited) + textwrap.dedent(code), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
+def in_turns(table):
+    """The values of a table for `which`: what is done to the plain store, and what to the compacted one."""
+    return [(bool(i % 2), *(one if isinstance(one, tuple) else (one,))) for i, one in enumerate(table.values())]
+
+
+@contextmanager
+def taking_at_most(size):
+    """What is done in the block must take no more bytes of memory than this."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < size
+    finally:
+        tracemalloc.stop()
 
 
 def torn(path, cut):

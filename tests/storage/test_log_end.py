@@ -1,14 +1,13 @@
 """The end of a log: what `CURRENT`, a checkpoint or a batch proves of it, and what a power cut may have torn."""
 
-import logging
-
 import numpy as np
 import pytest
-from forging import frames_of, log_of
+from forging import log_of
 from logs import ends as ends_of
-from store_builds import damage, flip, flip_row
+from store_builds import as_after_a_crash, damage, flip, flip_row
 
 from store import DamageError, Store, check_store, repair_store
+from store.framing import FRAME_BYTES
 from store.layout import CURRENT_FILE, log_path, read_current, write_current
 
 
@@ -50,25 +49,14 @@ def require_named(path, rows, kept):
         assert store.append("add", "after", b"").sequence == kept + 1
 
 
-@pytest.mark.parametrize("kept", range(4))
-def test_a_closed_log_that_is_cut_off_is_damaged_wherever_it_is_cut(tmp_path, kept):
+@pytest.mark.parametrize(("kept", "flipped"), [(0, False), (2, False), (3, False), (3, True)])
+def test_a_closed_log_that_is_cut_off_or_flipped_at_its_end_is_damaged(tmp_path, kept, flipped):
     log = made(tmp_path / "s")
-    cut(log, ends(log)[kept])
+    if flipped:
+        flip(log, -100)
+    else:
+        cut(log, ends(log)[kept])
     require_named(tmp_path / "s", 4, kept)
-
-
-def test_a_flip_in_the_last_batch_of_a_closed_log_is_named(tmp_path):
-    log = made(tmp_path / "s")
-    flip(log, -100)
-    require_named(tmp_path / "s", 4, 3)
-
-
-def test_a_search_warns_of_rows_that_were_cut_off(tmp_path, caplog):
-    log = made(tmp_path / "s")
-    cut(log, ends(log)[2])
-    with Store.open(tmp_path / "s", mode="read") as store, caplog.at_level(logging.WARNING):
-        assert len(list(store.heads(kind="add"))) == 2
-        assert "ends with row 2" in caplog.text
 
 
 def crashed(path, rows):
@@ -89,6 +77,27 @@ def test_a_log_that_had_a_row_and_has_none_is_damaged_though_nobody_closed_it(tm
     require_named(path, 1, 0)
 
 
+@pytest.mark.parametrize("by", [1, FRAME_BYTES, FRAME_BYTES + 1])
+def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, by):
+    with Store.open(tmp_path / "s", identity={}) as store:
+        for label in "ab":
+            store.append("add", label, b"")
+        store.commit({}, last_sequence=2)
+        store.append("add", "behind it", b"")
+        path = as_after_a_crash(store, tmp_path / "crashed")
+    cut(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
+    with pytest.raises(DamageError, match="repair the store"):
+        Store.open(path)
+    with Store.open(path, mode="read") as store:
+        assert store.last == 2
+        with pytest.raises(DamageError, match="row 2 is missing"):
+            list(store.records())
+    # Without the commit frame alone the row is whole, and the place tells of what is behind it.
+    assert [problem.kind for problem in damage(path)] == ["spare" if by <= FRAME_BYTES else "lost", "spare"]
+    assert repair_store(path).kept == 2
+    assert damage(path) == []
+
+
 def test_the_end_of_a_log_that_nobody_closed_may_be_torn_and_the_rows_before_it_are_there(tmp_path):
     path = crashed(tmp_path / "s", 3)
     cut(log_path(path, 1), ends(log_path(path, 1))[2] + 50)
@@ -96,14 +105,6 @@ def test_the_end_of_a_log_that_nobody_closed_may_be_torn_and_the_rows_before_it_
         assert store.last == 2
         assert store.append("add", "", b"").sequence == 3
     assert read_current(path / CURRENT_FILE).last == 3
-
-
-def test_a_copy_says_where_its_log_ends(tmp_path):
-    with Store.open(tmp_path / "s", identity={}) as store:
-        for _ in range(3):
-            store.append("add", "", b"")
-        store.backup(tmp_path / "backup")
-    assert read_current(tmp_path / "backup" / CURRENT_FILE).last == 3
 
 
 def test_a_store_that_cannot_say_so_is_closed_with_a_warning_and_one_that_is_another_is_left_alone(tmp_path, caplog):
@@ -128,36 +129,6 @@ def test_a_store_that_says_nothing_of_it_is_read_as_before(tmp_path):
     cut(log, ends(log)[2])
     with Store.open(tmp_path / "s") as store:
         assert store.last == 2
-
-
-# Logs that replaced another, and batches of several rows.
-
-
-@pytest.fixture
-def compacted(tmp_path):
-    """A store of three rows, the first of them compacted, whose last row has another bit: no frame is behind it."""
-    made(tmp_path / "s", 3)
-    with Store.open(tmp_path / "s") as store:
-        store.compact({}, last_sequence=1)
-    flip_row(tmp_path / "s", 3, arrays=True)
-    return tmp_path / "s"
-
-
-@pytest.mark.parametrize("after", [1, 2])
-def test_a_damaged_last_row_is_not_taken_for_the_end(compacted, after):
-    with Store.open(compacted, mode="read") as store:
-        with pytest.raises(DamageError, match=r"repair|row 3 is missing"):
-            list(store.records(after=after))
-        assert store.record(2).label == "label 1"
-        found = store.heads()
-        assert [next(found).label, next(found).label] == ["label 0", "label 1"]
-        with pytest.raises(DamageError, match="log-00000002"):
-            next(found)
-        assert [head.sequence for head in store.heads(kind="add")] == [1, 2]
-    assert any("log" in str(problem.what) for problem in check_store(compacted))
-    assert repair_store(compacted).kept == 2
-    with Store.open(compacted, mode="read") as store:
-        assert [record.label for record in store.records(after=1)] == ["label 1"]
 
 
 BATCH = {
@@ -186,25 +157,3 @@ def test_a_repair_keeps_the_sound_rows_of_a_last_batch_that_a_checkpoint_proves(
     with Store.open(path) as store:
         assert [head.sequence for head in store.heads()] == kept
         assert store.compacted == (0 if kept == [1, 2, 3] else 3)
-
-
-def test_a_bit_of_a_repaired_log_does_not_take_its_rows_away_unnoticed(tmp_path):
-    path = tmp_path / "s"
-    made(path, 3)
-    (path / CURRENT_FILE).unlink()
-    assert repair_store(path).lost == []
-    flip(log_of(path), frames_of(path)[1].payload_offset + 12)
-    with pytest.raises(DamageError, match="proves that it was durable"):
-        Store.open(path)
-
-
-def test_of_a_log_and_the_one_that_compaction_replaced_a_repair_takes_the_newer(tmp_path):
-    path = tmp_path / "s"
-    before = made(path, 1).read_bytes()
-    with Store.open(path) as store:
-        store.compact({}, last_sequence=1)
-    log_path(path, 1).write_bytes(before)  # a power cut brought it back
-    (path / CURRENT_FILE).unlink()
-    repair_store(path)
-    with Store.open(path) as store:
-        assert store.compacted == 1

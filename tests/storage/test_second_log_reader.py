@@ -91,13 +91,14 @@ def test_both_find_the_same_damage(path, tmp_path):
         assert theirs(copy)[1] is None
 
 
-def test_it_finds_torn_tails_as_ours_does(tmp_path):
+@pytest.mark.parametrize(("payloads", "lost"), [([b"a" * 700, b"b" * 700, b"c" * 700], 1000), ([b""] * 3, 88)])
+def test_it_finds_torn_tails_as_ours_does(tmp_path, payloads, lost):
     path = build(tmp_path / "log")
     size = path.stat().st_size
     with LogWriter(path) as log:
-        append(log, [b"a" * 700, b"b" * 700, b"c" * 700])
+        append(log, payloads)
         data = path.read_bytes()[: log.place.offset]
-    path.write_bytes(data[:size] + bytes(1000) + data[size + 1000 :])
+    path.write_bytes(data[:size] + bytes(lost) + data[size + lost :])
     _, whole, damage = second_reader.frames(path.read_bytes())
     with LogReader(path) as log:
         assert sum(len(batch) + 1 for batch in log.refresh()) == len(whole) == 13

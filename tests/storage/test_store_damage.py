@@ -60,8 +60,10 @@ def test_exchanged_and_doubled_rows_are_found(plain, row):
     for change, said in ((swap, f"row {row} is missing"), (double, f"row {row + 1} is missing")):
         path = shutil.copytree(plain, plain.with_name(change.__name__))
         change_rows(path, change)
+        found = []
         with Store.open(path, mode="read") as opened, pytest.raises(DamageError, match=said):
-            list(opened.heads())
+            found.extend(head.sequence for head in opened.heads())
+        assert found == list(range(1, row + (change is double)))
 
 
 def test_missing_rows_are_named_and_their_numbers_not_given_again(plain):
@@ -120,15 +122,14 @@ SPOIL = {
 
 
 @pytest.mark.parametrize(("harm", "said"), SPOIL.values(), ids=SPOIL)
-@pytest.mark.parametrize("mode", ["read", "write"])
-def test_a_spoilt_checkpoint_is_named_and_the_compaction_checkpoint_taken(compacted, harm, said, mode, caplog):
+def test_a_spoilt_checkpoint_is_named_and_the_compaction_checkpoint_taken(compacted, harm, said, caplog):
     folder = newest(compacted)
     harm(folder)
     problems = check_store(compacted)
     assert said in " ".join(problem.what for problem in problems)
     assert all(problem.path.is_relative_to(folder) and str(problem.path) in problem.what for problem in problems)
     assert {problem.kind for problem in problems} == {"spare"}
-    with Store.open(compacted, mode=mode) as opened, caplog.at_level(logging.WARNING):
+    with Store.open(compacted) as opened, caplog.at_level(logging.WARNING):
         found = opened.latest()
     assert found.last_sequence == 6
     assert same_arrays(found.arrays, state(6))

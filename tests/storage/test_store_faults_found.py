@@ -2,16 +2,14 @@
 
 import errno
 import os
-import sys
-from pathlib import Path
 
 import pytest
-from forging import get_current, log_of, set_current, spoil_row
+from forging import log_of
 
 import store.archive
 import store.backup
 import store.log_writer
-from store import DamageError, Store, check_store, repair_store
+from store import DamageError, Store, check_store
 from store.layout import read_current
 
 
@@ -22,16 +20,6 @@ def path(tmp_path):
         for i in range(3):
             store.append("kind", "label", bytes([i]), attributes={"i": i})
     return tmp_path / "s"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-def test_a_check_leaves_no_file_open(path):
-    for damage in (False, True):
-        if damage:
-            spoil_row(path, 2, head=True)
-        check_store(path)
-        opened = [os.path.realpath(file) for file in Path("/proc/self/fd").iterdir()]
-        assert not [name for name in opened if name.startswith(str(path))]
 
 
 @pytest.mark.parametrize("module", [store.archive, store.backup], ids=["a reader", "a backup"])
@@ -54,25 +42,6 @@ def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(path):
         with pytest.raises(DamageError, match="nothing of it was read"):
             reader.last  # noqa: B018
     assert any("nothing of it was read" in problem.what for problem in check_store(path))
-
-
-@pytest.mark.parametrize("named", [1, 3])
-def test_a_place_that_is_none_or_behind_other_rows_is_found_and_mended(path, named):
-    with Store.open(path) as writer:
-        writer.commit({}, last_sequence=named)
-    assert check_store(path) == []
-    newest = get_current(path)["newest"]
-    with Store.open(path) as writer:
-        writer.append("kind", "label", b"")
-        writer.commit({}, last_sequence=4)
-    later = get_current(path)["newest"]
-    place = later["place"] if named == 1 else [newest["place"][0] + 1, *newest["place"][1:]]
-    set_current(path, newest=later | {"place": place, **({"last_sequence": 3} if named == 1 else {})})
-    assert any("no place behind which" in problem.what for problem in check_store(path))
-    repair_store(path)
-    assert check_store(path) == [] or all(problem.kind == "leftover" for problem in check_store(path))
-    with Store.open(path) as again:
-        assert [head.sequence for head in again.heads()] == [1, 2, 3, 4]
 
 
 def test_a_compaction_that_is_committed_stands_though_its_log_cannot_be_opened_at_once(path, monkeypatch, caplog):

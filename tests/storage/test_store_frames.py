@@ -54,11 +54,7 @@ FRAMES = {
     "lz4": lambda raw: blosc.compress(raw.view("<u2"), b"lz4", 1, blosc.SHUFFLE),
     "own": lambda raw: compress(raw, 4),
 }
-READ = {
-    "zstd": decompress_blosc,
-    "lz4": decompress_blosc,
-    "own": lambda frame, target: decompress(frame, target, 4),
-}
+READ = {"zstd": decompress_blosc, "lz4": decompress_blosc, "own": lambda frame, target: decompress(frame, target, 4)}
 
 
 @pytest.mark.parametrize("kind", FRAMES)

@@ -7,7 +7,7 @@ import pytest
 from forging import frames_of, log_of
 from store_builds import flip_row, lose_rows
 
-from store import DamageError, Head, Record, RecordError, Store
+from store import DamageError, Record, RecordError, Store
 
 
 @pytest.fixture
@@ -22,38 +22,23 @@ def sequences(rows):
     return [row.sequence for row in rows]
 
 
-def test_heads_are_the_records_without_their_arrays(opened):
-    heads, records = list(opened.heads()), list(opened.records())
-    assert {type(head) for head in heads} == {Head}
-    for head, record in zip(heads, records, strict=True):
-        for name in ("sequence", "kind", "label", "key", "time", "attributes"):
-            assert getattr(head, name) == getattr(record, name)
-        assert head.size > 0
-    assert sequences(opened.heads(7)) == [8, 9, 10]
-    assert sequences(opened.heads(10)) == sequences(opened.heads(99)) == []
-
-
-def test_heads_of_one_kind_or_label(opened):
-    assert sequences(opened.heads(kind="take")) == [3, 6, 9]
-    assert sequences(opened.heads(3, kind="take")) == [6, 9]
-    assert sequences(opened.heads(label="wool")) == [2, 4, 6, 8, 10]
-    assert sequences(opened.heads(kind="take", label="é'\"\U0001f9f6")) == [3, 9]
-    assert sequences(opened.heads(kind="wool")) == []
-
-
-def test_heads_end_where_the_last_was_when_they_were_asked_for(opened):
+def test_heads_behind_a_row_of_one_kind_or_label(opened):
     heads = opened.heads(8)
     opened.append("add", "late", b"")
-    assert sequences(heads) == [9, 10]
-
-
-@pytest.mark.parametrize(("name", "value"), [("kind", "a\0"), ("label", "\ud800"), ("label", 3)])
-def test_a_filter_that_no_record_could_have_is_refused(opened, name, value):
-    with pytest.raises(RecordError, match=f"the {name}"):
-        opened.heads(**{name: value})
-
-
-def test_heads_from_before_the_beginning_are_refused(opened):
+    assert sequences(heads) == [9, 10]  # up to the last when they were asked for
+    for asked, expected in (
+        ({"after": 7}, [8, 9, 10, 11]),
+        ({"after": 99}, []),
+        ({"kind": "take"}, [3, 6, 9]),
+        ({"after": 3, "kind": "take"}, [6, 9]),
+        ({"label": "wool"}, [2, 4, 6, 8, 10]),
+        ({"kind": "take", "label": "é'\"\U0001f9f6"}, [3, 9]),
+        ({"kind": "wool"}, []),
+    ):
+        assert sequences(opened.heads(**asked)) == expected
+    for name, value in (("kind", "a\0"), ("label", "\ud800"), ("label", 3)):
+        with pytest.raises(RecordError, match=f"the {name}"):
+            opened.heads(**{name: value})
     with pytest.raises(ValueError, match="negative"):
         opened.heads(-1)
 

@@ -89,7 +89,8 @@ class History(RuleBasedStateMachine):
     def refuse(self):
         wrong = [lambda: self.store.append("a", "\0", b""), lambda: self.store.commit({}, last_sequence=10**6)]
         if self.compacted:
-            wrong.append(lambda: self.store.commit({}, last_sequence=self.compacted - 1))
+            wrong += [lambda: self.store.commit({}, last_sequence=self.compacted - 1)]
+            wrong += [lambda: self.store.compact({}, last_sequence=self.compacted - 1)]
         for call in wrong:
             try:
                 call()
@@ -170,6 +171,6 @@ class History(RuleBasedStateMachine):
 
 
 History.TestCase.settings = settings(
-    max_examples=20, stateful_step_count=15, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=12, stateful_step_count=15, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 TestHistory = History.TestCase

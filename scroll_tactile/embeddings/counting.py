@@ -23,7 +23,7 @@ __all__ = [
     "GROUP",
     "Counts",
     "Groups",
-    "Request",
+    "CountRequest",
     "competing_counts",
     "competing_groups",
     "count",
@@ -51,7 +51,7 @@ class Groups:
 
 
 @dataclass(frozen=True)
-class Request:
+class CountRequest:
     """What is counted of one bank's responses to an image: so many features in some windows, and groups, or none."""
 
     bank: Bank
@@ -62,7 +62,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Counts:
-    """What a `Request` asked for.
+    """What a `CountRequest` asks for.
 
     features: how often each threshold is exceeded in each window, shape (windows, features). competing: at how many
     places each kernel of a group has the greatest response above 0, and the least below 0, shape (2, G, GROUP); kernels
@@ -73,7 +73,7 @@ class Counts:
     competing: Integers
 
 
-def count(levels: Floats, requests: Sequence[Request]) -> list[Counts]:
+def count(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]:
     """Count, in the responses to an image of whole numbers in ±LEVELS, float32 of shape (C, T), one bank at a time."""
     if not native.available or not (np.abs(levels) <= LEVELS).all() or not _agrees():
         return count_by_numpy(levels, requests)
@@ -90,13 +90,13 @@ def competing_groups(bank: Bank, count: int) -> Groups:
     return Groups(members.astype(np.uint16), weights.astype(np.uint8))
 
 
-def count_by_c(levels: Floats, requests: Sequence[Request]) -> list[Counts]:
+def count_by_c(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]:
     """What `count` gives, by the compiled module. Raises ValueError for requests that do not fit the image."""
     whole = np.ascontiguousarray(levels, np.int16)  # a stretched image comes in the other order
     return [_counted(whole, request) for request in requests]
 
 
-def _counted(levels: npt.NDArray[np.int16], request: Request) -> Counts:
+def _counted(levels: npt.NDArray[np.int16], request: CountRequest) -> Counts:
     bank, (edges, spans), groups = _compiled(request.bank), _segments(request.windows), request.groups
     competing = 0 if groups is None else len(groups.members)
     counted = np.empty((len(spans), request.features), np.int32)
@@ -146,7 +146,7 @@ def _agrees() -> bool:
         channels[:, 0], channels[:, MOST_CHANNELS:] = 1, 0
         thresholds = rng.integers(-4000, 4000, (2, ROUND)) + np.float32(0.5)
         made = Bank(dilation, channels, rng.permutation(ROUND), thresholds.astype(np.float32))
-        requests.append(Request(made, ROUND + 9, ((0, 20), (7, 22), (0, 22)), competing_groups(made, 11)))
+        requests.append(CountRequest(made, ROUND + 9, ((0, 20), (7, 22), (0, 22)), competing_groups(made, 11)))
     by_c, by_numpy = count_by_c(levels, requests), count_by_numpy(levels, requests)
     return all(
         np.array_equal(ours.features, theirs.features) and np.array_equal(ours.competing, theirs.competing)
@@ -154,7 +154,7 @@ def _agrees() -> bool:
     )
 
 
-def count_by_numpy(levels: Floats, requests: Sequence[Request]) -> list[Counts]:
+def count_by_numpy(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]:
     """What `count` gives, without a compiled module: the channels of all banks are summed in one product."""
     needed = (max(of.features, 0 if of.groups is None else of.groups.members.size) for of in requests)
     banks = _banks(tuple(of.bank for of in requests), tuple(needed))
@@ -188,7 +188,7 @@ def _banks(banks: tuple[Bank, ...], counts: tuple[int, ...]) -> Banks:
     return Banks(np.concatenate(parts), rows)
 
 
-def _exceeding(request: Request, responses: Floats) -> Integers:
+def _exceeding(request: CountRequest, responses: Floats) -> Integers:
     """How often each feature's threshold is exceeded in each window, of responses of shape (rows, places)."""
     kernels, count = request.bank, request.features
     if not count:

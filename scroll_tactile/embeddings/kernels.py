@@ -26,7 +26,7 @@ from scroll_tactile.embeddings.banks import (
     window_statistics,
 )
 from scroll_tactile.embeddings.convolution import TAPS, Bank
-from scroll_tactile.embeddings.counting import GROUP, Request, competing_groups, count
+from scroll_tactile.embeddings.counting import GROUP, CountRequest, competing_groups, count
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import ENOUGH
@@ -65,10 +65,10 @@ class Part:
     groups: int
     pools: tuple[tuple[int, slice, int, int], ...]
 
-    def request(self, bank: Bank) -> Request:
+    def request(self, bank: Bank) -> CountRequest:
         """What is counted of this dilation's bank."""
         groups = competing_groups(bank, self.groups) if self.groups else None
-        return Request(bank, self.features, self.windows, groups)
+        return CountRequest(bank, self.features, self.windows, groups)
 
 
 class Kernels:

@@ -32,7 +32,7 @@ NARROWEST = 1.0  # levels: rounding alone spreads by 0.3, and a touch has to be 
 BLUR = 0.006  # of an amplitude: what a step of the amplitudes leaves unsaid of where the noise ends
 LEAST = 0.01  # of the range: less noise cannot be told from touch to touch
 UNIFORM_STEP, NORMAL_STEP = 1.005, 1.12  # uniform noise ends sharply, and five per cent beside it nothing is explained
-MOST_TABLES = 64  # of 128 kB
+MOST_TABLES = 96  # of 128 kB; the rough and coarse noises are 50
 
 LevelArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]

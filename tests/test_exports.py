@@ -60,17 +60,16 @@ def test_types_are_shipped():
         assert (Path(package.__file__).parent / "py.typed").exists()
 
 
-def test_importing_brings_no_library_that_only_some_need():
-    code = (
-        "import sys, scroll_tactile; "
-        "print(*[n for n in ('matplotlib', 'sklearn', 'zarr', 'typer', 'rich', 'hypothesis') if n in sys.modules])"
-    )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
-    assert said.stdout.split() == []
+SOME_NEED = "matplotlib sklearn zarr typer rich hypothesis torch"
+FORMATS = "rosbags pyarrow h5py zarr fsspec torch lz4 sqlite3 PIL"
 
 
-def test_the_store_knows_nothing_of_touch():
-    code = "import sys, store; print(*[n for n in sys.modules if n.split('.')[0] in ('scroll_tactile', 'torch')])"
+@pytest.mark.parametrize(
+    ("package", "others"),
+    [("scroll_tactile", SOME_NEED), ("scroll_tactile.recordings", FORMATS), ("store", "scroll_tactile torch")],
+)
+def test_importing_brings_no_library_that_only_some_need(package, others):
+    code = f"import sys, {package}; print(*[name for name in {others.split()} if name in sys.modules])"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert said.stdout.split() == []
 

@@ -310,17 +310,6 @@ def test_constant_streams_and_dead_channels(value, readout):
     check(learner.predict(np.full((12, 3), value)), [*NAMES, "dead", "half"])
 
 
-def test_a_memory_of_constant_streams_only():
-    for readout in ("lda", "ridge"):
-        learner = TactileLearner(sensor=PAD, embedding=SMALL, readout=readout)
-        for i in range(9):
-            learner.observe("off", np.zeros((100 + i, 3)))
-            learner.observe("also off", np.zeros((100 + i, 3)))
-        prediction = learner.predict(np.zeros((100, 3)))
-        check(prediction, ["off", "also off"])
-        assert prediction.probability == pytest.approx(0.5)
-
-
 BAD = {
     "nothing": ([], EmptyStreamError),
     "no readings": (np.zeros((0, 3)), EmptyStreamError),
@@ -372,15 +361,6 @@ def test_any_printable_name_survives(tmp_path, name):
         with opened(tmp_path / "m") as learner:
             assert learner.materials == {name: 1}
             assert learner.predict(touch("wool", 1)).material == name
-
-
-@pytest.mark.parametrize("settings", [{"readout": "svm"}, {"false_alarms": 0}, {"false_alarms": 1.0}])
-def test_settings_that_cannot_be_are_refused(tmp_path, settings):
-    with pytest.raises(InputError, match=r"^expected (readout|false_alarms) to be"):
-        TactileLearner(sensor=PAD, embedding=SMALL, **settings)
-    with pytest.raises(InputError, match=r"^expected (readout|false_alarms) to be"):
-        opened(tmp_path / "m", **settings)
-    assert not (tmp_path / "m").exists()
 
 
 class Broken:

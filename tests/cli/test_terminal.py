@@ -53,14 +53,6 @@ def path(whole, tmp_path):
     return tmp_path / "m"
 
 
-@pytest.fixture(scope="module")
-def seconds(whole):
-    """How long a prediction takes that nothing interrupts."""
-    began = time.monotonic()
-    process("predict", whole, whole.parent / "t.npy")
-    return time.monotonic() - began
-
-
 @pytest.fixture
 def received(path):
     """A memory with a name that no `observe` lets in, in rows with right checksums."""
@@ -186,12 +178,12 @@ def test_an_interrupt_while_a_checkpoint_is_written(path):
     ]
 
 
-@pytest.mark.parametrize("share", [0.4, 0.8])
-def test_an_interrupt_at_any_time(whole, seconds, share):
+@pytest.mark.parametrize("seconds", [0.3, 1.2])
+def test_an_interrupt_at_any_time(whole, seconds):
     running = begun("print('ready', flush=True)", "predict", whole, whole.parent / "t.npy")
     try:
         assert running.stdout.readline() == "ready\n"
-        time.sleep(share * seconds)
+        time.sleep(seconds)
         running.send_signal(signal.SIGINT)
         _, errors = running.communicate(timeout=60)
     finally:
@@ -267,8 +259,3 @@ class TestFirstTouches:
         np.save(tmp_path / "t.npy", np.full((5, 24, 32, 3), 100.0))
         assert refused("observe", tmp_path / "m", "felt", tmp_path / "t.npy", "--sensor", tmp_path / "eye.json")
         assert not (tmp_path / "m").exists()
-
-    def test_of_the_demo(self, tmp_path):
-        for words in (("--seed", "-1"), ("--sensor", "gelsight"), ("--sensor", "nose")):
-            assert refused("demo", "--memory", tmp_path / "m", *words)
-            assert not (tmp_path / "m").exists()

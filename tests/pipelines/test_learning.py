@@ -9,7 +9,7 @@ import pytest
 from bags import START, biotac, typestore, write
 from live_touches import GEL, frames, gel_learner, shift
 from live_touches import learner as live_learner
-from touches import PAD, SETTINGS, fed, filled, require_same, stream
+from touches import PAD, SETTINGS, fed, require_same, stream
 
 from examples.paper.readers import biotac_slide
 from scroll_tactile import Kernels, TactileLearner, sensors
@@ -19,7 +19,6 @@ from scroll_tactile.pipelines.learning import evaluate_sources, learn_sources
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, find_sources, source_touches
 from scroll_tactile.recordings import Interval
 from scroll_tactile.results import Prediction
-from store import LockedError
 
 FOLDERS = SourceOptions(by="folder")
 
@@ -245,13 +244,9 @@ class TestLearn:
         assert done.learned == {"a": 1, "b": 1}
         require_same(learner, [("a", (0, 60)), ("b", (1, 60))])
 
-    def test_a_memory_that_another_process_has_open_is_refused(self, learner):
-        with pytest.raises(LockedError):
-            TactileLearner.open(learner.path)
-
     def test_bags_are_learned_as_the_arrays_in_them(self, real_data, tmp_path):
         recordings = biotac_slide.load(real_data, "biotac")
-        chosen = range(0, len(recordings.streams), len(recordings.streams) // 50)
+        chosen = range(0, len(recordings.streams), len(recordings.streams) // 10)
         settings = {"sensor": sensors.BIOTAC, "embedding": Kernels(seed=0, dimension=64)}
         plain, store = TactileLearner(**settings), typestore(1)
         for i in chosen:
@@ -321,11 +316,3 @@ def test_a_memory_without_a_path_learns_too(data):
     learner = TactileLearner(**SETTINGS)
     learn_sources(learner, sources_of(data), FOLDERS)
     assert learner.digest() == fed(EXPECTED).digest()
-
-
-def test_the_same_memory_whatever_the_order(data, tmp_path):
-    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-        learn_sources(learner, sources_of(data)[::-1], FOLDERS)
-        other, _ = filled(tmp_path / "n", EXPECTED)
-        with other:
-            assert learner.digest() == other.digest()

@@ -1,6 +1,5 @@
 """Recordings from elsewhere: they run nothing, reach nothing outside, and cost what their size allows."""
 
-import logging
 import os
 import shutil
 import sys
@@ -178,26 +177,6 @@ class TestHdf5:
         assert len(read(path, field="obs/tactile")) == 60
         with pytest.raises(FieldError, match="no field 'away'"):
             read(path, field="away")
-
-
-@pytest.fixture
-def bucket(monkeypatch):
-    """An empty bucket of a real S3 interface, played by moto."""
-    s3fs = pytest.importorskip("s3fs")
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server.start()
-    host, port = server.get_host_and_port()
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "test")
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    s3fs.S3FileSystem.clear_instance_cache()
-    files = s3fs.S3FileSystem()
-    files.mkdir("robots")
-    yield files
-    server.stop()
-    s3fs.S3FileSystem.clear_instance_cache()
 
 
 class TestPlaces:

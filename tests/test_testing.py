@@ -12,7 +12,7 @@ PAD = Sensor(name="pad", channels=3, rate=50.0, low=(0.0, -1.0, 0.0), high=(1.0,
 SMALL = Kernels(dimension=64)
 WAYS = {
     "ridge, no exemplars": {"sensor": PAD, "embedding": SMALL, "readout": "ridge", "exemplars": 0},
-    "copies": {"sensor": PAD, "embedding": SMALL, "augmentation": Augmented(copies=2)},
+    "copies": {"sensor": PAD, "embedding": SMALL, "augmentation": Augmented(copies=1), "kept_touches": 0},
     "camera": {"sensor": CAMERA},
 }
 

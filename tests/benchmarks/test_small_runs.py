@@ -2,7 +2,7 @@
 
 import json
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 
 import pytest
 from commands import run
@@ -29,7 +29,8 @@ def measured(tmp_path, *words):
 
 def test_each_way_of_appending_keeps_the_rows(tmp_path, monkeypatch):
     monkeypatch.setattr(appending, "ROWS", 5)
-    output, result = measured(tmp_path, "log", "--rounds", 3, "--folder", tmp_path)
+    monkeypatch.setattr(appending, "TemporaryDirectory", lambda dir: nullcontext(tmp_path))
+    output, result = measured(tmp_path, "log", "--rounds", 3)
     cases = [record["case"].split(",")[0] for record in result["records"]]
     assert cases == ["SQLite", "the log", "a bare file that grows"] and "times SQLite's" in output
     assert result["rows"] == 15 and result["records"][0]["times_sqlite"] == 1.0

@@ -77,7 +77,7 @@ def test_every_case_is_measured_on_both_sides(measured):
     ):
         record = found[everyday, case]
         assert (record["calls"], record["before_calls"]) == (calls, calls)
-        assert 0 < record["median"] <= record["p99"] <= record["largest"]
+        assert 0 < record["median"] <= (record["p99"] or record["largest"]) <= record["largest"]
         assert record["times"] == record["before_median"] / record["median"]
         assert record["of_forward"] == record["median"] / measured["resnet_forward"]["median_milliseconds"]
     assert found[everyday, "predict again"]["wrong"] < 0.5

@@ -10,12 +10,14 @@ import pytest
 from buckets import BUCKETS, served
 from commands import refused
 from commands import run as command
-from test_fleet import BY_FOLDER, TOUCHES, expected, memory_of, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, expected, jobs_here, memory_of, run, touch_files
 from touches import PAD, SETTINGS
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.fleet import learn
+
+__all__ = ["jobs_here"]  # a fixture
 
 CLUSTER = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask[distributed] is missing")
 
@@ -55,6 +57,7 @@ class TestBucket:
         assert "Access Denied" in "".join(each.why for each in done.refused)
         assert done.digest == expected().digest()
 
+    @pytest.mark.usefixtures("jobs_here")
     def test_a_bucket_that_never_answers_is_given_up(self, tmp_path, bucket):
         touch_files(tmp_path / "in", TOUCHES)
         with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -66,6 +69,7 @@ class TestBucket:
         assert done.digest == expected().digest()
 
 
+@pytest.mark.usefixtures("jobs_here")
 def test_a_server_that_falls_silent_after_it_listed_its_files_is_given_up(tmp_path, monkeypatch):
     from fsspec.implementations.memory import MemoryFileSystem
 

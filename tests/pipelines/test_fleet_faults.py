@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from test_fleet import BY_FOLDER, TOUCHES, expected, full, learned, require_learned, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, expected, jobs_here, require_learned, run, touch_files
 from touches import SETTINGS, stream
 
 from examples.benchmarks.fleet import DyingExecutor
@@ -24,7 +24,7 @@ from scroll_tactile.pipelines.workers import engines, steps
 from scroll_tactile.pipelines.workers.jobs import Made
 from store import DamageError, LockedError
 
-__all__ = ["full", "learned"]  # fixtures
+__all__ = ["jobs_here"]  # a fixture
 
 
 @pytest.fixture
@@ -45,7 +45,22 @@ class Silent(Executor):
         return DyingExecutor().submit(what, *words) if self.after >= 0 else Future()
 
 
+class Then(DyingExecutor):
+    """Does something with each job when it is done, and its number."""
+
+    def __init__(self, then):
+        super().__init__()
+        self.then, self.done = then, 0
+
+    def submit(self, what, job):
+        future = super().submit(what, job)
+        self.done += 1
+        self.then(job, self.done)
+        return future
+
+
 class TestPatience:
+    @pytest.mark.usefixtures("jobs_here")
     @pytest.mark.parametrize("after", [0, 3])
     def test_an_executor_that_never_answers_is_named_and_the_same_call_goes_on(
         self, tmp_path, sources, monkeypatch, after
@@ -58,6 +73,7 @@ class TestPatience:
         assert (done.observations, done.held, done.repeated) == (12 - after, 12, 0)  # what was learned before came in
         require_learned(tmp_path / "m")
 
+    @pytest.mark.usefixtures("jobs_here")
     def test_a_job_that_is_never_answered_is_handed_over_again(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(fleet, "GRACE", 0.2)
         monkeypatch.setattr(steps, "MOST_SOURCES", 2)
@@ -73,7 +89,7 @@ class TestPatience:
                 threading.Timer(0.1, lambda: future.set_result(what(job))).start()
                 return future
 
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Forgetful(), patience=1.5)
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Forgetful(), patience=3)
         assert done.deaths == 1 and done.digest == expected().digest() and not done.refused
 
     def test_a_worker_that_is_stopped_is_ended_and_its_job_done_by_another(self, tmp_path, sources, monkeypatch):
@@ -133,35 +149,20 @@ class TestGarbage:
     def test_a_packed_memory_of_other_sources_is_not_taken_for_the_jobs(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(steps, "MOST_SOURCES", 6)
 
-        class Mistaken(DyingExecutor):
-            """Writes what one job learned where what the other did belongs, once."""
+        def mistaken(job, number):
+            if number == 2:
+                first = next(path for path in Path(job.folder).glob("learned-*.part") if path != job.target)
+                job.target.write_bytes(first.read_bytes())
 
-            done = 0
-
-            def submit(self, what, job):
-                future = super().submit(what, job)
-                self.done += 1
-                if self.done == 2:
-                    first = next(path for path in Path(job.folder).glob("learned-*.part") if path != job.target)
-                    job.target.write_bytes(first.read_bytes())
-                return future
-
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Mistaken())
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Then(mistaken))
         assert done.observations == 12 and done.digest == expected().digest()
 
     def test_one_that_is_never_there_is_named_in_the_end(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(steps, "MOST_TRIES", 2)
 
-        class Elsewhere(DyingExecutor):
-            """Has a folder of its own under this name."""
-
-            def submit(self, what, job):
-                future = super().submit(what, job)
-                job.target.unlink()
-                return future
-
+        elsewhere = Then(lambda job, number: job.target.unlink())
         with pytest.raises(InputError, match=r"2 sources were refused.*while they learned it, again and again"):
-            run(tmp_path / "m", sources[:2], client=Elsewhere())
+            run(tmp_path / "m", sources[:2], client=elsewhere)
 
 
 def renamed(path):
@@ -174,27 +175,30 @@ def renamed(path):
         learner.pack(path)
 
 
+def test_a_job_has_no_more_bytes_than_it_may(tmp_path, sources, monkeypatch):
+    monkeypatch.setattr(steps, "JOBS_A_WORKER", 1)
+    monkeypatch.setattr(steps, "MOST_STEP_BYTES", 2 * max(path.stat().st_size for path in sources))
+    jobs = []
+    client = Then(lambda job, number: jobs.append(len(job.sources)))
+    client._max_workers = 1
+    assert run(tmp_path / "m", sources, client=client).observations == 12
+    assert jobs == [2] * 6
+
+
 class TestSpoilt:
     @pytest.mark.parametrize("place", [None, -9, 3000])
     def test_one_that_is_spoilt_while_the_run_goes_on_is_learned_again(self, tmp_path, sources, monkeypatch, place):
         monkeypatch.setattr(steps, "MOST_SOURCES", 3)
 
-        class Spoiling(DyingExecutor):
-            spoilt = 0
+        def spoil(job, number):
+            if number == 3 and place is None:
+                renamed(job.target)
+            elif number == 3:
+                whole = bytearray(job.target.read_bytes())
+                whole[place] ^= 1
+                job.target.write_bytes(bytes(whole))
 
-            def submit(self, what, job):
-                future = super().submit(what, job)
-                self.spoilt += 1
-                if self.spoilt == 3:
-                    if place is None:
-                        renamed(job.target)
-                    else:
-                        whole = bytearray(job.target.read_bytes())
-                        whole[place] ^= 1
-                        job.target.write_bytes(bytes(whole))
-                return future
-
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Spoiling())
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Then(spoil))
         assert done.observations == 12 and not done.refused and done.sources == 12
         require_learned(tmp_path / "m")
 

@@ -126,6 +126,12 @@ class TestSources:
             (ended,) = session.push(np.load(tmp_path / "gel.npy")).touches
         np.testing.assert_array_equal(touch.stream.readings, ended.stream.readings)
 
+    def test_contacts_of_a_camera_that_follow_each_other_share_no_frame(self, tmp_path):
+        np.save(tmp_path / "gel.npy", np.concatenate([frames(GEL.materials[0], number, 5) for number in range(3)]))
+        found = source_touches(gel_learner(), str(tmp_path / "gel.npy"), SourceOptions(cut="contact", material="a"))
+        spans = [list(map(int, each.source.rpartition("npy")[2].strip("[]").split(":"))) for each in found]
+        assert len(spans) == 3 and (np.diff(np.concatenate(spans)) >= 0).all()
+
     def test_names_with_anything_in_them_are_kept_printable_and_bounded(self, tmp_path, learner):
         odd = put(tmp_path / ("fé[b]\x1b\n" + "x" * 200) / "=1+1 .npy", (0, 60))
         done = learn_sources(learner, [str(odd)], SourceOptions(material="[red]a"))

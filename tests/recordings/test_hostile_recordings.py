@@ -241,6 +241,9 @@ class TestBounds:
         budget.take(bounds.SPARE + 10 * bounds.RATIO)
         with pytest.raises(RecordingError, match="in 10 bytes on the disk; expected at most 256 times as many"):
             budget.take(1)
+        budget.give(bounds.SPARE + 10 * bounds.RATIO)
+        with pytest.raises(RecordingError, match="bytes of readings in 10 bytes on the disk"):
+            budget.give(1)
         budget.add(1)
         budget.take(bounds.RATIO - 1)
         budget.work(bounds.SPARE_STEPS + 11 * bounds.STEPS_A_BYTE)

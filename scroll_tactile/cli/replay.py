@@ -59,9 +59,8 @@ def live(
             if touch:
                 session.begin()
             before: LiveState | None = None
-            count, at = 0, 0.0
-            for row in _rows(file, timed):
-                count += 1
+            at = 0.0
+            for count, row in enumerate(_rows(file, timed), start=1):
                 reading, time = (row[1:], float(row[0])) if timed else (row, None)
                 reading = reading if columns is None else reading[places(columns, reading.size)]
                 now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)

@@ -247,7 +247,9 @@ class TestNotes:
         left = tmp_path / "m.fleet" / "learned-0.part.x.partial"
         (left / "memory").mkdir(parents=True)
         (tmp_path / "m.fleet" / "mine.txt").write_text("any")
-        run(tmp_path / "m", sources)
+        seen = []
+        run(tmp_path / "m", sources, client=Then(lambda job, number: seen.append(left.exists())))
+        assert seen and not any(seen)
         assert sorted(path.name for path in (tmp_path / "m.fleet").iterdir()) == ["mine.txt", "run.json"]
 
     def test_notes_are_few_where_noting_takes_long(self, tmp_path, sources, monkeypatch):

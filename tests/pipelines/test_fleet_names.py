@@ -149,8 +149,9 @@ def test_memories_are_refused_touch_by_touch_where_they_have_rows_and_whole_wher
             learner.observe("z", stream(TOUCHES[3][1]).astype(np.float32), source="robot 7")
             learner.observe("z", stream((90 + rows, 60)).astype(np.float32))
             learner.pack(tmp_path / name, rows=rows)
-    done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "rows", tmp_path / "sums"])
-    assert [each.source for each in done.refused] == ["robot 7", str(tmp_path / "sums")]
+    for _ in range(2):  # and says so again
+        done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "rows", tmp_path / "sums"])
+        assert [each.source for each in done.refused] == ["robot 7", str(tmp_path / "sums")]
     assert all("as 'a' and not as 'z'" in each.why for each in done.refused)
     assert "none of them can be left out" in done.refused[1].why
     with TactileLearner.open(tmp_path / "m") as learner:

@@ -112,6 +112,12 @@ def test_a_rate_counts_times_and_blocks_go_on_with_it(tmp_path):
         read(path, rate=0)
 
 
+def test_a_step_of_more_than_twice_the_usual_is_no_jitter(tmp_path):
+    times = [*(i / 10 for i in range(9)), 1.05]
+    report = read(table(tmp_path, "time,a\n" + "".join(f"{time},1\n" for time in times))).report
+    assert report.rate == pytest.approx(10) and report.jitter == pytest.approx(0, abs=1e-9)
+
+
 def test_the_slow_way_gives_the_same_as_the_fast(tmp_path):
     values = np.random.default_rng(1).standard_normal((500, 4))
     np.savetxt(tmp_path / "fast.csv", values, delimiter=",", fmt="%.17g")

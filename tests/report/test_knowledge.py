@@ -173,6 +173,7 @@ def test_faults_of_channels_are_found():
         readings[:, 0] = 3.0
         readings[::8, 1] = 400.0
         readings[:, 2] += 60 * part
+        readings[::8, 3] = 0.0  # at rest: the end of a range that begins at zero
 
     assert faults(spoil) == [["dead"], ["saturated"], ["drifting"], []]
 

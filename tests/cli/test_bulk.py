@@ -129,7 +129,7 @@ class TestLearn:
         assert "cannot be read" in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "no.csv")
 
     def test_ctrl_c_ends_it_and_it_goes_on(self, memory: Path, tmp_path: Path) -> None:
-        for i in range(32):
+        for i in range(60):
             touch(tmp_path / "many", "silk", i)
         words = [sys.executable, "-c", SLOWLY, "learn", memory, tmp_path / "many", "--label", "silk"]
         process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -143,9 +143,9 @@ class TestLearn:
             process.kill()
         assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
         before = _observed(memory)
-        assert 0 < before < 32
+        assert 0 < before < 60
         found = json.loads(run("learn", memory, tmp_path / "many", "--label", "silk", "--json").stdout)
-        assert (found["touches"], found["skipped"], found["observations"]) == (32 - before, before, 32)
+        assert (found["touches"], found["skipped"], found["observations"]) == (60 - before, before, 60)
 
 
 SLOWLY = """

@@ -163,8 +163,14 @@ def test_an_empty_memory_and_one_material_say_what_is_missing():
     assert "1 material, 4 touches" in text
     assert "teach a second one" in text
     learner.observe("silk", Scene(sensor=PAD).touch("silk", 0))
+    assert "2 materials, 5 touches" in words(memory_page(learner))
+
+
+def test_single_touches_leave_nothing_out():
+    learner = TactileLearner(sensor=PAD, embedding=SMALL)
+    feel(learner, 1, 3)
     text = words(memory_page(learner))
-    assert "2 materials, 5 touches" in text and "two materials with two touches or more of each" in text
+    assert "two materials with two touches or more of each" in text and "Nearest pairs" in text
 
 
 def test_touches_that_are_mixed_up_are_named_by_where_they_came_from(tmp_path):

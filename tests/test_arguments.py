@@ -61,7 +61,8 @@ def test_paths(tmp_path, monkeypatch, learner, path):
         ({"kept_touches": 1.5}, "expected kept_touches"),
         ({"exemplars": -1}, "expected exemplars"),
         ({"exemplars": [4]}, "expected exemplars"),
-        ({"readout": None}, "expected readout"),
+        *(({"false_alarms": share}, "^expected false_alarms to be") for share in (0, 1.0)),
+        *(({"readout": readout}, "^expected readout to be") for readout in ("svm", None)),
         ({"colour": "red"}, "no setting"),
     ],
 )

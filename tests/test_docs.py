@@ -13,6 +13,8 @@ from commands import run
 from readme import TEXT as README
 from readme import command_lines, lay_out, promised, run_session, set_up_lines
 
+from scroll_tactile import Kernels
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -74,7 +76,8 @@ def test_every_example_is_short_and_among_those_that_run():
 
 
 @pytest.mark.parametrize("name", SHOWN)
-def test_examples_run(name, capsys):
+def test_examples_run(name, capsys, monkeypatch):
+    monkeypatch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 256)  # a fit takes a tenth of the time
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
     assert SHOWN[name] in capsys.readouterr().out
 

@@ -59,15 +59,15 @@ def live(
             if touch:
                 session.begin()
             before: LiveState | None = None
-            count = 0
-            for row in _rows(file, timed):
-                count += 1
+            at = 0.0
+            for count, row in enumerate(_rows(file, timed), start=1):
                 reading, time = (row[1:], float(row[0])) if timed else (row, None)
                 reading = reading if columns is None else reading[places(columns, reading.size)]
                 now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)
-                before = _shown(before, now, count / learner.sensor.rate, as_json, growing)
+                at = count / learner.sensor.rate if time is None else time
+                before = _shown(before, now, at, as_json, growing)
             if touch:
-                _shown(before, session.end(), count / learner.sensor.rate, as_json, growing)
+                _shown(before, session.end(), at, as_json, growing)
         _summed_up(session.report, as_json)
 
 

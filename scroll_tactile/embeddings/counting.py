@@ -21,9 +21,9 @@ from scroll_tactile.embeddings.convolution import HEAVY, ROUND, Bank, Floats, wo
 
 __all__ = [
     "GROUP",
+    "CountRequest",
     "Counts",
     "Groups",
-    "CountRequest",
     "competing_counts",
     "competing_groups",
     "count",

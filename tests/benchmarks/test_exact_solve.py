@@ -162,24 +162,3 @@ def test_a_singular_system_is_refused_with_its_exact_rank(rows, rank):
 def test_weights_too_large_for_a_double_are_not_passed_off():
     with pytest.raises(SingularError, match="exceed"):
         solved(np.array([[5e-324], [0.0]]), np.ones((2, 1)))
-
-
-# Schedules
-
-
-def test_a_hundred_schedules_give_the_same_bytes_where_plain_sums_do_not():
-    """The thousand, with two threads, are measured by `benchmarks numerics`."""
-    rng = np.random.default_rng(9)
-    rows, targets = rng.normal(size=(120, 9)), np.eye(3)[rng.integers(3, size=120)]
-    exact, plain = set(), set()
-    for _ in range(100):
-        order = rng.permutation(120)
-        solver, total = Exact(), np.zeros((9, 9))
-        solver.start(9, 3, 1e-6)
-        for some in np.split(order, np.sort(rng.integers(0, 120, size=rng.integers(1, 20)))):
-            solver.update(rows[some], targets[some])
-            total += rows[some].T @ rows[some]
-        exact.add((solver.digest(), solver.weights().tobytes()))
-        plain.add(total.tobytes())
-    assert len(exact) == 1
-    assert len(plain) > 90

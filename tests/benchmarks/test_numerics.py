@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from examples.benchmarks.numerics import comparison
 from examples.benchmarks.numerics.comparison import claims, find_nist
 from examples.benchmarks.numerics.learned import AGREED, answers_error, flips, measure_learned
-from examples.benchmarks.numerics.long_runs import run_drift, run_schedules, run_updates
+from examples.benchmarks.numerics.long_runs import run_schedules, run_updates
 from examples.benchmarks.numerics.memories import make_memories
 from examples.benchmarks.numerics.peers import as_case, error_of, measure
 from examples.benchmarks.numerics.recorded import digits, nist_cases
@@ -127,14 +127,6 @@ def test_a_readout_follows_touches_much_louder_than_all_before(louder):
     assert followed["solved_again"] >= (louder >= 1e3)
 
 
-def test_ten_thousand_observations_do_not_drift():
-    (found,) = run_drift(0, 8, 10_000, lambda _: None)
-    assert found["rows"] == 10_000
-    assert found["solved_again"] > 200  # a readout has room for 32
-    assert max(found[name] for name in ("answers_error", "ridge_error", "novelty_error")) < AGREED
-    assert found["flipped"] == 0
-
-
 class TestMeasuring:
     def test_cases_have_names_of_their_own_and_a_seed_makes_them_again(self):
         first, again, other = ([*make_memories(seed, 0.1), *make_cases(seed)] for seed in (3, 3, 4))
@@ -182,13 +174,10 @@ class TestMeasuring:
         assert found["ridge_error"] == {"error": 2e-9, "case": "b"}
 
     def test_updates_are_measured_at_each_power_of_ten(self):
-        found = list(run_updates(0, 8, 10_000, ["exact", "plain sums"], lambda _: None))
-        assert [(one["method"], one["rows"]) for one in found] == [
-            ("exact", 1000), ("exact", 10_000), ("plain sums", 1000), ("plain sums", 10_000),
-        ]  # fmt: skip
-        assert all(one["weights_error"] < 1e-11 for one in found)
-        assert found[1]["weights_error"] < 2.0**-52
-        assert found[1]["case"] == "1e4 observations, 8 features"
+        exact, plain = run_updates(0, 8, 1000, ["exact", "plain sums"], lambda _: None)
+        assert [(one["method"], one["rows"]) for one in (exact, plain)] == [("exact", 1000), ("plain sums", 1000)]
+        assert exact["weights_error"] < 2.0**-52 and plain["weights_error"] < 1e-11
+        assert exact["case"] == "1e3 observations, 8 features"
 
     def test_schedules_count_what_differs(self):
         methods = ("learner", "exact", "plain sums")
@@ -254,36 +243,16 @@ def test_powers_are_rounded_once(nist):
     assert case.rows[0, 10] == float(Fraction(first) ** 10)
 
 
-@pytest.fixture(scope="module")
-def quick(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    folder = tmp_path_factory.mktemp("numerics")
-    with pytest.MonkeyPatch.context() as smaller:
-        smaller.setattr(comparison, "QUICK", 0.1)
-        smaller.setattr(comparison, "QUICK_OBSERVATIONS", 1000)
-        result = run("bench", "numerics", "--quick", "--json", folder / "n.json")
-    assert result.exit_code == 0, result.output
-    return folder, result.output
-
-
-def test_the_command_measures_every_case_with_every_method(quick):
-    folder, said = quick
-    result = json.loads((folder / "n.json").read_text())
-    wanted = {"case", "family", "method", "answers_error", "weights_error", "flipped", "seconds_per_row"}
-    assert all(wanted <= one.keys() for one in result["records"] if one["method"] in SOLVERS)
-    assert {"command", "date", "versions", "machine", "seed"} <= result.keys()
-    for case in [*make_memories(0, 0.1), *make_cases(0)]:
-        learned = set() if isinstance(case, Case) else {"learner", "learner, followed", "grid"}
-        assert {one["method"] for one in result["records"] if one["case"] == case.name} == learned | set(SOLVERS)
-    exact = [one for one in result["records"] if one["method"] == "exact" and one["weights_error"] is not None]
-    assert max(one["weights_error"] for one in exact) < 1e-15
-    assert result["claims"]["agreed"]
-    assert result["claims"]["flipped"] == 0
-    assert "Hilbert" in said
-    assert "not measured: biotac" in said
-
-
 def test_what_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):
     assert "folder" in refused("bench", "numerics", "--quick", "--json", tmp_path / "none" / "n.json")
+
+
+@pytest.mark.parametrize(("agreed", "flipped", "code"), [(True, 0, 0), (False, 0, 1), (True, 1, 1)])
+def test_figures_that_cannot_be_right_end_the_command_with_1(monkeypatch, agreed, flipped, code):
+    """CI runs `numerics --quick`."""
+    measured = {"records": [], "not_measured": {}, "claims": {"agreed": agreed, "flipped": flipped, "limit": 1e-9}}
+    monkeypatch.setattr(comparison, "run_numerics", lambda **_: measured)
+    assert run("bench", "numerics", "--quick").exit_code == code
 
 
 def test_a_library_that_is_not_there_is_named_with_what_installs_it(monkeypatch):

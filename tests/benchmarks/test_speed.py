@@ -18,8 +18,8 @@ from examples.benchmarks.timing import CLOCKS, Timing, take_turns
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
 from scroll_tactile.errors import InputError
 
-FEW = {"touches": 40, "asked": 2, "pairs": 2, "starts": 2, "materials": 6, "before_materials": 6, "each": 2}
-TINY = Sizes(**FEW, opening=(100,), before_opening=100)
+FEW = {"touches": 40, "asked": 1, "pairs": 2, "starts": 1, "materials": 6, "before_materials": 0, "each": 2}
+TINY = Sizes(**FEW, opening=(100,), before_opening=0)  # an older checkout beside the everyday memory alone
 
 
 def test_a_timing_is_the_median_and_the_99th_percentile_of_its_calls():
@@ -58,7 +58,7 @@ def measured(without_torch):
     """Every case, tiny, with this checkout beside itself."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed, "checkouts", lambda before: {"now": without_torch, "before": before})
-        patch.setattr(speed, "REPLAYED", 25)
+        patch.setattr(speed, "REPLAYED", 6)
         patch.setattr(speed, "REFRESHES", 2)
         return run_speed(sizes=TINY, before=without_torch)
 
@@ -68,16 +68,16 @@ def test_every_case_is_measured_on_both_sides(measured):
     everyday = "40 touches of 20 materials, BioTac"
     for case, calls in (
         ("observe, durable", 40),
-        ("import torch", 2),
-        ("first predict after opening", 2),
-        ("predict again", 40),
+        ("import torch", 1),
+        ("first predict after opening", 1),
+        ("predict again", 20),
         ("predict right after an observe", 2),
         ("a reader's refresh after one observation", 2),
-        ("open, 25 observations after the last close", 2),
+        ("open, 6 observations after the last close", 1),
     ):
         record = found[everyday, case]
         assert (record["calls"], record["before_calls"]) == (calls, calls)
-        assert 0 < record["median"] <= record["p99"] <= record["largest"]
+        assert 0 < record["median"] <= (record["p99"] or record["largest"]) <= record["largest"]
         assert record["times"] == record["before_median"] / record["median"]
         assert record["of_forward"] == record["median"] / measured["resnet_forward"]["median_milliseconds"]
     assert found[everyday, "predict again"]["wrong"] < 0.5

@@ -101,6 +101,11 @@ class TestLearn:
             assert result.stderr.count("refused:") == 6
         assert not new.exists()
 
+    def test_a_cut_that_is_none_and_a_memory_that_is_being_written_are_refused(self, memory: Path, data: Path) -> None:
+        assert run("learn", memory, data, "--cut", "thin").exit_code == 2
+        with TactileLearner.open(memory):
+            assert "is being written by process" in refused("learn", memory, data, "--label", "a")
+
     def test_labels_in_a_table(self, memory: Path, data: Path, tmp_path: Path) -> None:
         rows = SCENE.touch("silk", 0).readings
         table = np.hstack([np.arange(len(rows))[:, None] / 50, rows])
@@ -122,16 +127,6 @@ class TestLearn:
             (tmp_path / "wrong.csv").write_text(text)
             assert said in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "wrong.csv")
         assert "cannot be read" in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "no.csv")
-
-    def test_options_that_do_not_fit_are_one_line(self, memory: Path, data: Path) -> None:
-        assert "in one way" in refused("learn", memory, data, "--label", "a", "--label-by", "file")
-        assert "1 to 200" in refused("learn", memory, data, "--label", "")
-        assert "--cut intervals takes --labels, a table" in refused("learn", memory, data, "--cut", "intervals")
-        assert "expected a preset" in refused("learn", memory, data, "--preset", "nose", "--label", "a")
-        assert "biotac" in refused("learn", memory, data, "--sensor", "biotac", "--label", "a")
-        assert run("learn", memory, data, "--cut", "thin").exit_code == 2
-        with TactileLearner.open(memory):
-            assert "is being written by process" in refused("learn", memory, data, "--label", "a")
 
     def test_ctrl_c_ends_it_and_it_goes_on(self, memory: Path, tmp_path: Path) -> None:
         for i in range(60):

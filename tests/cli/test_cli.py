@@ -2,7 +2,6 @@
 
 import json
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -125,12 +124,6 @@ class TestMemory:
 LONGER = [*SMALL, "--materials", "10", "--held-out", "1"]  # a demo long enough to be stopped in
 
 
-@pytest.fixture(scope="module")
-def uninterrupted() -> str:
-    """The digest of a demo that nothing stopped."""
-    return digest_of(run("demo", *LONGER).stdout)
-
-
 class TestDemo:
     def test_it_shows_all_it_promises(self) -> None:
         result = run("demo", *SMALL, "--sensor", "contactile")
@@ -148,35 +141,32 @@ class TestDemo:
             assert words in result.stdout
 
     def test_errors_are_one_line(self, tmp_path: Path) -> None:
-        assert "camera" in refused("demo", "--sensor", "gelsight")
-        assert "one of" in refused("demo", "--sensor", "nose")
-        assert "seed" in refused("demo", "--seed", "-1")
+        for said, *words in (
+            ("camera", "--sensor", "gelsight"), ("one of", "--sensor", "nose"), ("seed", "--seed", "-1"),
+        ):  # fmt: skip
+            assert said in refused("demo", "--memory", tmp_path / "m", *words)
+            assert not (tmp_path / "m").exists()
         (tmp_path / "file").write_text("")
         assert "is a file" in refused("demo", "--memory", tmp_path / "file")
 
-    @pytest.mark.parametrize("stop", [signal.SIGKILL, signal.SIGINT], ids=lambda stop: stop.name)
-    def test_the_plug_is_pulled_and_it_goes_on(self, tmp_path: Path, uninterrupted: str, stop: signal.Signals) -> None:
+    def test_the_plug_is_pulled_and_it_goes_on(self, tmp_path: Path) -> None:
         kept = tmp_path / "kept"
         words = [sys.executable, "-m", "scroll_tactile.cli", "demo", "--memory", str(kept), *LONGER]
-        process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
         try:
             until = time.monotonic() + 60
             while not _finished(kept) and process.poll() is None and time.monotonic() < until:
                 time.sleep(0.005)
-            process.send_signal(stop)
-            _, errors = process.communicate(timeout=60)
         finally:
             process.kill()
+            process.wait()
         assert len(_finished(kept)) < 10, "it was not stopped in time"
-        if stop is signal.SIGINT:  # what a killed one can do it can, too
-            assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
-            return
         resumed = run("demo", "--memory", kept, *LONGER)
         assert resumed.exit_code == 0, resumed.output
         observed = re.search(r"observed now: (\d+)", resumed.stdout)
         assert observed
         assert int(observed[1]) < 30
-        assert digest_of(resumed.stdout) == uninterrupted
+        assert digest_of(resumed.stdout) == digest_of(run("demo", *LONGER).stdout)
         assert digest_of(resumed.stdout) == digest_of(run("inspect", kept / "memory").stdout)
 
 

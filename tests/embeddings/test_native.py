@@ -56,7 +56,9 @@ def test_any_bank_counts_as_by_numpy(data):
     firsts = data.draw(st.lists(st.integers(0, places - 1), min_size=1, max_size=20))
     windows = tuple((first, data.draw(st.integers(first + 1, places))) for first in firsts)
     groups = competing_groups(own, data.draw(st.integers(1, 2 * kernels // GROUP)))
-    request = CountRequest(own, data.draw(st.integers(0, 3 * kernels)), windows, data.draw(st.sampled_from([None, groups])))
+    request = CountRequest(
+        own, data.draw(st.integers(0, 3 * kernels)), windows, data.draw(st.sampled_from([None, groups]))
+    )
     levels = rng.integers(-LEVELS, LEVELS + 1, (channels, places + 8 * dilation)).astype(np.float32)
     if data.draw(st.booleans()):
         levels = np.asfortranarray(levels)  # as those of a stretched image come

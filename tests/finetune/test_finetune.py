@@ -287,16 +287,6 @@ def test_a_material_of_which_all_is_held_out_is_not_compared():
     assert start.names == model.names
 
 
-@pytest.mark.parametrize("kind", ["kernels", "vision"])
-def test_touches_that_are_all_too_short_say_so(kind):
-    learner = TactileLearner(sensor=PAD, embedding=EMBEDDINGS[kind](), exemplars=12)
-    for name, stream in touches:
-        learner.observe(name, stream.first(0.4))
-    with pytest.raises(errors.InputError, match="Observe longer touches"):
-        learner.fine_tune()
-    assert learner.predict(touches[0][1].first(0.4)).material in NAMES
-
-
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, StoreError("no space left")])
 def test_what_comes_after_the_commit_leaves_disk_and_memory_agreed(tmp_path, monkeypatch, stop):
     learner = learned("kernels", path=tmp_path / "m")

@@ -103,6 +103,7 @@ class TestCells:
         cells = [Cell("a", 0, "slow"), Cell("a", 1, "slow"), Cell("b", 0, "slow"), Cell("a", 0, "quick")]
         assert time_left({}, cells) == ""
         assert time_left({cells[0]: 30.0}, cells[1:2]) == ", about 30 s left"
+        assert time_left({cells[0]: 30.0, cells[2]: 90.0}, cells[1:2]) == ", about 30 s left"  # of the same set
         assert time_left({cells[0]: 240.0, cells[3]: 1.0}, cells) == ", about 8 min left"
 
     def test_folds_of_unequal_size_count_by_touches(self):

@@ -27,6 +27,7 @@ from examples.paper.studies.recursive_ridge import RecursiveRidge
 from examples.paper.studies.robustness import SESSION, Robustness, Series, Simulated
 from examples.paper.studies.schedules import SCHEDULES, arrange, part_ends, si_blurry
 from examples.paper.studies.unlearning import Unlearning, relative_error, requests, ridge_from_scratch
+from scroll_tactile import Kernels
 from scroll_tactile.errors import InputError
 
 HERE = Path(__file__).resolve().parents[2]
@@ -234,7 +235,8 @@ class TestRobustness:
         with pytest.raises(InputError, match=r"text\.npz; they cannot be read"):
             Series(tmp_path / "text.npz").fits()
 
-    def test_another_checkout_answers_the_same_touches(self):
+    def test_another_checkout_answers_the_same_touches(self, monkeypatch):
+        monkeypatch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 1008)  # as a process of its own has it
         sets = recorded(PATCH, materials=3, each=6)
         train = [(name, stream.readings) for name, stream in zip(sets.materials[::2], sets.streams[::2], strict=True)]
         tests = {"whole": [stream.readings for stream in sets.streams[1::6]], "none": [sets.streams[3].readings[:2]]}

@@ -58,11 +58,6 @@ class TestScore:
                 score(["a", "b"], truth, presence)
 
 
-def forces(fabric, protocol, repetition=0, scene=SCENE):
-    """(T, 9, 3) N, once the touch has settled."""
-    return scene.touch(fabric, protocol, repetition).readings.astype(np.float64).reshape(-1, 9, 3)[100:]
-
-
 class TestSimulated:
     def test_shares_are_parts_of_one_and_every_constituent_is_in_some(self):
         made_of = SCENE.compositions
@@ -87,29 +82,6 @@ class TestSimulated:
         others.append(FabricScene(seed=1).touch("fabric07", protocol, 3))
         others.append(SCENE.touch("fabric07", 3 - protocol, 3))
         assert len({stream.key for stream in [first, *others]}) == 5
-
-    def test_a_robot_presses_and_moves_alike_and_a_hand_does_not(self):
-        load, way = {}, {}
-        for protocol in (ROBOT, HAND):
-            touches = [forces("fabric02", protocol, repetition) for repetition in range(8)]
-            load[protocol] = np.array([touch[..., 2].sum(axis=1).mean() for touch in touches])
-            along = [np.sign(touch[:, :, 0].sum(axis=1)) for touch in touches]
-            way[protocol] = [int(np.flatnonzero(np.diff(one))[0]) for one in along if np.ptp(one)]
-        assert load[ROBOT].mean() == pytest.approx(5, rel=0.1)
-        assert load[HAND].std() > 4 * load[ROBOT].std()
-        assert np.ptp(way[ROBOT]) < 5 < np.ptp(way[HAND])
-
-    def test_yarn_is_observed(self):
-        """Wool drags more than cotton, that more than linen, and polyester least."""
-
-        def friction(name):
-            settled = forces(name, ROBOT)[150:200]
-            return float((np.linalg.norm(settled[..., :2].sum(axis=1), axis=1) / settled[..., 2].sum(axis=1)).mean())
-
-        pure = {next(iter(shares)): name for name, shares in SCENE.compositions.items() if len(shares) == 1}
-        assert friction(pure["polyester"]) < friction(pure["linen"]) < friction(pure["cotton"])
-        wool = [friction(name) for name, shares in SCENE.compositions.items() if shares.get("wool", 0) > 0.6]
-        assert min(wool) > friction(pure["cotton"])
 
     def test_a_set_is_dealt_into_seeded_folds_of_each_fabric_and_protocol(self):
         scene = FabricScene(seed=2, count=3)

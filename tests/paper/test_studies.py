@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ from paper_touches import untimed
 
 from examples.paper.fabric.attributes import FIGURES as GRADED
 from examples.paper.fabric.letters import FIGURES as OF_LETTERS
-from examples.paper.runs.options import SETS
 from examples.paper.runs.study import SystemStudy
 from examples.paper.studies.metrics import METHODS, STREAMS
 from examples.paper.studies.replay import FIGURES as OF_REPLAY
@@ -95,7 +93,7 @@ STUDIES = {
         ("published: ridge", "True"),
     ),
     "continual": Study(
-        "continual roboskin-20 --features 64 --sizes 0,8,all --epochs 1 --curve 2 --tuned-curve --plot P.png",
+        "continual roboskin-20 --features 64 --sizes 0,8,all --epochs 1 --curve 4 --tuned-curve --plot P.png",
         {
             ("means", 0): {"method", "size", "accuracy", "forgetting", "curve"},
             ("means", 4): {
@@ -151,8 +149,8 @@ STUDIES = {
         ("hardness, composed",),
     ),
     "contactile": Study(
-        "fabric contactile --simulated --size 5,6,2 --rows least-squares,resnet-biotac,resnet-augmented,kernels,"
-        "ratios-copies --weights W --biotac DATA --epochs 1 --biotac-epochs 1 --every 24 --take 1",
+        "fabric contactile --simulated --size 5,6,2 --rows least-squares,resnet-biotac,kernels,ratios-copies "
+        "--weights W --biotac DATA --epochs 1 --biotac-epochs 1 --every 24 --take 1",
         {
             ("rows", 0): {"key", "system", "paper", "difference", "parts"},
             ("rows", 0, "parts"): {"protocol 1 → 2", "protocol 1 → 1, held out"},
@@ -160,7 +158,7 @@ STUDIES = {
                 *("score", "exact", "share_error", "calibration_error", "always", "inferred", "heads", "fabric"),
             },
         },
-        ("78.9", "1 epochs (the paper has 50)", "simulated:"),
+        ("80.6", "1 epochs (the paper has 50)", "simulated:"),
     ),
     "tasks": Study(
         "transfer tasks --sets biotac-20,roboskin-20 --weights W --counts 1,2 --sources roboskin-20 --epochs 1 "
@@ -274,14 +272,6 @@ def test_ours_have_no_trace_of_what_went_and_no_schedule(words_of, gelsight, tmp
     assert len(digests) == 1
 
 
-def test_real_touches_are_replayed(real_data, tmp_path):
-    words = ("replay", "roboskin-20", "--data", real_data, "--quick", "--json", tmp_path / "r")
-    assert run(*words).exit_code == 0
-    found = json.loads((tmp_path / "r").read_text())
-    assert found["means"]["accuracy"]["mean"] == found["folds"][0]["accuracy"] > 0.5
-    assert found["folds"][0]["equals_offline"] and len(found["folds"][0]["digest"]) == 64
-
-
 def test_a_picture_of_each_study_of_each_set(words_of, gelsight, tmp_path):
     pytest.importorskip("matplotlib")
     words = ["strengths", "paper", "--systems", "ours", "--data", gelsight, "--quick", "--folds", "0"]
@@ -336,13 +326,3 @@ def test_a_picture_of_each_study_of_each_set(words_of, gelsight, tmp_path):
 def test_what_cannot_be_is_one_red_line(words, message, words_of, gelsight):
     data = [] if "contactile" in words else ["--data", gelsight]
     assert message in refused(*words_of(words), *data)
-
-
-def test_a_run_of_other_settings_or_of_other_data_is_refused(words_of, gelsight, tmp_path, small_sets, monkeypatch):
-    words = ["table1", "--systems", "svm-spikes", "--sets", "biotac-20", "--quick", "--data", gelsight]
-    words += ["--run", tmp_path / "run"]
-    assert run(*words).exit_code == 0
-    assert "epochs 15 there, 4 here" in refused(*words, "--epochs", 4)
-    other = replace(small_sets["roboskin-20"], name="BioTac-20")
-    monkeypatch.setitem(SETS, "biotac-20", lambda data, seed: other)
-    assert "other recordings or folds of BioTac-20" in refused(*words)

@@ -1,7 +1,6 @@
 """The systems of the comparison: encoding, what each learns, and the training that the networks share."""
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,11 +8,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from paper_touches import recorded
 from torch import nn
 
 from examples.paper.readers.physiclear import HALF_SIZE
-from examples.paper.studies.table1 import Table1
 from examples.paper.systems.catalogue import SYSTEMS, Catalogue
 from examples.paper.systems.descent import Batches, Course, Precision, TrainingError, descend, logits_of, seeded
 from examples.paper.systems.inputs import average_columns, one_width, picture
@@ -368,14 +365,3 @@ class TestOnesOwn:
         assert is_own(key)
         with pytest.raises(InputError, match=message):
             require_own(key)
-
-    def test_a_run_is_not_resumed_with_another_file(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.syspath_prepend(tmp_path)
-        file = tmp_path / "mine_alone.py"
-        file.write_text("from examples.own_system import NearestMean\n")
-        study = Table1([recorded()], ("mine_alone:NearestMean",), folder=tmp_path / "run")
-        ((_, first),) = study.run({"RoboSkin-20": [0]})
-        assert [figures for _, figures in study.run({"RoboSkin-20": [0]})] == [first]
-        file.write_text("from examples.own_system import NearestMean  # changed\n")
-        with pytest.raises(InputError, match="begun with other the file of mine_alone:NearestMean"):
-            list(study.run({"RoboSkin-20": [0]}))

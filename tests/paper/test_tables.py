@@ -164,15 +164,20 @@ def test_every_result_says_what_made_it_and_names_no_machine(path):
     assert not re.search(r"/(root|work|tmp|home)/", text)
 
 
+def require_command(words):
+    """Raise where the paper's program has no such command, or no such option."""
+    parsed = typer.main.get_command(paper)
+    while words and hasattr(parsed, "commands"):
+        parsed = parsed.commands[words.pop(0)]
+    parsed.make_context("it", words)
+
+
 @pytest.mark.parametrize("path", sorted(ROOMS[0].glob("results/*.json")), ids=lambda path: path.stem)
 def test_the_noted_commands_can_be_given(path):
     for command in json.loads(path.read_text())["command"].split(" && "):
         python, m, program, *words = shlex.split(command)
         assert (python, m, program) == ("python", "-m", "examples.paper")
-        parsed = typer.main.get_command(paper)
-        while words and hasattr(parsed, "commands"):
-            parsed = parsed.commands[words.pop(0)]
-        parsed.make_context("it", words)  # raises for an option that there is not
+        require_command(words)
 
 
 def test_the_results_are_small():
@@ -183,7 +188,4 @@ def test_the_map_of_the_paper_names_commands_that_can_be_given():
     named = re.findall(r"^\| .* \| \[.*\]\(#\S+\) \| `(.+)` \|$", (ROOMS[0] / "RESULTS.md").read_text(), re.MULTILINE)
     assert len(named) >= 8
     for command in named:
-        parsed, words = typer.main.get_command(paper), command.split()
-        while words and hasattr(parsed, "commands"):
-            parsed = parsed.commands[words.pop(0)]
-        parsed.make_context("it", words)
+        require_command(command.split())

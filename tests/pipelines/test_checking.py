@@ -72,7 +72,7 @@ def test_a_check_that_dies_is_damage(path, tmp_path, monkeypatch, death):
     )
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     if death == "a hang":  # the others end by themselves, however long a busy machine takes to start them
-        monkeypatch.setattr(checking, "SPARE_SECONDS", 10.0)
+        monkeypatch.setattr(checking, "SPARE_SECONDS", 1.0)
     (problem,) = check_in_process(path)
     assert problem.kind == "lost"
     assert re.search(said, problem.what)

@@ -6,17 +6,18 @@ import os
 import socket
 import threading
 
-import numpy as np
 import pytest
 from buckets import BUCKETS, served
 from commands import refused
 from commands import run as command
-from test_fleet import BY_FOLDER, TOUCHES, expected, run, touch_files
-from touches import PAD, SETTINGS, stream
+from test_fleet import BY_FOLDER, TOUCHES, expected, jobs_here, memory_of, run, touch_files
+from touches import PAD, SETTINGS
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.fleet import learn
+
+__all__ = ["jobs_here"]  # a fixture
 
 CLUSTER = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask[distributed] is missing")
 
@@ -34,10 +35,7 @@ class TestBucket:
     def test_recordings_and_packed_memories_in_a_bucket_are_one_memory(self, tmp_path, bucket):
         for path in touch_files(tmp_path / "in", TOUCHES[:9]):
             bucket.put_file(str(path), f"touches/day/{path.parent.name}/{path.name}")
-        with TactileLearner.open(tmp_path / "robot", **SETTINGS) as learner:
-            for name, touch in TOUCHES[7:]:
-                learner.observe(name, stream(touch).astype(np.float32))
-            learner.pack(tmp_path / "robot.part", source="robot 7")
+        memory_of(tmp_path / "robot", TOUCHES[7:], tmp_path / "robot.part", source="robot 7")
         bucket.put_file(str(tmp_path / "robot.part"), "touches/robot.part")
         done = run(tmp_path / "m", ["s3://touches/day", "s3://touches/robot.part", "s3://touches/nothing"])
         assert [each.source for each in done.refused] == ["s3://touches/nothing"]
@@ -59,17 +57,19 @@ class TestBucket:
         assert "Access Denied" in "".join(each.why for each in done.refused)
         assert done.digest == expected().digest()
 
+    @pytest.mark.usefixtures("jobs_here")
     def test_a_bucket_that_never_answers_is_given_up(self, tmp_path, bucket):
         touch_files(tmp_path / "in", TOUCHES)
         with socket.create_server(("127.0.0.1", 0)) as silent:
             os.environ["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{silent.getsockname()[1]}"
             type(bucket).clear_instance_cache()
-            done = run(tmp_path / "m", [tmp_path / "in", "s3://touches/day"], patience=4)
+            done = run(tmp_path / "m", [tmp_path / "in", "s3://touches/day"], patience=2)
         assert [each.source for each in done.refused] == ["s3://touches/day"]
-        assert "no answer in 4 s" in done.refused[0].why
+        assert "no answer in 2 s" in done.refused[0].why
         assert done.digest == expected().digest()
 
 
+@pytest.mark.usefixtures("jobs_here")
 def test_a_server_that_falls_silent_after_it_listed_its_files_is_given_up(tmp_path, monkeypatch):
     from fsspec.implementations.memory import MemoryFileSystem
 
@@ -84,12 +84,12 @@ def test_a_server_that_falls_silent_after_it_listed_its_files_is_given_up(tmp_pa
 
     monkeypatch.setattr(MemoryFileSystem, "open", silent)
     try:
-        done = run(tmp_path / "m", [tmp_path / "in", "memory://silent"], patience=4)
+        done = run(tmp_path / "m", [tmp_path / "in", "memory://silent"], patience=2)
     finally:
         ended.set()
         files.rm("/silent", recursive=True)
     (silence,) = done.refused
-    assert silence.source.endswith("silent/a.part") and "no answer in 4 s" in silence.why
+    assert silence.source.endswith("silent/a.part") and "no answer in 2 s" in silence.why
     assert done.digest == expected().digest()
 
 
@@ -98,10 +98,7 @@ def test_a_memory_elsewhere_is_fetched_and_one_that_is_damaged_or_never_comes_is
     from fsspec.implementations.memory import MemoryFileSystem
 
     files = MemoryFileSystem()
-    with TactileLearner.open(tmp_path / "robot", **SETTINGS) as learner:
-        for name, touch in TOUCHES:
-            learner.observe(name, stream(touch).astype(np.float32))
-        learner.pack(tmp_path / "p")
+    memory_of(tmp_path / "robot", TOUCHES, tmp_path / "p")
     whole = (tmp_path / "p").read_bytes()
     spoilt = bytearray(whole)
     spoilt[3000] ^= 1  # in the log

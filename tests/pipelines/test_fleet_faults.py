@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from test_fleet import BY_FOLDER, TOUCHES, expected, full, learned, require_learned, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, expected, jobs_here, require_learned, run, touch_files
 from touches import SETTINGS, stream
 
 from examples.benchmarks.fleet import DyingExecutor
@@ -22,9 +22,9 @@ from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.pipelines.sources import Refused
 from scroll_tactile.pipelines.workers import engines, steps
 from scroll_tactile.pipelines.workers.jobs import Made
-from store import DamageError, LockedError, StoreFullError
+from store import DamageError, LockedError
 
-__all__ = ["full", "learned"]  # fixtures
+__all__ = ["jobs_here"]  # a fixture
 
 
 @pytest.fixture
@@ -45,19 +45,35 @@ class Silent(Executor):
         return DyingExecutor().submit(what, *words) if self.after >= 0 else Future()
 
 
+class Then(DyingExecutor):
+    """Does something with each job when it is done, and its number."""
+
+    def __init__(self, then):
+        super().__init__()
+        self.then, self.done = then, 0
+
+    def submit(self, what, job):
+        future = super().submit(what, job)
+        self.done += 1
+        self.then(job, self.done)
+        return future
+
+
 class TestPatience:
+    @pytest.mark.usefixtures("jobs_here")
     @pytest.mark.parametrize("after", [0, 3])
     def test_an_executor_that_never_answers_is_named_and_the_same_call_goes_on(
         self, tmp_path, sources, monkeypatch, after
     ):
         monkeypatch.setattr(fleet, "GRACE", 0.2)
         monkeypatch.setattr(steps, "MOST_SOURCES", 1)
-        with pytest.raises(ScrollTactileError, match="Silent has answered no job for 6 s"):
-            run(tmp_path / "m", [tmp_path / "in"], client=Silent(after), patience=3)
+        with pytest.raises(ScrollTactileError, match="Silent has answered no job for 2 s"):
+            run(tmp_path / "m", [tmp_path / "in"], client=Silent(after), patience=1)
         done = run(tmp_path / "m", [tmp_path / "in"])
         assert (done.observations, done.held, done.repeated) == (12 - after, 12, 0)  # what was learned before came in
         require_learned(tmp_path / "m")
 
+    @pytest.mark.usefixtures("jobs_here")
     def test_a_job_that_is_never_answered_is_handed_over_again(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(fleet, "GRACE", 0.2)
         monkeypatch.setattr(steps, "MOST_SOURCES", 2)
@@ -90,8 +106,8 @@ class TestPatience:
             return future
 
         monkeypatch.setattr(engines.Processes, "submit", stopping)
-        done = learn(tmp_path / "m", sources[:6], BY_FOLDER, workers=1, patience=4, **SETTINGS)
-        assert done.deaths and done.observations == 6
+        done = learn(tmp_path / "m", sources[:4], BY_FOLDER, workers=1, patience=3, **SETTINGS)
+        assert done.deaths and done.observations == 4
         with pytest.raises(ProcessLookupError):
             for _ in range(100):
                 os.kill(stopped[0], 0)
@@ -104,24 +120,22 @@ class TestGarbage:
         [
             None,
             "done",
-            {},
             Made("/etc/passwd", processor=1.0),
+            Made(None, rows=[0], processor=1.0),
             Made("", processor=1.0),
             Made("", rows=[0], processor="1"),
-            Made("", rows=[-1], processor=1.0),
-            Made("", rows=[True], processor=1.0),
-            Made("", rows=[1], processor=1.0),
-            Made("", rows=[0], refused="all", processor=1.0),
-            Made("", rows=[0], refused=[1], processor=1.0),
-            Made("", rows=[0], refused=[Refused("x", 5)], processor=1.0),
-            Made("", rows=[0], failed=["/etc/passwd"], processor=1.0),
-            Made("", rows=[0], clipped=["x"], processor=1.0),
-            Made("", rows=[0], range_problem=5, processor=1.0),
-            Made(None, rows=[0], processor=1.0),
+            *(Made("", rows=[row], processor=1.0) for row in (-1, True, 1)),
+            *(
+                Made("", rows=[0], processor=1.0, **wrong)
+                for wrong in (
+                    *({"refused": "all"}, {"refused": [1]}, {"refused": [Refused("x", 5)]}),
+                    *({"failed": ["/etc/passwd"]}, {"clipped": ["x"]}, {"range_problem": 5}),
+                )
+            ),
         ],
     )
     def test_what_is_no_answer_is_asked_for_again_and_named_in_the_end(self, tmp_path, sources, monkeypatch, made):
-        monkeypatch.setattr(steps, "MOST_TRIES", 3)
+        monkeypatch.setattr(steps, "MOST_TRIES", 2)
 
         class Garbage(DyingExecutor):
             def submit(self, what, job):
@@ -135,35 +149,20 @@ class TestGarbage:
     def test_a_packed_memory_of_other_sources_is_not_taken_for_the_jobs(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(steps, "MOST_SOURCES", 6)
 
-        class Mistaken(DyingExecutor):
-            """Writes what one job learned where what the other did belongs, once."""
+        def mistaken(job, number):
+            if number == 2:
+                first = next(path for path in Path(job.folder).glob("learned-*.part") if path != job.target)
+                job.target.write_bytes(first.read_bytes())
 
-            done = 0
-
-            def submit(self, what, job):
-                future = super().submit(what, job)
-                self.done += 1
-                if self.done == 2:
-                    first = next(path for path in Path(job.folder).glob("learned-*.part") if path != job.target)
-                    job.target.write_bytes(first.read_bytes())
-                return future
-
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Mistaken())
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Then(mistaken))
         assert done.observations == 12 and done.digest == expected().digest()
 
     def test_one_that_is_never_there_is_named_in_the_end(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(steps, "MOST_TRIES", 2)
 
-        class Elsewhere(DyingExecutor):
-            """Has a folder of its own under this name."""
-
-            def submit(self, what, job):
-                future = super().submit(what, job)
-                job.target.unlink()
-                return future
-
+        elsewhere = Then(lambda job, number: job.target.unlink())
         with pytest.raises(InputError, match=r"2 sources were refused.*while they learned it, again and again"):
-            run(tmp_path / "m", sources[:2], client=Elsewhere())
+            run(tmp_path / "m", sources[:2], client=elsewhere)
 
 
 def renamed(path):
@@ -176,42 +175,30 @@ def renamed(path):
         learner.pack(path)
 
 
-class TestSpoilt:
-    def test_a_packed_memory_of_other_touches_and_right_checksums_is_learned_again(
-        self, tmp_path, sources, monkeypatch, full, learned
-    ):
-        monkeypatch.setattr(steps, "MOST_SOURCES", 4)
-        full(0)
-        with pytest.raises(StoreFullError):
-            run(tmp_path / "m", [tmp_path / "in"])
-        full(None)
-        path = min((tmp_path / "m.fleet").glob("learned-*.part"))
-        renamed(path)
-        learned.clear()
-        done = run(tmp_path / "m", [tmp_path / "in"])
-        assert 0 < len(learned) < 12 and done.deaths == 0 and not done.refused
-        require_learned(tmp_path / "m")
+def test_a_job_has_no_more_bytes_than_it_may(tmp_path, sources, monkeypatch):
+    monkeypatch.setattr(steps, "JOBS_A_WORKER", 1)
+    monkeypatch.setattr(steps, "MOST_STEP_BYTES", 2 * max(path.stat().st_size for path in sources))
+    jobs = []
+    client = Then(lambda job, number: jobs.append(len(job.sources)))
+    client._max_workers = 1
+    assert run(tmp_path / "m", sources, client=client).observations == 12
+    assert jobs == [2] * 6
 
-    @pytest.mark.parametrize("place", [None, -9, 100, 3000])
+
+class TestSpoilt:
+    @pytest.mark.parametrize("place", [None, -9, 3000])
     def test_one_that_is_spoilt_while_the_run_goes_on_is_learned_again(self, tmp_path, sources, monkeypatch, place):
         monkeypatch.setattr(steps, "MOST_SOURCES", 3)
 
-        class Spoiling(DyingExecutor):
-            spoilt = 0
+        def spoil(job, number):
+            if number == 3 and place is None:
+                renamed(job.target)
+            elif number == 3:
+                whole = bytearray(job.target.read_bytes())
+                whole[place] ^= 1
+                job.target.write_bytes(bytes(whole))
 
-            def submit(self, what, job):
-                future = super().submit(what, job)
-                self.spoilt += 1
-                if self.spoilt == 3:
-                    if place is None:
-                        renamed(job.target)
-                    else:
-                        whole = bytearray(job.target.read_bytes())
-                        whole[place] ^= 1
-                        job.target.write_bytes(bytes(whole))
-                return future
-
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Spoiling())
+        done = run(tmp_path / "m", [tmp_path / "in"], client=Then(spoil))
         assert done.observations == 12 and not done.refused and done.sources == 12
         require_learned(tmp_path / "m")
 
@@ -260,7 +247,9 @@ class TestNotes:
         left = tmp_path / "m.fleet" / "learned-0.part.x.partial"
         (left / "memory").mkdir(parents=True)
         (tmp_path / "m.fleet" / "mine.txt").write_text("any")
-        run(tmp_path / "m", sources)
+        seen = []
+        run(tmp_path / "m", sources, client=Then(lambda job, number: seen.append(left.exists())))
+        assert seen and not any(seen)
         assert sorted(path.name for path in (tmp_path / "m.fleet").iterdir()) == ["mine.txt", "run.json"]
 
     def test_notes_are_few_where_noting_takes_long(self, tmp_path, sources, monkeypatch):

@@ -5,7 +5,7 @@ import random
 
 import numpy as np
 import pytest
-from test_fleet import BY_FOLDER, TOUCHES, full, run, touch_files
+from test_fleet import BY_FOLDER, TOUCHES, full, memory_of, run, touch_files
 from touches import SETTINGS, SmallSample, require_same, stream
 
 import scroll_tactile.memory.state
@@ -36,17 +36,15 @@ def seen(learner):
     return [(row.material, row.key, row.source) for row in rows]
 
 
-def by_one_process(path, sources, before=()):
+def by_one_process(path, sources):
     """What `learn` makes of sources: rows in order, digest, what was skipped and what was refused."""
     with TactileLearner.open(path, **SETTINGS) as learner:
-        for name, touch in before:
-            learner.observe(name, stream(touch).astype(np.float32))
         done = learning.learn_sources(learner, find_sources(list(map(str, sources)))[0], BY_FOLDER)
         refused = [(each.source, each.why) for each in done.refused]
         return seen(learner), learner.digest(), done.skipped, refused
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path, seed, monkeypatch):
     monkeypatch.setattr(scroll_tactile.memory.state, "TouchSample", SmallSample)
     draw = random.Random(seed)
@@ -55,7 +53,7 @@ def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path
     draw.shuffle(paths)
     monkeypatch.setattr(steps, "MOST_SOURCES", draw.randrange(1, 5))
     monkeypatch.setattr(steps, "MOST_TRIES", 50)
-    if seed < 6:
+    if seed < 3:
         done = run(tmp_path / "m", paths, client=Shuffled(seed))
     else:
         done = learn(tmp_path / "m", paths, BY_FOLDER, workers=1, **SETTINGS)
@@ -94,12 +92,11 @@ def test_the_first_source_counts_also_where_its_worker_is_last(tmp_path, monkeyp
             assert (done.observations, done.repeated) == (1, 0)
 
 
-def test_a_destination_that_has_it_under_another_name_comes_first(tmp_path):
+def test_a_destination_that_has_it_under_another_name_comes_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(steps, "JOBS_A_WORKER", 1)  # several sources a job
     before = [("x", TOUCHES[4][1]), TOUCHES[5]]
     paths = touch_files(tmp_path / "in", TOUCHES)
-    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-        for name, touch in before:
-            learner.observe(name, stream(touch).astype(np.float32))
+    memory_of(tmp_path / "m", before)
     for _ in range(2):  # and says so again
         done = run(tmp_path / "m", [tmp_path / "in"], add=True)
         (refused,) = done.refused
@@ -127,7 +124,7 @@ def test_a_run_that_was_cut_short_and_goes_on_with_other_sources_takes_the_same(
         assert seen(learner) == rows
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_run_that_was_cut_short_goes_on_with_its_sources_in_another_order(tmp_path, seed, monkeypatch, full):
     # Each of the two jobs has both copies of a touch; the one that its partial has no row of may come first now.
     x, y, z = TOUCHES[:3]
@@ -152,8 +149,9 @@ def test_memories_are_refused_touch_by_touch_where_they_have_rows_and_whole_wher
             learner.observe("z", stream(TOUCHES[3][1]).astype(np.float32), source="robot 7")
             learner.observe("z", stream((90 + rows, 60)).astype(np.float32))
             learner.pack(tmp_path / name, rows=rows)
-    done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "rows", tmp_path / "sums"])
-    assert [each.source for each in done.refused] == ["robot 7", str(tmp_path / "sums")]
+    for _ in range(2):  # and says so again
+        done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "rows", tmp_path / "sums"])
+        assert [each.source for each in done.refused] == ["robot 7", str(tmp_path / "sums")]
     assert all("as 'a' and not as 'z'" in each.why for each in done.refused)
     assert "none of them can be left out" in done.refused[1].why
     with TactileLearner.open(tmp_path / "m") as learner:

@@ -9,7 +9,7 @@ from scroll_tactile import sensors
 from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.classification import missing
 from scroll_tactile.pipelines.demo import Demo, pull_the_plug
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error, confusion_counts, mean_and_spread
 from scroll_tactile.pipelines.runfile import RunFile
 from scroll_tactile.simulation.scene import Scene
 
@@ -19,14 +19,17 @@ class TestMetrics:
         assert accuracy(["a", "b", "c", "d"], ["a", "b", "c", None]) == 0.75
 
     def test_calibration_error_of_a_case_worked_by_hand(self) -> None:
-        # Two bins: 0.25 and 0.5 fall into (0, ½], half right: |0.5 − 0.375|; 0.75 and 1 into (½, 1], both right.
-        assert calibration_error([0.25, 0.5, 0.75, 1.0], [1, 0, 1, 1], bins=2) == pytest.approx(
-            (2 * 0.125 + 2 * 0.125) / 4
-        )
+        # Two bins, half right each: 0.25 and 0.5 in (0, ½], |0.5 − 0.375|; 0.75 and 1 in (½, 1], |0.5 − 0.875|.
+        error = calibration_error([0.25, 0.5, 0.75, 1.0], [1, 0, 1, 0], bins=2)
+        assert error == pytest.approx((2 * 0.125 + 2 * 0.375) / 4)
 
     def test_certain_and_right_is_calibrated_and_zero_has_a_bin(self) -> None:
         assert calibration_error([1.0, 1.0], [1, 1]) == 0.0
         assert calibration_error([0.0], [0]) == 0.0
+
+    def test_confusions_are_counted_beside_the_right_answers(self) -> None:
+        counts = confusion_counts(["a", "b", "c"], [4, 3, 1], [("a", "b", 1), ("b", "c", 2)])
+        assert counts.tolist() == [[3, 1, 0], [0, 1, 2], [0, 0, 1]]
 
     def test_mean_and_spread(self) -> None:
         assert mean_and_spread([1.0, 3.0]) == (2.0, pytest.approx(math.sqrt(2)))

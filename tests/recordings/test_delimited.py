@@ -39,6 +39,7 @@ NAN = float("nan")
         ("time,a,b\n0.5,1,2\n0.6,3,4\n", [[1, 2], [3, 4]], [0.5, 0.6]),
         ("Timestamp (ms),a\n500,1\n600,3\n", [[1], [3]], [0.5, 0.6]),
         ("timestamp,a\n1760000000000000000,1\n1760000001000000000,2\n", [[1], [2]], [1.76e9, 1.760000001e9]),
+        ("timestamp,a\n1760000000000,1\n1760000001000,2\n", [[1], [2]], [1.76e9, 1.760000001e9]),
         ("time,a\n2026-01-01T00:00:00.5,1\n2026-01-01 00:00:01+00:00,3\n", [[1], [3]], [1767225600.5, 1767225601]),
         ("a,b,c\n1,,nan\nNA,2,null\n", [[1, NAN, NAN], [NAN, 2, NAN]], None),
         ('"a","b"\n"1","2"\n', [[1, 2]], None),
@@ -109,6 +110,12 @@ def test_a_rate_counts_times_and_blocks_go_on_with_it(tmp_path):
     np.testing.assert_array_equal(np.concatenate([block.times for block in blocks]), recording.times)
     with pytest.raises(InputError, match="positive rate"):
         read(path, rate=0)
+
+
+def test_a_step_of_more_than_twice_the_usual_is_no_jitter(tmp_path):
+    times = [*(i / 10 for i in range(9)), 1.05]
+    report = read(table(tmp_path, "time,a\n" + "".join(f"{time},1\n" for time in times))).report
+    assert report.rate == pytest.approx(10) and report.jitter == pytest.approx(0, abs=1e-9)
 
 
 def test_the_slow_way_gives_the_same_as_the_fast(tmp_path):

@@ -1,6 +1,5 @@
 """Recordings from elsewhere: they run nothing, reach nothing outside, and cost what their size allows."""
 
-import logging
 import os
 import shutil
 import sys
@@ -180,26 +179,6 @@ class TestHdf5:
             read(path, field="away")
 
 
-@pytest.fixture
-def bucket(monkeypatch):
-    """An empty bucket of a real S3 interface, played by moto."""
-    s3fs = pytest.importorskip("s3fs")
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    server.start()
-    host, port = server.get_host_and_port()
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.setenv(name, "test")
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    s3fs.S3FileSystem.clear_instance_cache()
-    files = s3fs.S3FileSystem()
-    files.mkdir("robots")
-    yield files
-    server.stop()
-    s3fs.S3FileSystem.clear_instance_cache()
-
-
 class TestPlaces:
     def test_pipes_in_a_folder_are_refused_by_name_and_stop_nothing(self, tmp_path):
         for name in ("a.npy", "b.csv", "c.mcap"):
@@ -262,6 +241,9 @@ class TestBounds:
         budget.take(bounds.SPARE + 10 * bounds.RATIO)
         with pytest.raises(RecordingError, match="in 10 bytes on the disk; expected at most 256 times as many"):
             budget.take(1)
+        budget.give(bounds.SPARE + 10 * bounds.RATIO)
+        with pytest.raises(RecordingError, match="bytes of readings in 10 bytes on the disk"):
+            budget.give(1)
         budget.add(1)
         budget.take(bounds.RATIO - 1)
         budget.work(bounds.SPARE_STEPS + 11 * bounds.STEPS_A_BYTE)

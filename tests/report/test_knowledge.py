@@ -142,6 +142,8 @@ def test_trust_is_counted():
     right = [one.answer == one.material for one in touches]
     assert trust.error == pytest.approx(calibration_error([one.confidence for one in touches], right, bins=10))
     assert [(one.material, one.answer, one.count, one.tested) for one in mistakes(touches)] == [("a", "b", 1, 19)]
+    several = [touch("b", "a", 0.9), *[touch("a", "b", 0.9)] * 2]
+    assert [(one.material, one.count) for one in mistakes(several)] == [("a", 2), ("b", 1)]
     assert unknown_by(touches) == [("b", 1, 1), ("a", 0, 19)]
     assert sum(found.count for found in bins_of(touches)) == 20
     assert interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
@@ -171,6 +173,7 @@ def test_faults_of_channels_are_found():
         readings[:, 0] = 3.0
         readings[::8, 1] = 400.0
         readings[:, 2] += 60 * part
+        readings[::8, 3] = 0.0  # at rest: the end of a range that begins at zero
 
     assert faults(spoil) == [["dead"], ["saturated"], ["drifting"], []]
 

@@ -97,6 +97,26 @@ def publishing(count, rate, every=1):
     assert process.returncode == 0
 
 
+@contextmanager
+def command(*words, **options):
+    """A process that is killed at the end, where it has not ended before."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROBOT.parents[2]), *sys.path])}
+    line = list(map(str, [sys.executable, *words]))
+    with subprocess.Popen(line, env=environment, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended_by_ctrl_c(process):
+    """What a process wrote, where ctrl-C ended it in order."""
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    return output
+
+
 def feed(node, rows, start=0.0):
     for i, row in enumerate(rows):
         stamp = 1000 + start + i / PAD.rate
@@ -120,26 +140,6 @@ def test_every_reading_of_a_burst_arrives_and_is_answered(spinning, learner):
     assert [answer["material"] for answer in ended][:5] == list("abcab")
     spinning.until(lambda: len(texts) == len(answers))
     assert texts == json.loads(json.dumps(answers))
-
-
-def test_learning_by_services_and_by_the_parameter(spinning, learner):
-    node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
-    arm = spinning.node("arm")
-    assert "ros2 param set /scroll_tactile material NAME" in spinning.call(arm, "/scroll_tactile/learn").message
-    node.set_parameters([rclpy.Parameter("material", value="felt")])
-    for service in ("learn", "again"):
-        assert "none has ended" in spinning.call(arm, f"/scroll_tactile/{service}").message
-    feed(served, shift("a")[0])
-    reply = spinning.call(arm, "/scroll_tactile/learn")
-    assert reply.success and reply.message.startswith("felt: ")
-    assert learner.materials["felt"] == 1
-    reply = spinning.call(arm, "/scroll_tactile/learn")
-    assert reply.success and "learned already" in reply.message
-    assert learner.materials["felt"] == 1
-    assert spinning.call(arm, "/scroll_tactile/forget").success
-    assert "felt" not in learner.materials
-    assert "manual" in spinning.call(arm, "/scroll_tactile/begin").message
 
 
 def test_a_touch_between_the_services_begin_and_end(spinning, learner):
@@ -208,25 +208,19 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
     with TactileLearner.open(memory, mode="read") as source:
         source.backup(tmp_path / "own")
     words = ["ros2", "--memory", tmp_path / "own", "--topic", TOPIC, "--field", "position"]
-    line = [sys.executable, "-m", "scroll_tactile.cli", *words, "--ros-args", "-r", "__ns:=/left"]
     ended = []
     arm = spinning.node("arm")
     arm.create_subscription(String, "/left/scroll_tactile/answer", lambda text: ended.append(json.loads(text.data)), 50)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    with subprocess.Popen(list(map(str, line)), env=environment, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            client = arm.create_client(Trigger, "/left/scroll_tactile/learn")
-            spinning.until(client.service_is_ready, 60)
-            assert f"is being written by process {process.pid}" in refused(*words)
-            with publishing(500, 250):
-                spinning.until(lambda: sum(answer["event"] == "ended" for answer in ended) == 2, 60)
-            set_material(spinning, arm, "felt")
-            assert spinning.call(arm, "/left/scroll_tactile/learn").success
-            process.send_signal(signal.SIGINT)
-            output, _ = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 0
+    named = ("--ros-args", "-r", "__ns:=/left")
+    with command("-m", "scroll_tactile.cli", *words, *named, stdout=subprocess.PIPE) as process:
+        client = arm.create_client(Trigger, "/left/scroll_tactile/learn")
+        spinning.until(client.service_is_ready, 60)
+        assert f"is being written by process {process.pid}" in refused(*words)
+        with publishing(500, 250):
+            spinning.until(lambda: sum(answer["event"] == "ended" for answer in ended) == 2, 60)
+        set_material(spinning, arm, "felt")
+        assert spinning.call(arm, "/left/scroll_tactile/learn").success
+        output = ended_by_ctrl_c(process)
     assert "4 materials" in output and "readings: 500" in output
     with TactileLearner.open(tmp_path / "own", mode="read") as kept:
         assert kept.materials["felt"] == 1
@@ -235,34 +229,21 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
 def test_readmes_line_runs_as_it_stands(spinning, tmp_path):
     TactileLearner.open(tmp_path / "memory", sensor=PRESETS["biotac"].sensor).close()
     words = next(words for words in command_lines() if words[1] == "ros2")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    line = [sys.executable, "-m", "scroll_tactile.cli", *words[1:]]
-    with subprocess.Popen(line, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            client = spinning.node("arm").create_client(Trigger, "/scroll_tactile/learn")
-            spinning.until(client.service_is_ready, 60)
-            process.send_signal(signal.SIGINT)
-            output, _ = process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 0 and "memory: 0 materials" in output
+    with command("-m", "scroll_tactile.cli", *words[1:], cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        client = spinning.node("arm").create_client(Trigger, "/scroll_tactile/learn")
+        spinning.until(client.service_is_ready, 60)
+        assert "memory: 0 materials" in ended_by_ctrl_c(process)
 
 
 def test_the_example_acts_on_what_it_feels(memory, tmp_path):
     with TactileLearner.open(memory, mode="read") as source:
         source.backup(tmp_path / "own")
     script = ROBOT.parents[2] / "examples" / "ros2_node.py"
-    line = [sys.executable, script, tmp_path / "own", TOPIC, "position"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROBOT.parents[2]), *sys.path])}
-    with subprocess.Popen(list(map(str, line)), env=environment, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            with publishing(360, 250):
-                said = [next(text for text in process.stderr if f"{name} after" in text) for name in "ab"]
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 0 and len(said) == 2
+    with command(script, tmp_path / "own", TOPIC, "position", stderr=subprocess.PIPE) as process:
+        with publishing(360, 250):
+            said = [next(text for text in process.stderr if f"{name} after" in text) for name in "ab"]
+        ended_by_ctrl_c(process)
+    assert len(said) == 2
 
 
 def set_material(spinning, node, name):
@@ -274,11 +255,6 @@ def set_material(spinning, node, name):
     future = client.call_async(SetParameters.Request(parameters=[value]))
     spinning.until(future.done)
     assert future.result().results[0].successful
-
-
-def test_a_memory_that_is_not_there(tmp_path):
-    said = refused("ros2", "--memory", tmp_path / "none", "--topic", TOPIC, "--field", "position")
-    assert "there is no memory" in said
 
 
 def test_messages_that_a_node_serialized_are_read_from_a_bag(tmp_path):

@@ -1,0 +1,81 @@
+"""The smaller benchmarks, run small: each fills its table, and its figures are of what was asked for."""
+
+import json
+import sqlite3
+from contextlib import closing, nullcontext
+
+import pytest
+from commands import run
+
+from examples.benchmarks import appending, live_shift
+from examples.benchmarks.interleaved import AsIs
+from examples.benchmarks.live_shift import _scored
+from scroll_tactile import sensors
+from scroll_tactile.live.answers import LiveTouch
+from scroll_tactile.results import Prediction
+from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.simulation.shift import Shift, Truth
+from scroll_tactile.testing import check_embedding
+from store.log import LogReader
+from store.row_encoding import decode_row
+
+
+def measured(tmp_path, *words):
+    """What a benchmark printed, and wrote as JSON."""
+    result = run("bench", *words, "--json", tmp_path / "r.json")
+    assert result.exit_code == 0, result.output
+    return result.output, json.loads((tmp_path / "r.json").read_text())
+
+
+def test_each_way_of_appending_keeps_the_rows(tmp_path, monkeypatch):
+    monkeypatch.setattr(appending, "ROWS", 5)
+    monkeypatch.setattr(appending, "TemporaryDirectory", lambda dir: nullcontext(tmp_path))
+    output, result = measured(tmp_path, "log", "--rounds", 3)
+    cases = [record["case"].split(",")[0] for record in result["records"]]
+    assert cases == ["SQLite", "the log", "a bare file that grows"] and "times SQLite's" in output
+    assert result["rows"] == 15 and result["records"][0]["times_sqlite"] == 1.0
+    with closing(sqlite3.connect(tmp_path / "rows.sqlite")) as database:
+        kept = [data for (data,) in database.execute("SELECT bytes FROM row ORDER BY sequence")]
+    with LogReader(tmp_path / "log") as log:
+        rows = [log.read(frame.offset, frame.size)[1] for batch in log.refresh() for frame in batch]
+    assert kept == rows and [decode_row(row).head.sequence for row in rows] == list(range(1, 16))
+    assert (tmp_path / "bare").stat().st_size == 15 * appending.ROW_BYTES
+
+
+def test_the_embedding_of_vectors_keeps_the_promises_of_one():
+    check_embedding(AsIs(), columns=(8,))
+
+
+def test_every_learner_is_trained_and_timed_in_turns(tmp_path):
+    pytest.importorskip("sklearn")
+    output, found = measured(tmp_path, "interleaved", "--streams", 100, "--pairs", 10)
+    assert [record["measured"] for record in found["records"]] == [True] * 5
+    for record in found["records"]:
+        assert 0 < record["median_milliseconds"] <= record["p99_milliseconds"]
+        assert record["observe_median_milliseconds"] + record["predict_median_milliseconds"] > 0
+        assert record["times_ours"] > 0
+    for i, name in enumerate(("times_ours", "times_ours_in_memory")):
+        assert found["records"][i][name] == pytest.approx(1)
+    assert {"date", "versions", "machine", "seed"} <= found.keys()
+    assert "pseudo-inverse" in output
+
+
+def test_shifts_are_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(live_shift, "LEARNED", 2)
+    records = measured(tmp_path, "live", "--hours", "0.01")[1]["shifts"]
+    assert [record["channels"] for record in records] == [19, 60]
+    for record in records:
+        assert record["found"] == record["touches"] > 1 and record["false"] == 0
+        assert record["onset_ms"]["median"] < 30
+        assert 0 < record["milliseconds"]["p50"] <= record["milliseconds"]["p99"] <= record["milliseconds"]["max"]
+
+
+def test_contacts_are_scored_by_the_truth():
+    stream = Scene(sensor=sensors.ROBOSKIN).touch("oak", 0)
+    oak = Prediction("oak", 1.0, (("oak", 1.0),), 0.0, True, 1.5)
+    found = [LiveTouch(stream, oak, True, at, "released") for at in (10.02, 11.6, 30.0, 39.99)]
+    truth = [Truth("oak", 10.0, 13.0), Truth("ash", 20.0, 21.5), Truth("ash", 40.0, 41.5)]
+    scored = _scored(Shift(sensors.ROBOSKIN, stream.readings, stream.readings[:, 0], truth), found)
+    assert (scored["touches"], scored["found"], scored["in_parts"], scored["false"]) == (3, 2, 1, 1)
+    assert scored["named_right"] == 1
+    assert scored["onset_ms"]["median"] == pytest.approx(15.0)

@@ -174,13 +174,13 @@ def test_one_of_another_checkpoint_or_release_is_not_read(made, path, fits, monk
 
 def test_a_damaged_file_is_not_used(made, path, fits):
     whole = kept(path).read_bytes()
-    for place in (0, 9, 41, 60, len(whole) // 2, len(whole) - 1):
+    for place in (0, 41, len(whole) // 2, len(whole) - 1):
         harmed = bytearray(whole)
         harmed[place] ^= 1
         kept(path).write_bytes(harmed)
         with opened(path) as learner:
             learner.predict(stream("a", 50))
-    assert len(fits) == 6
+    assert len(fits) == 4
     kept(path).write_bytes(whole[:-40])
     with opened(path) as learner:
         assert bits(learner) == made[1]
@@ -223,7 +223,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
     """Every array left out, of another shape, type or value; every attribute of another type."""
     whole, refused, allowed = kept(path).read_bytes(), 0, []
     changes = []
-    for name in names_of_arrays(path):
+    for name in sorted({name.rstrip("-0123456789"): name for name in names_of_arrays(path)}.values()):
         if name not in ("kept-keys", "banks"):  # without them it is a model without kept touches, or without banks
             changes.append((name, less(name)))
         changes.append((name, of_array(name, lambda array: array[..., :-1] if array.ndim else array)))
@@ -236,7 +236,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
         changes.append((name, of_array(name, lambda array: array + 2**40)))
         changes.append((name, of_array(name, lambda array: array - 2**40)))
     for name in ("made_by", "readout", "names", "scales", "calibrations", "moments", "least", "longest", "fitted_to"):
-        for value in (None, -1, 10**30, "x", [], {}, 1.5, [1.5], ["x"]):
+        for value in (None, -1, 10**30, [1.5]):
             changes.append((name, lambda about, arrays, n=name, v=value: ({**about, n: v}, arrays)))
     for name, change in changes:
         kept(path).write_bytes(whole)
@@ -249,7 +249,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
             else:
                 allowed.append(name)
                 assert bits(learner)
-    assert refused > 300
+    assert refused > 100
     assert {name.split("-")[0] for name in allowed} <= {"reference"}, allowed  # fewer could be one
     with opened(path) as learner:
         assert bits(learner) == made[1]

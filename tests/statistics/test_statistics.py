@@ -50,15 +50,7 @@ touches = st.lists(st.integers(0, 40), max_size=25)
 few = settings(max_examples=40, deadline=None)
 
 
-@few
-@given(touches, st.randoms(use_true_random=False))
-def test_any_order_is_the_same(observed, random):
-    shuffled = observed.copy()
-    random.shuffle(shuffled)
-    same(of(observed), of(shuffled))
-
-
-@few
+@settings(max_examples=25, deadline=None)
 @given(touches, touches, touches)
 def test_a_sum_is_the_union(a, b, c):
     left, right = of(a), of(b)
@@ -182,6 +174,7 @@ def test_what_is_not_contained_cannot_be_taken_out():
         ([[[1, 2, 3]]], [[[-1, -2, -3]]]),  # the products agree, and yet the sums do not
         ([[[1, 2, 3]], [[-1, -2, -3]]], [[[4, 5, 6]], [[-4, -5, -6]]]),  # the sums agree, and yet the products do not
         ([[[0, 0, 0]]], [[[0, 0, 0], [0, 0, 0]]]),  # nothing but the number of rows differs
+        ([[[1, 1, 1], [1, 1, 1]], [[2, 2, 2]]], [[[1, 1, 1]], [[1, 1, 1]], [[2, 2, 2]]]),  # fewer touches
     ],
 )
 def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
@@ -261,22 +254,9 @@ def test_full_statistics_refuse_before_anything_is_added():
     assert statistics.second(5).rows == 1
     statistics.add("felt", {5: codes[5], 20: codes[20][:1]})
     assert statistics.materials == {"felt": 1, "wool": 1}
-
-
-def test_full_statistics_do_not_merge():
     half = MOST_ROWS // 2 + 1
     with pytest.raises(CapacityError, match="exact"):
         filled(half) + filled(half)
-
-
-def test_fewer_touches_of_as_many_rows_do_not_contain_more():
-    whole, part = of([]), of([])
-    whole.add("wool", {5: np.ones((2, 3), np.int32)})
-    whole.add("felt", {5: np.ones((1, 3), np.int32)})
-    for _ in range(2):
-        part.add("wool", {5: np.ones((1, 3), np.int32)})
-    with pytest.raises(InputError, match="contain"):
-        whole - part
 
 
 lengths = st.lists(st.sampled_from([1, 2, 9, 9, 40, 50, 400, 10**6]), max_size=60)

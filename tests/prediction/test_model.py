@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from prediction.test_current import fed
 from touches import PAD, SMALL, SmallSample, Windowed
 
 from scroll_tactile import TactileLearner
@@ -139,15 +138,6 @@ def test_a_material_that_was_observed_briefly_among_others_that_came_since(monke
         prediction = learner.predict(stream(7, 70, readings))
         assert {name for name, _ in prediction.ranking} == {*NAMES[:3], "new"}
         assert np.isfinite(prediction.novelty)
-
-
-def test_one_material_and_one_touch():
-    learner = fed([("a", 1)])
-    for readings in (6, 60, 500):
-        assert learner.predict(stream(3, 4, readings)).ranking == (("a", 1.0),)
-    learner.observe("a", stream(3, 5))
-    learner.observe("b", stream(5, 5))
-    assert {name for name, _ in learner.predict(stream(3, 6)).ranking} == {"a", "b"}
 
 
 def test_competing_kernels_weigh_in_probabilities_and_not_in_novelty_or_distance():

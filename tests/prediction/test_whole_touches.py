@@ -114,16 +114,6 @@ def test_joined_kernels_have_views(viewed):
     assert mixed.plan.views == ()
 
 
-@pytest.mark.parametrize("readout", ["lda", "ridge"])
-def test_touches_of_two_readings_and_of_one_value_are_answered(readout):
-    learner = TactileLearner(sensor=PAD, embedding=Kernels(dimension=64), readout=readout)
-    for i, (name, touch) in enumerate(TOUCHES[:24]):
-        learner.observe(name, touch if i % 3 else touch.first(0.02))
-    for asked in (np.zeros((2, 6)), np.ones((100, 6)), np.full((1000, 6), 0.5)):
-        prediction = learner.predict(asked)
-        assert np.isfinite([prediction.novelty, *(share for _, share in prediction.ranking)]).all()
-
-
 def test_of_many_materials_the_answer_is_that_of_few(monkeypatch, viewed):
     """Beyond a thousand, scores in single precision choose those that are solved for; here beyond four."""
     for module in ("prediction.model", "readouts.readout"):

@@ -92,6 +92,15 @@ def test_a_level_that_moved_for_good_is_rest_in_the_end():
     assert abs(round(ended[1].at * 100) - 7000) <= 2
 
 
+def test_noise_that_grew_for_good_while_rest_was_hardly_known_is_learned_anew():
+    rows = np.random.default_rng(11).standard_normal((5000, 12))
+    rows[:300] *= 0.02
+    rows[300:] = 1 + 0.1 * rows[300:]
+    rows[4000:4300] += 2.0
+    contacts, detector = found(wide(12), rows)
+    assert np.abs(np.array(contacts[-1]) - [4000, 4300]).max() <= 3 and not detector.contact
+
+
 def test_contact_from_the_first_reading_on_is_found_out_and_reported():
     random = np.random.default_rng(9)
     rows = np.concatenate([slide("a", 200, random), shift("ab", 2)[0]])

@@ -7,7 +7,18 @@ import pytest
 from scroll_tactile import Frames
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
-from scroll_tactile.signals.windows import MOST_WINDOWS, Scale, extent, fitting, milestones, scales, scored, stages
+from scroll_tactile.signals.windows import (
+    MOST_COLUMNS,
+    MOST_WINDOWS,
+    Scale,
+    extent,
+    fitting,
+    milestones,
+    scales,
+    scored,
+    stages,
+    whole_columns,
+)
 
 
 def sensor(rate, duration, **settings):
@@ -74,6 +85,15 @@ def test_scored_windows_lie_within_what_was_observed(one):
                 assert starts == sorted(set(starts))
                 if width == widths[0]:
                     assert all(b - a >= width // 2 for a, b in pairwise(starts))
+
+
+def test_of_the_shortest_those_are_scored_that_begin_half_a_width_apart():
+    read = extent(100, (30, 300))
+    assert [read[30][place] for place in scored(read, 100)[30]] == [0, 15, 34, 60]
+
+
+def test_views_have_as_many_columns_as_a_usual_touch_within_bounds():
+    assert [whole_columns(one) for one in (BIOTAC, sensor(1.0, 1.0), sensor(10_000.0, 4.0))] == [400, 9, MOST_COLUMNS]
 
 
 def test_milestones_ascend_from_the_shortest_scale_to_where_the_longest_fits():

@@ -1,5 +1,7 @@
 """The embedding for cameras, and memories of what it sees."""
 
+import itertools
+
 import numpy as np
 import pytest
 from commands import refused, run
@@ -28,10 +30,10 @@ NETWORK = ResNet.random(0).state_dict()
 SEEING = Frames(NETWORK)
 
 
-def learned(repetitions=4, **settings):
+def learned(repetitions=4, names=GEL.materials, **settings):
     learner = TactileLearner(sensor=SMALL, **settings)
     for i in range(repetitions):
-        for name in GEL.materials:
+        for name in names:
             learner.observe(name, GEL.touch(name, i))
     return learner
 
@@ -79,7 +81,7 @@ def test_the_network_sees_relief_and_no_level():
 
 def test_cosines_approximate_a_kernel_of_the_surface_alone():
     """The mean product of two frames' cosines is half of exp(−‖s − s'‖² / (2 · 1.2²)), of their counts s and s'."""
-    embedding = Frames(cosines=4000)
+    embedding = Frames(cosines=2000)
     frames = [GEL.touch(name, 0).readings[-1] for name in MATERIALS[:3]]
     images = [tactile_image(validate(frame[None], SMALL)) for frame in frames]
     waves = [embedding.embed(image).astype(np.float64) for image in images]
@@ -87,7 +89,7 @@ def test_cosines_approximate_a_kernel_of_the_surface_alone():
     for i in range(3):
         for j in range(3):
             near = np.exp(-np.square(counts[i] - counts[j]).sum() / (2 * 1.2**2))
-            assert 2 * np.mean(waves[i] * waves[j]) == pytest.approx(near, abs=0.08)
+            assert 2 * np.mean(waves[i] * waves[j]) == pytest.approx(near, abs=0.1)
     assert np.array_equal(embedding.embed(images[0] + np.float32(0.25)), embedding.embed(images[0]))
 
 
@@ -159,26 +161,6 @@ def test_no_frames_are_kept_unless_asked_for_and_another_resting_image_is_anothe
         TactileLearner.open(tmp_path / "eye", embedding=Frames(rest=None))
 
 
-def test_the_commands_read_frames(tmp_path):
-    (tmp_path / "eye.json").write_text(SMALL.model_dump_json())
-    for name in MATERIALS[:2]:
-        np.save(tmp_path / f"{name}.npy", GEL.touch(name, 0).readings.astype(np.uint8))
-        words = ("observe", tmp_path / "memory", name, tmp_path / f"{name}.npy")
-        assert run(*words, "--sensor", tmp_path / "eye.json").exit_code == 0
-    assert "cord" in run("predict", tmp_path / "memory", tmp_path / "cord.npy").output
-    np.save(tmp_path / "rest.npy", np.full((3, *SMALL.shape), 90, np.uint8))
-    assert "none differs from the resting image" in refused("predict", tmp_path / "memory", tmp_path / "rest.npy")
-
-
-def test_pictures_of_another_size():
-    gel = Gel(sensors.GELSIGHT.model_copy(update={"channels": 37 * 51 * 3, "layout": (37, 51, 3)}))
-    learner = TactileLearner(sensor=gel.sensor, exemplars=0)
-    for name in MATERIALS[:2]:
-        for i in range(2):
-            learner.observe(name, gel.touch(name, i, frames=3))
-    assert learner.predict(gel.touch("cord", 7, frames=2)).material in MATERIALS[:2]
-
-
 def test_a_memory_of_single_frames_takes_no_resting_image():
     learner = TactileLearner(sensor=SMALL, embedding=Frames(rest=None))
     for i in range(3):
@@ -207,17 +189,6 @@ def frame_image(frame):
     return image_of(validate(frame[None], SMALL), None)
 
 
-def test_a_resting_image_given_once_serves_every_stream(memory):
-    rest = GEL.touch("cord", 0, force=0).readings[0]
-    given = TactileLearner(sensor=SMALL, embedding=Frames(rest=rest))
-    for i in range(4):
-        for name in MATERIALS[:3]:
-            given.observe(name, GEL.touch(name, i).readings[1:])
-    assert given.predict(GEL.touch("gravel", 9).readings[3:]).material == "gravel"
-    with pytest.raises(NoContactError, match="the one given"):
-        given.predict(rest[None])
-
-
 def test_bad_streams_of_frames_are_refused_and_nothing_is_kept(memory):
     good = GEL.touch("cord", 0).readings
     before = memory.digest()
@@ -242,11 +213,27 @@ def test_bad_streams_of_frames_are_refused_and_nothing_is_kept(memory):
     assert memory.digest() == before
 
 
-def test_f_star_reads_what_f_reads():
-    learner = learned(3, exemplars=18)
-    report = learner.fine_tune(epochs=1)
-    assert report.exemplars == 18
+def test_a_resting_image_given_once_serves_every_stream():
+    rest = GEL.touch("cord", 0, force=0).readings[0]
+    given = TactileLearner(sensor=SMALL, embedding=Frames(rest=rest))
+    for i, name in itertools.product(range(4), MATERIALS[:3]):
+        given.observe(name, GEL.touch(name, i).readings[1:])
+    assert given.predict(GEL.touch("gravel", 9).readings[3:]).material == "gravel"
+    with pytest.raises(NoContactError, match="the one given"):
+        given.predict(rest[None])
+
+
+def test_commands_and_fine_tuning_read_frames(tmp_path):
+    learner = learned(2, MATERIALS[:2], exemplars=4)
+    assert learner.fine_tune(epochs=1).exemplars == 4
     assert learner.tuned_digest() is not None
+    (tmp_path / "eye.json").write_text(SMALL.model_dump_json())
+    np.save(tmp_path / "cord.npy", GEL.touch("cord", 0).readings.astype(np.uint8))
+    words = ("observe", tmp_path / "memory", "cord", tmp_path / "cord.npy")
+    assert run(*words, "--sensor", tmp_path / "eye.json").exit_code == 0
+    assert "cord" in run("predict", tmp_path / "memory", tmp_path / "cord.npy").output
+    np.save(tmp_path / "rest.npy", np.full((3, *SMALL.shape), 90, np.uint8))
+    assert "none differs from the resting image" in refused("predict", tmp_path / "memory", tmp_path / "rest.npy")
 
 
 def test_a_sensor_of_channels_takes_no_frames():

@@ -1,12 +1,13 @@
-"""What an embedding declares, and what one that declares nothing is taken for."""
+"""What an embedding declares, what one that declares nothing is taken for, and embeddings side by side."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+from images import image
 
-from scroll_tactile import Capabilities, Frames, Joined, Kernels, TactileLearner, sensors
-from scroll_tactile.embeddings.protocol import capabilities_of, embed_windows, parts_of, require_rest, window_plan
+from scroll_tactile import Capabilities, Frames, Joined, Kernels, TactileLearner, Vision, sensors
+from scroll_tactile.embeddings.protocol import capabilities_of, embed_windows, parts_of, window_plan
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, whole_steps
 from scroll_tactile.testing import check_embedding
@@ -37,6 +38,7 @@ class Declaring(Plain):
 
 def test_name_dimension_bound_fingerprint_and_embed_are_enough():
     assert capabilities_of(Plain()) == Capabilities()
+    assert len(parts_of(plain := Plain())) == 1 and parts_of(plain)[0] is plain
     check_embedding(Plain(), columns=(9, 30))
     learner = TactileLearner(embedding=Plain(), sensor=sensors.BIOTAC)
     learner.observe("felt", np.full((400, 19), 3.0))
@@ -77,13 +79,33 @@ def test_the_plan_of_windows_follows_what_is_declared():
     assert whole_steps(sensors.GELSIGHT) == 0
 
 
-def test_an_embedding_of_frames_is_refused_to_a_sensor_of_channels():
-    with pytest.raises(InputError, match="reads a camera's frames, and sensor 'biotac'"):
-        require_rest(Declaring(Capabilities(reads_frames=True)), sensors.BIOTAC)
-    with pytest.raises(InputError, match="expected a resting image of sensor 'gelsight'"):
-        require_rest(Frames(rest=np.zeros((4, 4, 3))), sensors.GELSIGHT)
+KERNELS = Kernels(dimension=64)
+VISION = Vision(None, seed=0, stages=(1, 2))
 
 
-def test_an_embedding_that_is_no_composite_is_its_own_part():
-    plain = Plain()
-    assert parts_of(plain) == (plain,)
+def test_it_is_its_parts_side_by_side():
+    joined = Joined(KERNELS, VISION)
+    assert (joined.name, joined.dimension, joined.bound) == ("kernels+vision", 64 + 192, 1.0)
+    assert joined.parts == (KERNELS, VISION)
+    declared = joined.capabilities
+    assert (declared.partial_windows, declared.judged_scales) == (False, "widest")  # the most demanding part's
+    picture, windows = image(19, 100), {30: [0, 7], 75: [0, 20]}
+    parts = [part.embed_windows(picture, windows) for part in (KERNELS, VISION)]
+    for width, rows in joined.embed_windows(picture, windows).items():
+        assert rows[:, :64].tobytes() == parts[0][width].tobytes()
+        assert rows[:, 64:].tobytes() == parts[1][width].tobytes()
+
+
+def test_the_fingerprint_depends_on_the_parts_and_their_order():
+    pairs = [(KERNELS, VISION), (VISION, KERNELS), (KERNELS, KERNELS), (Kernels(seed=2, dimension=64), VISION)]
+    assert len({Joined(*pair).fingerprint for pair in pairs}) == 4
+    assert Joined(KERNELS, VISION).fingerprint == Joined(Kernels(dimension=64), VISION).fingerprint
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [((), "at least two"), ((KERNELS,), "at least two"), ((KERNELS, "vision"), "expected embeddings")],
+)
+def test_what_cannot_be_joined_is_refused(parts, message):
+    with pytest.raises(InputError, match=message):
+        Joined(*parts)

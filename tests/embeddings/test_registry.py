@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from scroll_tactile import Frames, Joined, Kernels, ModuleEmbedding, Vision
 from scroll_tactile.embeddings.registry import MOST_COSINES, configuration_of, from_configuration
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import PUBLISHED
-from scroll_tactile.errors import EmbeddingError, WeightsError
+from scroll_tactile.errors import EmbeddingError
 
 PICTURE = np.random.default_rng(0).uniform(0, 255, (24, 32, 3)).astype(np.float32)
 KERNELS = {"kind": "kernels", "dimension": 64, "seed": 0}
@@ -127,7 +125,7 @@ JSON = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.sampled_from([KERNELS, FRAMES, VISION | {"weights": {"name": None, "sha256": "0" * 64}}]), st.data())
 def test_any_one_field_of_any_value_gives_an_embedding_or_a_typed_error(configuration, data):
     changed = configuration | {data.draw(st.sampled_from(sorted(configuration))): data.draw(JSON)}
@@ -145,15 +143,11 @@ class TestWeights:
         torch.save(ResNet.random(3).state_dict(), path)
         return path
 
-    def test_a_file_is_named_without_its_folder(self, file):
-        vision = Vision(file, stages=(1,))
-        assert configuration_of(vision)["weights"]["name"] == "mine.pth"
-        assert str(file.parent) not in json.dumps(configuration_of(vision)) + repr(vision)
-        assert repr(Vision(file, stages=(1,))) == repr(vision)
-
     @pytest.mark.parametrize("make", [lambda file: Vision(file, stages=(1, 2)), Frames], ids=["vision", "frames"])
-    def test_a_file_in_the_cache_is_found(self, file, cache, make):
+    def test_a_file_in_the_cache_is_found_by_its_name_without_a_folder(self, file, cache, make):
         embedding = make(file)
+        assert configuration_of(embedding)["weights"]["name"] == "mine.pth"
+        assert str(file.parent) not in json.dumps(configuration_of(embedding)) + repr(embedding)
         file.rename(cache / file.name)
         again = from_configuration(configuration_of(embedding))
         assert again.fingerprint == embedding.fingerprint
@@ -176,35 +170,6 @@ class TestWeights:
         name = f"resnet18-{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}.pth"
         file.rename(cache / name)
         monkeypatch.setitem(PUBLISHED, "resnet18", f"https://nowhere.invalid/{name}")
-        for embedding in (Vision(), Joined(Kernels(dimension=64), Vision())):
+        for embedding in (Joined(Kernels(dimension=64), Vision()),):
             assert repr(from_configuration(configuration_of(embedding))) == repr(embedding)
         assert configuration_of(Vision())["weights"]["name"] == "resnet18"
-
-    def test_damaged_published_weights_are_refused(self, cache):
-        (cache / "resnet18-f37072fd.pth").write_bytes(b"not weights")
-        published = VISION | {"weights": {"name": "resnet18", "sha256": "0" * 64}, "seed": None}
-        with pytest.raises(WeightsError, match="is damaged"):
-            from_configuration(published)
-
-
-IMPORTS = """
-import sys, tempfile
-import scroll_tactile.simulation.gel, scroll_tactile.testing
-from scroll_tactile import Frames, Joined, Kernels, TactileLearner, sensors
-from scroll_tactile.simulation.scene import Scene
-from scroll_tactile.embeddings.registry import configuration_of, from_configuration
-for embedding in (Kernels(), Frames(), Joined(Kernels(), Kernels(seed=2))):
-    from_configuration(configuration_of(embedding))
-scene = Scene(sensor=sensors.BIOTAC)
-with tempfile.TemporaryDirectory() as folder:
-    for repetition in range(2):
-        with TactileLearner.open(folder + "/memory", sensor=sensors.BIOTAC) as learner:
-            for material in scene.materials[:3]:
-                learner.observe(material, scene.touch(material, repetition))
-            learner.predict(scene.touch(scene.materials[0], 9))
-assert "torch" not in sys.modules
-"""
-
-
-def test_a_learner_with_the_default_embedding_imports_no_torch():
-    subprocess.run([sys.executable, "-c", IMPORTS], check=True, timeout=120)

@@ -8,7 +8,7 @@ from torch.nn import functional
 from scroll_tactile.embeddings.resnet import ResNet, folded
 from scroll_tactile.errors import InputError
 
-SIZES = [(19, 9), (3, 3), (60, 75), (19, 400)]
+SIZES = [(19, 9), (3, 3), (30, 75)]
 
 
 def planes(rows, columns, count=1, seed=0):
@@ -80,7 +80,7 @@ def test_tensors_are_torchvisions(depth, tensors, widths):
     assert ("layer1.0.conv3.weight" in names) == (depth == 50)
 
 
-@pytest.mark.parametrize(("depth", "stem"), [(18, "torchvision"), (34, "universal"), (50, "torchvision")])
+@pytest.mark.parametrize(("depth", "stem"), [(18, "universal"), (50, "torchvision")])
 def test_folding_changes_only_the_rounding(depth, stem):
     net = lively(ResNet.random(2, depth, stem))
     before = {name: tensor.clone() for name, tensor in net.state_dict().items()}

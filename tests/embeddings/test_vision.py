@@ -9,12 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from images import image
 
-from examples.paper.readers.biotac_slide import load
 from scroll_tactile import Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.vision import pool_windows, to_planes
 from scroll_tactile.errors import InputError
-from scroll_tactile.signals.image import tactile_image, three_planes
+from scroll_tactile.signals.image import three_planes
 
 REAL = Path.home() / ".cache" / "scroll-tactile" / "weights" / "resnet18_imagenet_vq.safetensors"
 RANDOM = Vision(None, seed=0)
@@ -44,7 +43,8 @@ def test_dimension_is_the_sum_of_the_stages_widths():
     assert RANDOM.dimension == 64 + 128 + 256
     assert Vision(None, seed=0, stages=(4,)).dimension == 512
     assert Vision(None, seed=0, stages=(0, 4), depth=50).dimension == 64 + 2048
-    assert len(Vision(None, seed=0, stages=(0, 1, 2, 3, 4)).embed(image(3, 20))) == 1024
+    with pytest.raises(InputError, match="needs a seed"):
+        Vision({}, seed=0)
 
 
 def test_a_narrow_window_sees_nothing_of_what_comes_later():
@@ -66,7 +66,7 @@ def test_windows_wider_than_the_image_and_of_a_very_long_one():
     assert RANDOM.embed_windows(short, {30: [0]})[30][0].tobytes() == RANDOM.embed(short).tobytes()
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(columns=st.integers(1, 500), shrink=st.integers(1, 32), data=st.data())
 def test_a_window_covers_the_columns_of_a_map_that_it_should(columns, shrink, data):
     across = -(-columns // shrink)
@@ -94,17 +94,15 @@ def test_bulk_is_the_same_but_for_the_last_bits():
 
 def test_the_fingerprint_is_of_all_that_features_depend_on():
     state = ResNet.random(0).state_dict()
-    same = [RANDOM, Vision(None, seed=0), Vision(state)]
-    assert len({one.fingerprint for one in same}) == 1
+    assert RANDOM.fingerprint == Vision(state).fingerprint
     touched = {name: tensor.clone() for name, tensor in state.items()}
     touched["layer4.1.bn2.bias"][0] += 1e-6  # not even used by the default stages
     others = [
         Vision(touched),
-        Vision(None, seed=1),
         Vision(None, seed=0, stages=(1, 2)),
         Vision(None, seed=0, precision="bfloat16"),
     ]
-    assert len({one.fingerprint for one in [RANDOM, *others]}) == 5
+    assert len({one.fingerprint for one in [RANDOM, *others]}) == 4
     assert len(RANDOM.fingerprint) == 64
     int(RANDOM.fingerprint, 16)
 
@@ -176,27 +174,9 @@ def test_settings_that_do_not_fit_are_refused(wrong):
         Vision(None, **({"seed": 0} | wrong))
 
 
-def test_given_weights_take_no_seed():
-    with pytest.raises(InputError, match="needs a seed"):
-        Vision({}, seed=0)
-
-
 def test_the_universal_stem_says_what_is_too_small_for_it():
     vision = Vision(ResNet.random(0, 18, "universal").state_dict())
     assert vision.embed(image(3, 3)).shape == vision.embed(image(3, 2)).shape == (448,)
     assert vision.fingerprint
     with pytest.raises(InputError, match="at least 3 channels"):
         vision.embed(image(2, 30))
-
-
-def test_real_streams_of_a_material_lie_together(real_data, real_weights):
-    recordings = load(real_data, "roboskin")
-    vision = Vision(real_weights)
-    chosen = [i for i, name in enumerate(recordings.materials) if name in ("mat1", "mat2")][:60:2]
-    features = vision.embed_bulk([tactile_image(recordings.streams[i]) for i in chosen])
-    names = np.array([recordings.materials[i] for i in chosen])
-    features -= features.mean(axis=0)
-    likeness = features @ features.T
-    np.fill_diagonal(likeness, -np.inf)
-    nearest = names[likeness.argmax(axis=1)]
-    assert np.mean(nearest == names) > 0.8

@@ -37,16 +37,6 @@ def refusal(source):
     return str(caught.value)
 
 
-def test_safetensors_and_torch_files_give_the_network_back(net, state, tmp_path):
-    head = {"fc.weight": torch.zeros(10, 512), "fc.bias": torch.zeros(10)}
-    save_file(state | head, tmp_path / "one.safetensors")
-    torch.save(state | head, tmp_path / "two.pth")
-    for source in (tmp_path / "one.safetensors", str(tmp_path / "two.pth"), state):
-        loaded = load_network(source)
-        assert same(loaded, net)
-        assert (loaded.depth, loaded.stem, loaded.training) == (18, "torchvision", False)
-
-
 @pytest.mark.parametrize("suffix", ["safetensors", "pth"])
 def test_every_value_is_read_under_its_own_name_and_in_its_own_place(net, tmp_path, suffix):
     """Each value differs from all others, so that no exchange or transposition reads the same."""
@@ -56,25 +46,19 @@ def test_every_value_is_read_under_its_own_name_and_in_its_own_place(net, tmp_pa
         expected[name] = values if tensor.is_floating_point() else np.full(tuple(tensor.shape), number)
     written = {name: torch.tensor(values).to(net.state_dict()[name].dtype) for name, values in expected.items()}
     path = tmp_path / f"weights.{suffix}"
-    save_file(written, path) if suffix == "safetensors" else torch.save(written, path)
-    held, loaded = weights.read_tensors(path), load_network(path).state_dict()
-    assert held.keys() == expected.keys()
+    head = {"fc.weight": torch.zeros(10, 512), "fc.bias": torch.zeros(10)}
+    save_file(written | head, path) if suffix == "safetensors" else torch.save(written | head, path)
+    held, network = weights.read_tensors(path), load_network(str(path))
+    loaded = network.state_dict()
+    assert (network.depth, network.stem, network.training) == (18, "torchvision", False)
+    assert held.keys() == (expected | head).keys()
     for name, values in expected.items():
         assert held[name].numpy().tobytes() == written[name].numpy().tobytes(), name
         if not name.endswith("num_batches_tracked"):
             np.testing.assert_array_equal(loaded[name].numpy(), values.astype(np.float32), err_msg=name)
 
 
-def test_the_given_tensors_are_copied(state):
-    loaded = load_network(state)
-    kept = loaded.conv1.weight.clone()
-    state["conv1.weight"] = state["conv1.weight"].clone()
-    loaded = load_network(state)
-    state["conv1.weight"].zero_()
-    assert torch.equal(loaded.conv1.weight, kept)
-
-
-@pytest.mark.parametrize(("depth", "stem"), [(18, "universal"), (34, "torchvision"), (50, "universal")])
+@pytest.mark.parametrize(("depth", "stem"), [(34, "torchvision"), (50, "universal")])
 def test_depth_and_stem_are_seen_from_the_tensors(depth, stem):
     net = ResNet.random(1, depth, stem)
     loaded = load_network(net.state_dict())
@@ -100,6 +84,7 @@ def test_a_checkpoint_of_universal_representations_is_read(tmp_path):
 def test_half_precision_is_read_as_float32(net, state):
     halves = {name: t.half() if t.is_floating_point() else t for name, t in state.items()}
     loaded = load_network(halves)
+    halves["conv1.weight"].zero_()  # what was given was copied
     assert loaded.conv1.weight.dtype == torch.float32
     assert torch.equal(loaded.conv1.weight, net.conv1.weight.half().float())
 
@@ -186,16 +171,19 @@ def test_a_file_cut_off_or_of_something_else_is_refused(state, tmp_path, suffix,
     assert "holds a list" in refusal(tmp_path / "list.pth")
 
 
-def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path):
-    message = refusal(tmp_path / "none.pth")
-    assert f"there is none at {tmp_path / 'none.pth'}" in message
-    assert "resnet18" in message
-
-
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     monkeypatch.setenv(weights.CACHE_VARIABLE, str(tmp_path))
     return tmp_path / "weights"
+
+
+def test_a_file_that_is_not_there_or_damaged_is_said_to_be(tmp_path, cache):
+    message = refusal(tmp_path / "none.pth")
+    assert f"there is none at {tmp_path / 'none.pth'}" in message and "resnet18" in message
+    cache.mkdir()
+    (cache / "resnet50-0676ba61.pth").write_bytes(b"half")
+    message = refusal("resnet50")
+    assert "is damaged" in message and "0676ba61" in message and "Delete it" in message
 
 
 def test_without_a_network_it_says_where_to_put_the_file(cache, monkeypatch):
@@ -225,15 +213,6 @@ def test_published_weights_are_fetched_once_and_checked(cache, state, monkeypatc
     for _ in range(2):
         assert load_network("resnet18").depth == 18
     assert fetched == [url]
-
-
-def test_a_damaged_download_is_noticed(cache, monkeypatch):
-    cache.mkdir()
-    (cache / "resnet50-0676ba61.pth").write_bytes(b"half")
-    message = refusal("resnet50")
-    assert "is damaged" in message
-    assert "0676ba61" in message
-    assert "Delete it" in message
 
 
 def test_the_downloader_itself_is_asked_for_the_right_file(cache, monkeypatch):

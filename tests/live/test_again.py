@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from live_touches import EMBEDDINGS, GEL, NOISE, frames, gel_learner, learner, predictions, rest, shift, slide
+from live_touches import EMBEDDINGS, GEL, frames, gel_learner, learner, predictions, rest, shift, slide
 from touches import PAD
 
 from scroll_tactile import TactileLearner
@@ -23,7 +23,7 @@ def touched(live, touch, again=False):
     return live.end().touches[0]
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(seed=st.integers(0, 50), length=st.integers(2, 70), sizes=st.lists(st.integers(0, 20), max_size=8))
 @pytest.mark.parametrize("embedding", EMBEDDINGS)
 def test_predictions_weigh_the_touches_of_one_thing(embedding, seed, length, sizes):
@@ -172,16 +172,3 @@ def test_again_without_a_touch_before_says_what_to_do():
             live.again()
     with pytest.raises(InputError, match="closed"):
         live.again()
-
-
-def test_a_thing_that_one_touch_leaves_undecided_is_decided_by_several():
-    """Beginnings of touches that say little each; at the end of the last the answer is one to act on."""
-    made, random = learner(), np.random.default_rng(3)
-    alone = together = 0
-    with made.live(contact="manual") as live:
-        for material in "abcabc":
-            hard = [slide(material, 8, random) + 20 * NOISE * random.standard_normal((8, 2)) for _ in range(3)]
-            found = [touched(live, touch.clip(0, 1), i > 0) for i, touch in enumerate(hard)]
-            alone += found[0].decided
-            together += found[-1].decided and found[-1].prediction.material == material
-    assert together >= alone

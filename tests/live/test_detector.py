@@ -35,7 +35,7 @@ def wide(channels, unit="N", **fields):
 @pytest.mark.parametrize("noise", ["white", "slow", "common", "counts", "heavy"])
 def test_noise_alone_is_no_contact(noise):
     random = np.random.default_rng(3)
-    rows = random.standard_normal((60_000, 12))
+    rows = random.standard_normal((20_000, 12))
     if noise == "slow":
         for i in range(1, len(rows)):
             rows[i] = 0.9 * rows[i - 1] + 0.44 * rows[i]
@@ -46,7 +46,7 @@ def test_noise_alone_is_no_contact(noise):
     elif noise == "heavy":
         rows = random.standard_t(4, rows.shape)
     contacts, _ = found(wide(12), 0.02 * rows)
-    assert len(contacts) <= 1  # ten minutes, of which an hour may have one
+    assert len(contacts) <= 1  # 200 seconds, of which an hour may have one
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
@@ -60,19 +60,14 @@ def test_units_do_not_matter(scale):
     assert np.abs(np.array(contacts) - [(1000, 1400), (2000, 2300)]).max() <= 2
 
 
-def test_a_glitch_is_no_contact():
-    random = np.random.default_rng(5)
-    rows = 0.02 * random.standard_normal((5000, 12))
+def test_glitches_are_no_contact_and_drift_is_followed_and_a_touch_on_it_is_found():
+    rows = 0.02 * np.random.default_rng(6).standard_normal((30_000, 12))
+    drifting = rows + np.linspace(0, 3, 30_000)[:, None]
     rows[1000::300] = 5.0
     rows[1001::900] = -5.0
-    assert found(wide(12), rows)[0] == []
-
-
-def test_drift_is_followed_and_a_touch_on_it_is_found():
-    random = np.random.default_rng(6)
-    rows = 0.02 * random.standard_normal((30_000, 12)) + np.linspace(0, 3, 30_000)[:, None]
-    rows[20_000:20_300] += 0.5
-    contacts, _ = found(wide(12), rows)
+    assert found(wide(12), rows[:5000])[0] == []
+    drifting[20_000:20_300] += 0.5
+    contacts, _ = found(wide(12), drifting)
     assert len(contacts) == 1 and abs(contacts[0][0] - 20_000) <= 2
 
 
@@ -95,6 +90,15 @@ def test_a_level_that_moved_for_good_is_rest_in_the_end():
         ended = live.push(rows).touches
     assert [touch.end for touch in ended] == ["still", "released"]
     assert abs(round(ended[1].at * 100) - 7000) <= 2
+
+
+def test_noise_that_grew_for_good_while_rest_was_hardly_known_is_learned_anew():
+    rows = np.random.default_rng(11).standard_normal((5000, 12))
+    rows[:300] *= 0.02
+    rows[300:] = 1 + 0.1 * rows[300:]
+    rows[4000:4300] += 2.0
+    contacts, detector = found(wide(12), rows)
+    assert np.abs(np.array(contacts[-1]) - [4000, 4300]).max() <= 3 and not detector.contact
 
 
 def test_contact_from_the_first_reading_on_is_found_out_and_reported():
@@ -126,8 +130,8 @@ def test_fewer_false_contacts_an_hour_ask_for_more():
     assert alarms == sorted(alarms, reverse=True) and alarms[0] > 1.5 * alarms[2] > 0
 
 
-@pytest.mark.parametrize("sensor", [sensors.BIOTAC, sensors.ROBOSKIN], ids=lambda sensor: sensor.name)
-def test_a_simulated_shift_s_touches_are_found(sensor):
+def test_a_simulated_shift_s_touches_are_found():
+    sensor = sensors.ROBOSKIN
     scene = Scene(sensor=sensor)
     shift_ = simulated_shift(scene, scene.materials[:5], seconds=120)
     with TactileLearner(sensor=sensor).live() as live:

@@ -1,5 +1,6 @@
 """What a touch is made of: by what it feels like, and by heads for materials that were never observed."""
 
+import copy
 import itertools
 from dataclasses import replace
 
@@ -38,7 +39,7 @@ def described(shares):
 
 
 def observed(names, touches=8, **settings):
-    learner = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=256), **settings)
+    learner = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=128), **settings)
     for at in range(touches):
         for name in names:
             learner.observe(name, touch(mixtures()[name], at))
@@ -54,14 +55,19 @@ def learner():
     return learner
 
 
+@pytest.fixture(scope="module")
+def three():
+    return observed(["c", "l", "s"], 4)
+
+
 def right(composition, shares):
     return [(one.presence > 0.5) == (share > 0) for one, share in zip(composition.constituents, shares, strict=True)]
 
 
 class TestCompose:
-    @pytest.mark.parametrize("name", ["c", "lw", "csw", "clsw"])
+    @pytest.mark.parametrize("name", ["c", "csw"])
     def test_a_material_that_was_observed_is_known_by_what_it_is_made_of(self, learner, name):
-        for seed in range(20, 24):
+        for seed in range(20, 23):
             said = learner.compose(touch(mixtures()[name], seed))
             assert all(right(said, mixtures()[name]))
             shares = [one.share for one in said.constituents]
@@ -105,16 +111,13 @@ def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares)
 class TestDescribing:
     def test_after_the_touching_is_as_before_to_the_byte(self):
         names = ["c", "l", "s", "cl", "ls", "csw"]
-        before = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
+        before, after = (TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64)) for _ in range(2))
         for name in reversed(names):
             before.describe(name, described(mixtures()[name]))
-        for at in range(4):
-            for name in names:
-                before.observe(name, touch(mixtures()[name], at))
-        after = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64))
-        for name in reversed(names):
-            for at in range(4):
-                after.observe(name, touch(mixtures()[name], at))
+        for name, at in itertools.product(names, range(4)):
+            before.observe(name, touch(mixtures()[name], at))
+        for name, at in itertools.product(reversed(names), range(4)):
+            after.observe(name, touch(mixtures()[name], at))
         digest = after.digest()
         for name in names:
             after.describe(name, described(mixtures()[name]))
@@ -123,8 +126,8 @@ class TestDescribing:
             stream = touch(mixtures()["sw"], 50 + seed)
             assert repr(after.compose(stream)) == repr(before.compose(stream))
 
-    def test_a_later_description_changes_the_answer_without_a_touch(self, learner):
-        trained = observed(["c", "l", "s"], 4)
+    def test_a_later_description_changes_the_answer_without_a_touch(self, three):
+        trained = copy.deepcopy(three)
         for name in "cls":
             trained.describe(name, described(mixtures()[name]))
         stream = touch(mixtures()["s"], 60)
@@ -134,8 +137,8 @@ class TestDescribing:
         assert said["wool"].presence > 0.5
         assert "silk" not in [one.name for one in said.constituents]
 
-    def test_what_all_or_none_have_is_named_and_not_guessed(self):
-        trained = observed(["c", "l", "s"], 4)
+    def test_what_all_or_none_have_is_named_and_not_guessed(self, three):
+        trained = copy.deepcopy(three)
         for name in "cls":
             values = {"dyed": True, "woven": False, "soft": name == "s"}
             trained.describe(name, values | ({"rare": True} if name == "c" else {}))
@@ -220,7 +223,7 @@ class TestDescribing:
 
     @pytest.mark.parametrize("readout", ["lda", "ridge"])
     def test_a_material_observed_since_the_heads_could_be_measured_is_weighed_too(self, readout):
-        trained = observed(["c", "l", "s"], 8, readout=readout)
+        trained = observed(["c", "l", "s"], 6, readout=readout)
         for name in ("c", "l", "s", "w"):
             trained.describe(name, described(mixtures()[name]))
         assert trained.compose(touch(mixtures()["w"], 60))["wool"].unlearned.startswith("no material")
@@ -233,7 +236,8 @@ class TestDescribing:
 
     def test_what_is_unknown_of_a_material_takes_no_part(self):
         names = ["c", "l", "s", "w", "cl"]
-        whole, part = observed(names, 4), observed(names, 4)
+        whole = observed(names, 4)
+        part = copy.deepcopy(whole)
         for name in names:
             values = {part: share > 0 for part, share in zip(PARTS, mixtures()[name], strict=True)}
             whole.describe(name, values)

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import weakref
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.errors import CapacityError, InputError
+from scroll_tactile.errors import CapacityError
 from scroll_tactile.prediction import current
 from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
@@ -56,10 +57,33 @@ def fed(observed, **settings):
     return learner
 
 
-def bits(learner, probes=PROBES, scene=None):
+def bits(learner, probes=PROBES):
     """Answers such that equal means equal to the bit."""
-    said = [learner.predict(stream(*probe), scene=scene) for probe in probes]
+    said = [learner.predict(stream(*probe)) for probe in probes]
     return [([(name, share.hex()) for name, share in one.ranking], one.novelty.hex(), one.known) for one in said]
+
+
+@cache
+def expected(observed):
+    """The answers of a fresh memory that observed these touches."""
+    return bits(fed(observed))
+
+
+def later(count):
+    """All that was observed, and so many touches of a."""
+    return *OBSERVED, *(("a", 90 + i) for i in range(count))
+
+
+def asked_once():
+    """A learner whose model was fitted to all that was observed."""
+    learner = copy.deepcopy(_unasked())
+    learner.predict(stream(*PROBES[0]))
+    return learner
+
+
+@cache
+def _unasked():
+    return fed(OBSERVED)
 
 
 def require_followed(learner):
@@ -87,10 +111,10 @@ def slowly(monkeypatch, seconds):
 # A touch that is observed, or None for a prediction.
 CALLS = st.lists(st.none() | st.tuples(st.sampled_from("abcdef"), st.integers(100, 160)), max_size=16)
 # Of a memory of no more than FEW touches each counts, and no thread is waited for.
-FEW_CALLS = st.lists(st.none() | st.tuples(st.sampled_from("abcdef"), st.integers(100, 160)), max_size=10)
+FEW_CALLS = st.lists(st.none() | st.tuples(st.sampled_from("abcdef"), st.integers(100, 160)), max_size=7)
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(FEW_CALLS, st.sampled_from(["lda", "ridge"]), st.sampled_from([0.01, 0.03]))
 def test_the_same_calls_give_the_same_answers_whatever_the_threads_speed(calls, readout, seconds):
     said = []
@@ -109,7 +133,7 @@ def test_the_same_calls_give_the_same_answers_whatever_the_threads_speed(calls, 
     assert said[0] == said[1]
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(CALLS, st.sampled_from(["lda", "ridge"]))
 def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
     learner, observed = fed(OBSERVED[:6], readout=readout), list(OBSERVED[:6])
@@ -127,10 +151,9 @@ def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
     assert learner._predictor.current._model is before  # settled already
 
 
-@pytest.mark.parametrize("readout", ["lda", "ridge"])
-def test_what_was_just_observed_counts_and_a_fit_that_is_there_answers(readout):
-    learner = fed([(name, seed) for seed in range(16) for name in "ab"], readout=readout)
-    for i in range(16):
+def test_what_was_just_observed_counts_and_a_fit_that_is_there_answers():
+    learner = fed([(name, seed) for seed in range(8) for name in "ab"])
+    for i in range(6):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 200 + i))
         learner.predict(stream(*PROBES[0]))
         if (fit := learner._predictor.current._fit) is not None:
@@ -143,13 +166,11 @@ def test_what_was_just_observed_counts_and_a_fit_that_is_there_answers(readout):
 
 
 def test_no_prediction_fits_in_the_foreground_while_touches_come(monkeypatch):
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
-    fitted = []
+    learner, fitted = asked_once(), []
     monkeypatch.setattr(Draft, "fit", lambda *own: fitted.append(threading.current_thread()) or FIT(*own))
-    for i in range(36):
+    for i in range(12):
         learner.observe("abcd"[i % 4], stream("abcd"[i % 4], 100 + i))
-        if i % 7 == 0:
+        if i % 5 == 0:
             learner.predict(stream(*PROBES[0]))
     assert fitted
     assert threading.main_thread() not in fitted
@@ -163,30 +184,28 @@ def test_no_prediction_waits_for_a_fit_that_never_ends(monkeypatch):
         go.wait(60)
         return FIT(draft, extractor)
 
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
+    learner = asked_once()
     monkeypatch.setattr(Draft, "fit", fit)
-    monkeypatch.setattr(current, "MOST_BEHIND", 20)
-    for i in range(60):
-        learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i, 60 + i))
-        if i % 9 == 0 or i == 59:
+    monkeypatch.setattr(current, "MOST_BEHIND", 8)
+    observed = [("abc"[i % 3], stream("abc"[i % 3], 100 + i, 60 + i)) for i in range(24)]
+    for i, (material, touch) in enumerate(observed):
+        learner.observe(material, touch)
+        if i % 9 == 0 or i == 23:
             learner.predict(stream(*PROBES[0]))
     assert not go.is_set()
     require_followed(learner)
     go.set()
     learner.settle()
-    later = [("abc"[i % 3], stream("abc"[i % 3], 100 + i, 60 + i)) for i in range(60)]
     fresh = fed(OBSERVED)
-    for material, touch in later:
+    for material, touch in observed:
         fresh.observe(material, touch)
     assert bits(learner) == bits(fresh)
 
 
 def test_readouts_solved_again_are_those_of_a_fit(monkeypatch):
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
+    learner = asked_once()
     before = learner._predictor.current.present(learner._ledger)
-    for i in range(30):
+    for i in range(12):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i))
     memory = learner.memory
     renewed = Renewal.of(before, memory).solve()
@@ -203,10 +222,10 @@ def test_readouts_solved_again_are_those_of_a_fit(monkeypatch):
 
 
 def test_many_touches_without_a_question_are_not_kept(monkeypatch):
-    monkeypatch.setattr(current, "MOST_BEHIND", 20)
+    monkeypatch.setattr(current, "MOST_BEHIND", 8)
     learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
-    for i in range(current.MOST_BEHIND + 50):
+    for i in range(current.MOST_BEHIND + 20):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 100 + i))
     held = learner._predictor.current
     jobs = [job for job in (held._fit, held._renewal) if job is not None]
@@ -241,12 +260,11 @@ def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, m
         require_followed(learner)
         learner.settle()
         settled = bits(learner)
-    fresh = fed([*FEWER, ("a", 90), ("b", 91)])
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as again:
-        assert bits(again) == settled == bits(fresh)
+        assert bits(again) == settled == expected((*FEWER, ("a", 90), ("b", 91)))
 
 
-@pytest.mark.parametrize("error", [MemoryError("no room"), InputError("too many"), RuntimeError("no new thread")])
+@pytest.mark.parametrize("error", [MemoryError("no room"), RuntimeError("no new thread")])
 def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monkeypatch, error):
     learner = fed(FEWER)
     learner.predict(stream(*PROBES[0]))
@@ -255,13 +273,11 @@ def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monk
         for i in range(5):
             assert learner.observe("a", stream("a", 90 + i)).sequence == len(FEWER) + 1 + i
     learner.settle()
-    fresh = fed([*FEWER, *(("a", 90 + i) for i in range(5))])
-    assert bits(learner) == bits(fresh)
+    assert bits(learner) == expected((*FEWER, *(("a", 90 + i) for i in range(5))))
 
 
 def test_a_fit_that_failed_beside_is_made_again(monkeypatch):
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
+    learner = asked_once()
     with monkeypatch.context() as broken:
         failing(broken, Draft, "fit", MemoryError("no room"))
         for i in range(3):
@@ -272,13 +288,12 @@ def test_a_fit_that_failed_beside_is_made_again(monkeypatch):
     again = learner._predictor.current._fit
     assert again is not failed
     again.future.result()
-    assert bits(learner) == bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
+    assert bits(learner) == expected(later(3))
 
 
 @pytest.mark.parametrize("touches", [1, 3])
 def test_following_that_is_cut_short_counts_no_touch_twice(monkeypatch, touches):
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
+    learner = asked_once()
     for i in range(touches):
         learner.observe("a", stream("a", 90 + i))
     own, calls = Readout.follow, []
@@ -293,10 +308,9 @@ def test_following_that_is_cut_short_counts_no_touch_twice(monkeypatch, touches)
     monkeypatch.setattr(Readout, "follow", follow)
     with pytest.raises(KeyboardInterrupt):
         learner.predict(stream(*PROBES[0]))
-    fresh = fed([*OBSERVED, *(("a", 90 + i) for i in range(touches))])
     require_followed(learner)
     learner.settle()
-    assert bits(learner) == bits(fresh)
+    assert bits(learner) == expected(later(touches))
 
 
 # With a fit running
@@ -306,8 +320,7 @@ def test_following_that_is_cut_short_counts_no_touch_twice(monkeypatch, touches)
 def fitting(monkeypatch):
     """A learner of which a thread is fitting the next model for a while."""
     slowly(monkeypatch, 0.3)
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
+    learner = asked_once()
     for i in range(3):
         learner.observe("a", stream("a", 90 + i))
     assert not learner._predictor.current._fit.future.done()
@@ -315,9 +328,8 @@ def fitting(monkeypatch):
 
 
 def test_closed_pickled_copied_and_dropped_while_a_fit_runs(fitting):
-    fresh = bits(fed([*OBSERVED, *(("a", 90 + i) for i in range(3))]))
     for snapshot in (pickle.loads(pickle.dumps(fitting)), copy.deepcopy(fitting)):
-        assert bits(snapshot) == fresh
+        assert bits(snapshot) == expected(later(3))
     job = fitting._predictor.current._fit
     fitting.close()
     assert job.future.done()
@@ -329,8 +341,7 @@ def test_closed_pickled_copied_and_dropped_while_a_fit_runs(fitting):
 def test_a_learner_that_nobody_holds_is_gone_and_its_thread_ends(monkeypatch):
     slowly(monkeypatch, 0.1)
     threads = set(threading.enumerate())
-    learner = fed(OBSERVED)
-    learner.predict(stream(*PROBES[0]))
+    learner = asked_once()
     learner.observe("a", stream("a", 90))
     learner.observe("a", stream("a", 91))
     gone = weakref.ref(learner)
@@ -353,38 +364,6 @@ def test_a_forked_process_waits_for_no_thread_of_its_parent(fitting):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-def test_predictions_from_four_threads_while_a_fifth_observes_are_each_of_some_state():
-    observed = [("abcd"[i % 4], 100 + i) for i in range(12)]
-    learner = fed(FEWER)
-    learner.predict(stream(*PROBES[0]))
-    said, failures, done = [], [], threading.Event()
-
-    def ask():
-        try:
-            while not done.is_set():
-                said.append(learner.predict(stream(*PROBES[0])))
-        except BaseException as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=ask) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for touch in observed:
-        learner.observe(touch[0], stream(*touch))
-        time.sleep(0.005)
-    done.set()
-    for thread in threads:
-        thread.join(60)
-    assert not failures
-    assert said
-    for prediction in said:
-        assert {name for name, _ in prediction.ranking} in ({*"abc"}, {*"abcd"})
-        assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
-        assert np.isfinite(prediction.novelty)
-    learner.settle()
-    assert bits(learner) == bits(fed([*FEWER, *observed]))
-
-
 ENDS = """
 import os, signal, sys, threading, time
 sys.path[:0] = sys.argv[3:]
@@ -396,11 +375,11 @@ fit, begun = Draft.fit, threading.Event()
 def slow(draft, extractor):
     if threading.current_thread() is not threading.main_thread():
         begun.set()
-        time.sleep(1.0)
+        time.sleep(0.5)
     return fit(draft, extractor)
 Draft.fit = slow
 learner = TactileLearner.open(sys.argv[1], sensor=PAD, embedding=SMALL)
-for i in range(8):
+for i in range(4):
     for name in "ab":
         learner.observe(name, stream(name, i))
 learner.predict(stream("a", 50))
@@ -409,14 +388,12 @@ for i in range(3):
 assert begun.wait(30)
 print("fitting", flush=True)
 how = sys.argv[2]
-if how == "killed":
-    os.kill(os.getpid(), signal.SIGKILL)
 if how == "interrupted":
     signal.raise_signal(signal.SIGINT)
 """
 
 
-@pytest.mark.parametrize(("how", "code"), [("ended", 0), ("killed", -9), ("interrupted", (1, -2, 130))])
+@pytest.mark.parametrize(("how", "code"), [("ended", (0,)), ("interrupted", (1, -2, 130))])
 def test_a_process_may_end_in_any_way_while_a_fit_runs(tmp_path, how, code):
     done = subprocess.run(
         [sys.executable, "-c", ENDS, tmp_path / "m", how, *sys.path],
@@ -426,7 +403,7 @@ def test_a_process_may_end_in_any_way_while_a_fit_runs(tmp_path, how, code):
         check=False,
     )
     assert done.stdout == "fitting\n", done.stderr
-    assert done.returncode in (code if isinstance(code, tuple) else (code,)), done.stderr
+    assert done.returncode in code, done.stderr
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
-        observed = [(name, i) for i in range(8) for name in "ab"] + [("a", 90 + i) for i in range(3)]
-        assert bits(learner) == bits(fed(observed))
+        observed = *((name, i) for i in range(4) for name in "ab"), *(("a", 90 + i) for i in range(3))
+        assert bits(learner) == expected(observed)

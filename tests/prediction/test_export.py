@@ -34,14 +34,13 @@ def exported(learner, path):
     return runtime.InferenceSession(path, providers=["CPUExecutionProvider"])
 
 
-@pytest.mark.parametrize("readout", ["lda", "ridge"])
-@pytest.mark.parametrize("sensor", [sensors.BIOTAC, sensors.ROBOSKIN, SLOW], ids=lambda one: one.name)
+@pytest.mark.parametrize(("sensor", "readout"), [(sensors.ROBOSKIN, "ridge"), (SLOW, "lda")])
 def test_it_says_what_predict_says(sensor, readout, tmp_path):
     learner, scene = trained(sensor, readout=readout)
     session = exported(learner, tmp_path / "memory.onnx")
     materials = json.loads(session.get_modelmeta().custom_metadata_map["materials"])
     assert materials == list(learner.materials)
-    for name in scene.materials[:4]:
+    for name in scene.materials[:2]:
         touch = scene.touch(name, 9)
         (scores,) = session.run(["scores"], {"image": tactile_image(touch)})
         assert scores.dtype == np.float32
@@ -70,8 +69,8 @@ def test_an_empty_memory_is_refused(tmp_path):
 
 
 def test_a_material_observed_only_briefly_is_named(tmp_path):
-    learner, scene = trained(sensors.ROBOSKIN)
-    learner.observe("brief", scene.touch(scene.materials[0], 5).first(0.4))
+    learner, scene = trained(SLOW)
+    learner.observe("brief", scene.touch(scene.materials[0], 5).first(0.5))
     with pytest.raises(InputError, match="'brief' was only observed briefly"):
         export_onnx(learner, tmp_path / "memory.onnx")
 

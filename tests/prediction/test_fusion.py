@@ -1,5 +1,7 @@
 """The weights of readouts and kept touches at each moment, fitted to held-out touches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -209,6 +211,8 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
     rng = np.random.default_rng(10)
     moment = fused(judged(10, evidence(rng, KEYS, 6.0), evidence(rng, KEYS, 2.0))).complete
     assert moment.lone_match_weight > moment.match_weight
+    sharper = fused(judged(10, evidence(rng, KEYS, 6.0), evidence(rng, KEYS, 2.0) * 8)).complete
+    assert sharper.lone_match_weight < 0.5 * moment.lone_match_weight
 
     def way(noise_share):
         return match(np.zeros(C), noise_share=noise_share)
@@ -225,3 +229,9 @@ def test_the_threshold_of_a_moment_is_the_conformal_quantile_of_its_touches():
     numbers = 1.0, 0.5, 0.5, 0.0, 0.0, np.inf, 0.0, 1.0
     moment = Moment(10, 0, calibration, *numbers)
     assert [moment.threshold(share) for share in (0.05, 0.5)] == [calibration.threshold(share) for share in (0.05, 0.5)]
+
+
+def test_the_further_off_a_touch_lies_the_less_the_readouts_weigh_and_at_another_pace_half_as_much():
+    limited = replace(fused(judged(10, None, None)).complete, distance_limit=4.0)
+    assert [limited.distance_weight(distance, True) for distance in (0.5, 2.0, 9.0, np.inf)] == [1.0, 0.5, 0.25, 1.0]
+    assert [limited.distance_weight(distance, False) for distance in (2.0, 9.0)] == [0.5, 0.125]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from prediction.test_current import fed
 from touches import PAD, SMALL, SmallSample, Windowed
 
 from scroll_tactile import TactileLearner
@@ -89,14 +88,14 @@ def test_a_scene_of_ten_thousand_names():
     assert learner.predict(probe, scene=[NAMES[3]]).ranking == ((NAMES[3], 1.0),)
 
 
-@pytest.mark.parametrize("touches", [1, 3])
+@pytest.mark.parametrize("touches", [1, 2])
 def test_materials_held_only_when_asked_for_are_weighed_alike(monkeypatch, touches):
     """Of a memory of more materials than are solved for at once, in which a few are of sampled touches."""
     monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
     plain = learner_of(touches)
     monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
     held = learner_of(touches)
-    for i in range(20):
+    for i in range(8):
         scene = [NAMES[place] for place in {i % 12, (5 * i + 1) % 12, (7 * i + 3) % 12}]
         for chosen in (scene, NAMES[i % 10 : i % 10 + 2], None):
             ours, theirs = (learner.predict(stream(i % 12, 50 + i), scene=chosen) for learner in (plain, held))
@@ -139,15 +138,6 @@ def test_a_material_that_was_observed_briefly_among_others_that_came_since(monke
         prediction = learner.predict(stream(7, 70, readings))
         assert {name for name, _ in prediction.ranking} == {*NAMES[:3], "new"}
         assert np.isfinite(prediction.novelty)
-
-
-def test_one_material_and_one_touch():
-    learner = fed([("a", 1)])
-    for readings in (6, 60, 500):
-        assert learner.predict(stream(3, 4, readings)).ranking == (("a", 1.0),)
-    learner.observe("a", stream(3, 5))
-    learner.observe("b", stream(5, 5))
-    assert {name for name, _ in learner.predict(stream(3, 6)).ranking} == {"a", "b"}
 
 
 def test_competing_kernels_weigh_in_probabilities_and_not_in_novelty_or_distance():

@@ -62,6 +62,7 @@ def test_what_is_kept_is_kept_again(rest):
     assert pressed(kept, rest) == kept
     if rest is not None:
         assert len(kept) == MOST_FRAMES + (rest is not REST)
+        assert len(pressed(stream(0, *[20] * (MOST_FRAMES + 1)), rest)) == len(kept)
 
 
 def test_the_image_is_the_difference_from_the_rest():

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -59,13 +58,6 @@ def test_a_frame_is_averaged_down_and_scanned_column_by_column():
         )
 
 
-def test_a_small_frame_keeps_its_pixels():
-    frames = np.random.default_rng(2).integers(0, 256, (1, 5, 7, 3))
-    image = tactile_image(validate(frames, camera(5, 7)))
-    assert image.shape == (15, 7)
-    assert np.allclose(image, frames[0].transpose(0, 2, 1).reshape(15, 7) / 127.5 - 1, atol=1e-6)
-
-
 def test_with_a_resting_image_what_is_shown_is_the_difference_from_it():
     frames = np.random.default_rng(5).integers(0, 256, (2, 5, 7, 3)).astype(np.float32)
     rest = np.random.default_rng(6).integers(0, 256, (5, 7, 3)).astype(np.float32)
@@ -84,25 +76,13 @@ def shares(length, size):
     return np.maximum(inside, 0) * size / length
 
 
-@pytest.mark.parametrize(("height", "width"), [(121, 161), (180, 400), (239, 160), (120, 333)])
+@pytest.mark.parametrize(("height", "width"), [(5, 7), (121, 161), (239, 160), (120, 333)])
 def test_areas_that_divide_pixels_share_them(height, width):
     frame = np.random.default_rng(3).uniform(0, 255, (height, width, 3))
     image = tactile_image(validate(frame[None], camera(height, width)))
     rows, columns = min(height, 120), min(width, 160)
     truth = np.einsum("rh,hwk,cw->rck", shares(height, rows), frame, shares(width, columns), optimize=True)
     assert np.allclose(image, truth.transpose(0, 2, 1).reshape(rows * 3, columns) / 127.5 - 1, atol=1e-6)
-
-
-def test_the_same_bits_whatever_the_thread_count():
-    frames = np.random.default_rng(4).uniform(0, 255, (1, 480, 640, 3))
-    stream = validate(frames, GELSIGHT)
-    threads = torch.get_num_threads()
-    images = []
-    for count in (1, 2):
-        torch.set_num_threads(count)
-        images.append(tactile_image(stream).tobytes())
-    torch.set_num_threads(threads)
-    assert images[0] == images[1]
 
 
 def test_three_planes_are_the_image_thrice():

@@ -18,7 +18,7 @@ from scroll_tactile.errors import (
     SensorMismatchError,
     StreamTooShortError,
 )
-from scroll_tactile.sensors import BIOTAC, GELSIGHT, ROBOSKIN, Sensor
+from scroll_tactile.sensors import BIOTAC, Sensor
 from scroll_tactile.signals.stream import fewest_readings, validate
 
 SKIN = Sensor(name="skin", channels=3, rate=20.0, low=-8.0, high=100.0, unit="counts", duration=1.0)
@@ -45,37 +45,24 @@ def test_a_stream_is_clean_float32_with_its_sensor():
     assert np.array_equal(stream.readings, VALUES)
     assert (len(stream), stream.seconds, stream.clipped) == (4, 0.2, 0)
     assert repr(stream) == "Stream(skin, (4, 3), 0.2 s, clipped=0)"
+    assert validate(np.full((4, 3), -0.0), SKIN).key == validate(np.zeros((4, 3), int), SKIN).key
+    with pytest.raises(AttributeError):
+        stream.clipped = 3
 
 
-# fmt: off
-DTYPES = [
-    "?", "i1", "u1", "i2", ">i2", "u2", "i4", "u4", "i8", ">i8", "u8",
-    "f2", "f4", ">f4", "f8", ">f8", "g",
-]
-TENSOR_DTYPES = [
-    torch.bool, torch.uint8, torch.int64, torch.float16, torch.bfloat16, torch.float32, torch.float64,
-]
-# fmt: on
+DTYPES = ["?", "i1", "u1", "i2", ">i2", "u2", "i4", "u4", "i8", ">i8", "u8", "f2", "f4", ">f4", "f8", ">f8", "g"]
+TENSOR_DTYPES = ["bool", "uint8", "int64", "float16", "bfloat16", "float32", "float64", "float8_e4m3fn"]
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", DTYPES + TENSOR_DTYPES)
 def test_any_real_type_gives_the_same_stream(dtype):
     values = VALUES % 2
-    assert validate(values.astype(dtype), SKIN) == validate(values, SKIN)
-
-
-@pytest.mark.parametrize("dtype", TENSOR_DTYPES)
-def test_any_real_tensor_gives_the_same_stream(dtype):
-    values = VALUES % 2
-    tensor = torch.from_numpy(values).to(dtype)
-    assert validate(tensor, SKIN) == validate(values, SKIN)
-    if dtype.is_floating_point:
-        tensor.requires_grad_()
-        assert validate(tensor, SKIN) == validate(values, SKIN)
-
-
-def test_a_float8_tensor_is_read():
-    assert validate(torch.ones(4, 3).to(torch.float8_e4m3fn), SKIN) == validate(np.ones((4, 3)), SKIN)
+    if dtype in DTYPES:
+        readings = values.astype(dtype)
+    else:
+        readings = torch.from_numpy(values).to(getattr(torch, dtype))
+        readings.requires_grad_(dtype in ("float16", "bfloat16", "float32", "float64"))
+    assert validate(readings, SKIN) == validate(values, SKIN)
 
 
 @pytest.mark.parametrize(
@@ -179,10 +166,6 @@ def test_the_ends_of_a_range_that_float32_cannot_write_are_inside_it():
     assert validate(np.array([[0.1], [0.7]]), sensor).clipped == 0
 
 
-def test_minus_zero_is_zero():
-    assert validate(np.full((4, 3), -0.0), SKIN).key == validate(np.zeros((4, 3), int), SKIN).key
-
-
 def test_the_key_tells_sensor_shape_and_every_value_apart():
     base = validate(VALUES, SKIN)
     changed = VALUES.copy()
@@ -238,6 +221,7 @@ def test_a_copy_is_equal_and_read_only(copied):
         ),
         (np.zeros((40, 4)), ChannelCountError, r"of sensor 'skin' of shape \(T, 3\); came \(40, 4\)"),
         (np.zeros((4, 3, 1)), ChannelCountError, r"Its values fit: use .reshape\(4, 3\)"),
+        ([[1e300, 0, np.nan], [0, 0, 0]], NotFiniteError, "reading 0, channel 2 is nan, the first of 1"),
         ([[0, 1, 2], [0, 1], [0, 1, 2]], ChannelCountError, r"shape \(3,\); reading 1 of 3 has \(2,\)"),
         ([np.zeros(3), np.zeros(4)], ChannelCountError, r"reading 1 of 2 has \(4,\)"),
         ([[0, 1, 2], [0, [1], 2]], ChannelCountError, "reading 1 of 2 holds sequences of different lengths"),
@@ -269,18 +253,10 @@ def test_the_first_value_that_is_not_finite_is_named(value, kind):
         validate(readings, SKIN)
 
 
-def test_an_overflow_beside_a_nan_is_no_excuse():
-    with pytest.raises(NotFiniteError, match="reading 0, channel 2 is nan, the first of 1"):
-        validate([[1e300, 0, np.nan]] * 1 + [[0, 0, 0]] * 3, SKIN)
-
-
-def test_a_masked_value_is_not_read_from_under_its_mask():
+def test_a_masked_value_is_not_read_from_under_its_mask_and_one_channel_gets_its_own_advice():
     masked = np.ma.masked_array(VALUES, mask=VALUES == 7)
     with pytest.raises(NotFiniteError, match="reading 2, channel 1"):
         validate(masked, SKIN)
-
-
-def test_one_channel_gets_its_own_advice():
     sensor = Sensor(name="mic", channels=1, rate=20, low=0, high=1, unit="V", duration=1)
     with pytest.raises(ChannelCountError, match=r"With one channel use .reshape\(40, 1\)"):
         validate(np.zeros(40), sensor)
@@ -302,15 +278,10 @@ def test_camera_frames_keep_their_shape_and_one_is_enough():
         validate(bad, CAMERA)
 
 
-@pytest.mark.parametrize(("sensor", "fewest"), [(BIOTAC, 2), (ROBOSKIN, 2), (SKIN, 2), (GELSIGHT, 1)])
-def test_two_readings_are_enough(sensor, fewest):
-    assert fewest_readings(sensor) == fewest
-
-
 @pytest.mark.parametrize("rate", [0.5, 100.0, 44_100.0])
 def test_two_readings_are_a_stream_at_any_rate_and_one_is_none(rate):
     sensor = SKIN.model_copy(update={"rate": rate})
-    assert len(validate(VALUES[:2], sensor)) == 2
+    assert len(validate(VALUES[:2], sensor)) == 2 == fewest_readings(sensor)
     with pytest.raises(StreamTooShortError, match="at least 2 readings"):
         validate(VALUES[:1], sensor)
 
@@ -362,7 +333,7 @@ def test_a_touch_with_nothing_finite_is_refused():
 
 
 @given(st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_missing_values_by_a_plain_model_and_a_prefix_knows_nothing_of_what_comes_later(data):
     count = data.draw(st.integers(2, 9))
     values = data.draw(hnp.arrays(np.float64, (count, 3), elements=st.integers(-8, 100)))
@@ -391,20 +362,15 @@ def test_a_camera_may_miss_pixels():
 
 
 def test_first_takes_a_prefix():
-    stream = validate(np.vstack([VALUES, np.full((4, 3), 200)]), SKIN)
+    stream = validate(np.vstack([VALUES, np.full((6, 3), 200)]), SKIN)
     part = stream.first(0.2)
     assert part == validate(VALUES, SKIN)
     assert not part.readings.flags.writeable
     assert part.clipped == 12  # an upper bound
-    for seconds in (0.4, 10, np.inf, 1e300):
+    for seconds in (0.5, 10, np.inf, 1e300):
         assert stream.first(seconds) is stream
     for seconds in (0.07, 0, -1, -np.inf):
         with pytest.raises(StreamTooShortError, match="at least 2 readings"):
             stream.first(seconds)
     with pytest.raises(InputError, match="came nan"):
         stream.first(np.nan)
-
-
-def test_a_stream_cannot_be_reassigned():
-    with pytest.raises(AttributeError):
-        validate(VALUES, SKIN).clipped = 3

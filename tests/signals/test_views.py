@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from scroll_tactile.signals.image import shape_image, stretched
 
-few = settings(max_examples=80, deadline=None)
+few = settings(max_examples=40, deadline=None)
 UNIT = 2**20  # steps of half the range: what the values below are whole numbers of
 values = st.integers(-UNIT, UNIT)
 
@@ -60,14 +60,8 @@ def test_an_offset_changes_no_bit(steps, offset):
     assert shape_image(image_of(steps)).tobytes() == shape_image(image_of(steps + offset)).tobytes()
 
 
-def test_an_offset_changes_no_bit_where_the_mean_lies_between_two_steps():
-    steps = np.array([[0, 1], [3, 4], [-7, 2]])
-    found = {shape_image(image_of(steps + offset)).tobytes() for offset in range(-5, 6)}
-    assert len(found) == 1
-
-
 @few
-@given(images(columns=200), st.randoms(use_true_random=False))
+@given(images(columns=60), st.randoms(use_true_random=False))
 def test_no_order_changes_a_bit(steps, random):
     """Of channels, of columns for the deviations, or of the array in memory: sums are of integers."""
     image, channels = image_of(steps), len(steps)
@@ -93,12 +87,6 @@ def test_large_values_are_summed_exactly(columns):
     assert deviations[0] == companded(3 - columns * 3)
 
 
-@pytest.mark.parametrize("columns", [1, 2, 400])
-@pytest.mark.parametrize("level", [-1.0, 0.0, 0.3, 1.0])
-def test_of_a_constant_touch_there_is_nothing(columns, level):
-    assert not shape_image(np.full((3, columns), level, np.float32)).any()
-
-
 @few
 @given(images())
 def test_a_gain_changes_no_sign_and_grows_no_more_than_the_values(steps):
@@ -111,6 +99,8 @@ def test_a_gain_changes_no_sign_and_grows_no_more_than_the_values(steps):
 
 
 def test_it_lies_between_minus_one_and_one_and_reaches_both():
+    for level, columns in ((-1.0, 1), (0.3, 2), (1.0, 400)):  # of a constant touch there is nothing
+        assert not shape_image(np.full((3, columns), level, np.float32)).any()
     found = shape_image(np.array([[-1, 1, -1]], np.float32))
     assert (found[0].tolist(), np.abs(found).max()) == ([0, 1, -1], 1)
 
@@ -136,8 +126,3 @@ class TestStretched:
         assert stretched(one, columns).tobytes() == np.repeat(one, columns, axis=1).tobytes()
         image = np.random.default_rng(0).uniform(-1, 1, (2, columns)).astype(np.float32)
         assert stretched(image, columns).tobytes() == image.tobytes()
-
-    def test_what_was_made_slower_by_whole_numbers_looks_the_same(self):
-        image = np.random.default_rng(0).uniform(-1, 1, (2, 33)).astype(np.float32)
-        for slower in (2, 4, 100):
-            np.testing.assert_allclose(stretched(stretched(image, 32 * slower + 1), 33), image, atol=1e-6)

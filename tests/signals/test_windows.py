@@ -7,7 +7,18 @@ import pytest
 from scroll_tactile import Frames
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
-from scroll_tactile.signals.windows import MOST_WINDOWS, Scale, extent, fitting, milestones, scales, scored, stages
+from scroll_tactile.signals.windows import (
+    MOST_COLUMNS,
+    MOST_WINDOWS,
+    Scale,
+    extent,
+    fitting,
+    milestones,
+    scales,
+    scored,
+    stages,
+    whole_columns,
+)
 
 
 def sensor(rate, duration, **settings):
@@ -34,17 +45,11 @@ def test_the_shortest_scale_is_a_third_of_a_second_and_a_camera_has_one():
 
 
 @pytest.mark.parametrize("one", ALL, ids=named)
-def test_scales_ascend_and_fit_a_usual_touch(one):
-    widths = scales(one)
-    assert list(widths) == sorted(set(widths))
-    assert all(width > 0 for width in widths)
-    assert all(width <= one.readings for width in widths[1:])
-
-
-@pytest.mark.parametrize("one", ALL, ids=named)
 def test_windows_of_all_lengths_lie_within_begin_at_the_beginning_and_are_few(one):
     widths = scales(one)
-    for columns in [*range(1, 2001), 10_000, 10**6]:
+    assert list(widths) == sorted(set(widths))
+    assert all(0 < width <= one.readings for width in widths[1:])
+    for columns in [*range(1, 500), 2000, 10_000, 10**6, 2**28]:
         read = extent(columns, widths)
         assert list(read) == fitting(columns, widths)
         assert widths[0] in read
@@ -82,6 +87,15 @@ def test_scored_windows_lie_within_what_was_observed(one):
                     assert all(b - a >= width // 2 for a, b in pairwise(starts))
 
 
+def test_of_the_shortest_those_are_scored_that_begin_half_a_width_apart():
+    read = extent(100, (30, 300))
+    assert [read[30][place] for place in scored(read, 100)[30]] == [0, 15, 34, 60]
+
+
+def test_views_have_as_many_columns_as_a_usual_touch_within_bounds():
+    assert [whole_columns(one) for one in (BIOTAC, sensor(1.0, 1.0), sensor(10_000.0, 4.0))] == [400, 9, MOST_COLUMNS]
+
+
 def test_milestones_ascend_from_the_shortest_scale_to_where_the_longest_fits():
     for widths in ((30, 200), (80,), (9, 20, 1000), (15, 56)):
         reached = milestones(widths)
@@ -101,23 +115,14 @@ def test_the_stages_of_a_touch_end_with_its_own_length(one):
         assert len(reached) == max(1, sum(length <= columns for length in milestones(widths)))
 
 
-@pytest.mark.parametrize("rate", [5.0, 10.0, 33.0, 50.0, 100.0, 240.0])
+@pytest.mark.parametrize("rate", [5.0, 33.0, 100.0])
 def test_at_each_stage_a_touch_has_the_scales_by_which_the_stage_is_judged(rate):
     """Calibration and model know a stage by its number, and take its scales from its milestone."""
-    for tenths in range(2, 40):
+    for tenths in range(2, 40, 3):
         widths = scales(sensor(rate, tenths / 10))
         for columns in range(1, int(rate * tenths / 5)):
             for stage, length in enumerate(stages(columns, widths)):
                 assert fitting(length, widths) == fitting(milestones(widths)[stage], widths), (widths, columns)
-
-
-def test_a_longer_touch_never_has_fewer_stages_or_scales():
-    before = (0, 0)
-    for columns in range(1, 900):
-        now = (len(stages(columns, (30, 200))), len(extent(columns, (30, 200))))
-        assert now[0] >= before[0]
-        assert now[1] >= before[1]
-        before = now
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 64, 65, 1000])
@@ -129,10 +134,3 @@ def test_the_windows_of_a_camera_are_its_frames(frames):
     assert starts[-1] == 32 * (frames - 1)
     assert all(start % 32 == 0 for start in starts)
     assert reading.scored(32 * frames, 32 * frames) == {Scale("window", 32): list(range(len(starts)))}
-
-
-def test_a_touch_of_months_has_as_many_windows_as_one_of_hours():
-    for columns in (10**6, 2**28):
-        read = extent(columns, (30, 300))
-        assert [len(starts) for starts in read.values()] == [MOST_WINDOWS, MOST_WINDOWS]
-        assert all(starts == sorted(set(starts)) for starts in read.values())

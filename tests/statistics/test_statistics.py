@@ -50,15 +50,7 @@ touches = st.lists(st.integers(0, 40), max_size=25)
 few = settings(max_examples=40, deadline=None)
 
 
-@few
-@given(touches, st.randoms(use_true_random=False))
-def test_any_order_is_the_same(observed, random):
-    shuffled = observed.copy()
-    random.shuffle(shuffled)
-    same(of(observed), of(shuffled))
-
-
-@few
+@settings(max_examples=25, deadline=None)
 @given(touches, touches, touches)
 def test_a_sum_is_the_union(a, b, c):
     left, right = of(a), of(b)
@@ -88,6 +80,7 @@ def counts_and_sums(of_these, names):
     return {scale: (of_these.counts(scale, names).tolist(), of_these.sums(scale, names).tolist()) for scale in SCALES}
 
 
+@few
 @given(touches, touches, st.randoms(use_true_random=False))
 def test_a_snapshot_stays_as_it_was_and_so_does_each_of_several(a, b, random):
     statistics, taken = of(a), []
@@ -97,22 +90,15 @@ def test_a_snapshot_stays_as_it_was_and_so_does_each_of_several(a, b, random):
         names = sorted(statistics.materials)
         taken.append((statistics.snapshot(), names, counts_and_sums(statistics, names)))
         change(*touch(one))
+    for other in (copy.deepcopy(statistics), pickle.loads(pickle.dumps(statistics))):
+        names = sorted(statistics.materials)
+        taken.append((statistics.snapshot(), names, counts_and_sums(statistics, names)))
+        other.add(*touch(3))
+        undo = statistics.undo(touch(4)[0], 0)
+        statistics.add(*touch(4))
+        undo()
     for snapshot, names, said in taken:
         assert counts_and_sums(snapshot, names) == said
-
-
-def test_a_snapshot_stays_as_it_was_where_an_addition_is_undone_and_copies_change():
-    statistics = of(range(20))
-    names = sorted(statistics.materials)
-    said, snapshot = counts_and_sums(statistics, names), statistics.snapshot()
-    undo = statistics.undo(touch(3)[0], 0)
-    statistics.add(*touch(3))
-    undo()
-    for other in (copy.deepcopy(statistics), pickle.loads(pickle.dumps(statistics))):
-        other.add(*touch(4))
-        assert counts_and_sums(other, names) != said
-    statistics.add(*touch(5))
-    assert counts_and_sums(snapshot, names) == said
 
 
 @few
@@ -124,6 +110,11 @@ def test_what_was_removed_leaves_no_trace_even_when_more_is_observed(a, b):
     same(statistics, of(a))
     for one in b[::-1]:
         statistics.add(*touch(one))
+    same(statistics, of(b + a))
+    absent = {name for name in "abcdefghijkl" if name not in statistics.materials}
+    for name in absent:
+        with pytest.raises(UnknownMaterialError):
+            statistics.remove(name, {5: np.ones((1, 3), np.int32)})
     same(statistics, of(b + a))
 
 
@@ -182,6 +173,7 @@ def test_what_is_not_contained_cannot_be_taken_out():
         ([[[1, 2, 3]]], [[[-1, -2, -3]]]),  # the products agree, and yet the sums do not
         ([[[1, 2, 3]], [[-1, -2, -3]]], [[[4, 5, 6]], [[-4, -5, -6]]]),  # the sums agree, and yet the products do not
         ([[[0, 0, 0]]], [[[0, 0, 0], [0, 0, 0]]]),  # nothing but the number of rows differs
+        ([[[1, 1, 1], [1, 1, 1]], [[2, 2, 2]]], [[[1, 1, 1]], [[1, 1, 1]], [[2, 2, 2]]]),  # fewer touches
     ],
 )
 def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
@@ -191,17 +183,6 @@ def test_as_many_touches_of_other_content_cannot_be_taken_out(ours, theirs):
             statistics.add("wool", {5: np.array(rows, np.int32)})
     with pytest.raises(InputError, match="contain"):
         whole - part
-
-
-def test_only_what_was_observed_can_be_removed():
-    statistics = of([])
-    statistics.add("wool", {5: np.ones((1, 3), np.int32)})
-    with pytest.raises(UnknownMaterialError):
-        statistics.remove("felt", {5: np.ones((1, 3), np.int32)})
-    statistics.remove("wool", {5: np.ones((1, 3), np.int32)})
-    with pytest.raises(UnknownMaterialError):
-        statistics.remove("wool", {5: np.ones((1, 3), np.int32)})
-    same(statistics, of([]))
 
 
 def test_touches_of_other_lengths_are_distinguished():
@@ -261,22 +242,9 @@ def test_full_statistics_refuse_before_anything_is_added():
     assert statistics.second(5).rows == 1
     statistics.add("felt", {5: codes[5], 20: codes[20][:1]})
     assert statistics.materials == {"felt": 1, "wool": 1}
-
-
-def test_full_statistics_do_not_merge():
     half = MOST_ROWS // 2 + 1
     with pytest.raises(CapacityError, match="exact"):
         filled(half) + filled(half)
-
-
-def test_fewer_touches_of_as_many_rows_do_not_contain_more():
-    whole, part = of([]), of([])
-    whole.add("wool", {5: np.ones((2, 3), np.int32)})
-    whole.add("felt", {5: np.ones((1, 3), np.int32)})
-    for _ in range(2):
-        part.add("wool", {5: np.ones((1, 3), np.int32)})
-    with pytest.raises(InputError, match="contain"):
-        whole - part
 
 
 lengths = st.lists(st.sampled_from([1, 2, 9, 9, 40, 50, 400, 10**6]), max_size=60)

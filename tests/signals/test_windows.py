@@ -8,7 +8,7 @@ from scroll_tactile import Frames
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.sensors import BIOTAC, CONTACTILE, GELSIGHT, ROBOSKIN, Sensor
 from scroll_tactile.signals.windows import (
-    MOST_COLUMNS,
+    MOST_STEPS,
     MOST_WINDOWS,
     Scale,
     extent,
@@ -17,7 +17,7 @@ from scroll_tactile.signals.windows import (
     scales,
     scored,
     stages,
-    whole_columns,
+    whole_steps,
 )
 
 
@@ -93,7 +93,7 @@ def test_of_the_shortest_those_are_scored_that_begin_half_a_width_apart():
 
 
 def test_views_have_as_many_columns_as_a_usual_touch_within_bounds():
-    assert [whole_columns(one) for one in (BIOTAC, sensor(1.0, 1.0), sensor(10_000.0, 4.0))] == [400, 9, MOST_COLUMNS]
+    assert [whole_steps(one) for one in (BIOTAC, sensor(1.0, 1.0), sensor(10_000.0, 4.0))] == [400, 9, MOST_STEPS]
 
 
 def test_milestones_ascend_from_the_shortest_scale_to_where_the_longest_fits():

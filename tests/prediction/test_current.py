@@ -152,7 +152,7 @@ def test_settled_it_answers_as_whoever_observed_the_same(calls, readout):
 
 
 def test_what_was_just_observed_counts_and_a_fit_that_is_there_answers():
-    learner = fed([(name, seed) for seed in range(8) for name in "ab"])
+    learner = fed([(name, seed) for seed in range(9) for name in "ab"])  # more than FEW
     for i in range(6):
         learner.observe("abc"[i % 3], stream("abc"[i % 3], 200 + i))
         learner.predict(stream(*PROBES[0]))
@@ -375,11 +375,11 @@ fit, begun = Draft.fit, threading.Event()
 def slow(draft, extractor):
     if threading.current_thread() is not threading.main_thread():
         begun.set()
-        time.sleep(0.5)
+        time.sleep(1.0)
     return fit(draft, extractor)
 Draft.fit = slow
 learner = TactileLearner.open(sys.argv[1], sensor=PAD, embedding=SMALL)
-for i in range(4):
+for i in range(8):
     for name in "ab":
         learner.observe(name, stream(name, i))
 learner.predict(stream("a", 50))
@@ -405,5 +405,5 @@ def test_a_process_may_end_in_any_way_while_a_fit_runs(tmp_path, how, code):
     assert done.stdout == "fitting\n", done.stderr
     assert done.returncode in code, done.stderr
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
-        observed = *((name, i) for i in range(4) for name in "ab"), *(("a", 90 + i) for i in range(3))
+        observed = *((name, i) for i in range(8) for name in "ab"), *(("a", 90 + i) for i in range(3))
         assert bits(learner) == expected(observed)

@@ -76,7 +76,7 @@ __all__ = [
     "sensors",
 ]
 
-__version__ = "0.12.0"
+__version__ = "0.13.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 
-from scroll_tactile import Kernels, TactileLearner, __version__, sensors
+from scroll_tactile import Kernels, TactileLearner, __version__, native, sensors
 from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -176,4 +176,4 @@ def _finished(kept: Path) -> list[str]:
 
 
 def test_the_version_is_shown() -> None:
-    assert run("--version").stdout == f"scroll-tactile {__version__}\n"
+    assert run("--version").stdout == f"scroll-tactile {__version__}, kernels {native.described()}\n"

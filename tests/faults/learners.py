@@ -161,6 +161,7 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
     store = learner._ledger.store
     named = ((str(touch), learner.names_of(KIT.stream(touch))) for touch in KIT.touches)
     return held(learner) | {
+        "embedding": learner.embedding.fingerprint,  # memories without a touch differ in nothing else
         "materials": learner.materials,
         "names": {touch: names for touch, names in named if names},
         "descriptions": learner.descriptions,
@@ -177,6 +178,7 @@ def expected(state: State) -> dict[str, Any]:
         if touch in KIT.touches and material not in names.setdefault(str(touch), []):
             names[str(touch)].append(material)
     return _held(state.pairs, state.embedding) | {
+        "embedding": KIT.embeddings[state.embedding].fingerprint,
         "materials": state.materials,
         "names": names,
         "descriptions": state.said,

@@ -18,7 +18,9 @@ def _load() -> tuple[Any, str]:
         return None, "turned off by SCROLL_TACTILE_NUMPY"
     try:
         return importlib.import_module("scroll_tactile.native._kernels"), ""
-    except ImportError as error:  # not built, or for another machine
+    except ModuleNotFoundError:
+        return None, "not built; a compiler was missing or failed when the package was installed"
+    except ImportError as error:  # for another machine
         return None, str(error)
 
 

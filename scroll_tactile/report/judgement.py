@@ -11,7 +11,7 @@ from scroll_tactile.report.growing import Growing
 from scroll_tactile.report.knowledge import MOST_NEAR, bins_of, unknown_by
 from scroll_tactile.report.page import figure, note, side_by_side, table
 
-__all__ = ["ROWS", "alike", "growing_answers", "mixed_up", "trusted"]
+__all__ = ["ROWS", "alike", "calibration_plots", "growing_answers", "mixed_up"]
 
 ROWS = 40  # materials, of which each has a row in a figure; of more there are tables
 SQUARE = 30  # materials, of which all pairs have a cell in a figure
@@ -99,7 +99,7 @@ def _by_name(facts: MemoryFacts) -> str:
     return "<h3>Touches it got wrong</h3>" + table(["touch", "of", "called", "probability"], rows, "wrong touches")
 
 
-def trusted(facts: MemoryFacts) -> str:
+def calibration_plots(facts: MemoryFacts) -> str:
     """Calibration, and what would be called unknown."""
     trust, alarms = facts.trust, facts.learner.settings.false_alarms
     if trust is None:

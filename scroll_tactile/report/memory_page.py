@@ -14,7 +14,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.report.judgement import ROWS, alike, growing_answers, mixed_up, trusted
+from scroll_tactile.report.judgement import ROWS, alike, calibration_plots, growing_answers, mixed_up
 from scroll_tactile.report.page import Card, State, cards, figure, page, table
 from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
 
@@ -49,7 +49,7 @@ def memory_page(
     show = progress or (lambda what, done, of: None)
     show("touches left out", 0, STEPS)
     near, order = alike(facts)
-    known, mixed, calibrated = _known(facts), mixed_up(facts, order), trusted(facts)
+    known, mixed, calibrated = _known(facts), mixed_up(facts, order), calibration_plots(facts)
     show("beginnings of touches", 1, STEPS)
     grown = growing_answers(facts)
     show("channels", 2, STEPS)

@@ -26,7 +26,7 @@ from faults.plans import KINDS, history, prepare
 from faults.trials import Trials, checkpoints_every
 from faults.zygote import Child, Zygote
 
-SNAPSHOT_EVERY = 6  # rows between checkpoints: some are written behind the back of most children
+CHECKPOINT_EVERY = 6  # rows between checkpoints: some are written behind the back of most children
 GROWN = 40  # touches at which a new memory is begun
 TARGETS = (*KINDS, "open", "close", "idle")
 TOLD = ("done", "begin", "warned", "seen")
@@ -35,7 +35,7 @@ PATIENCE = 120  # seconds without a word from a child
 
 def work(channel: Connection, path: Path, home: Path, operations: list[Operation]) -> None:
     """The child: open the memory, do the operations; "close": close it; "idle": wait to be killed."""
-    checkpoints_every(SNAPSHOT_EVERY)
+    checkpoints_every(CHECKPOINT_EVERY)
     with warnings_told(lambda text: channel.send(("warned", text))):
         channel.send(("begin", "open"))
         learner = opened(path)

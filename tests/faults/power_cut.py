@@ -32,7 +32,7 @@ from faults.plans import KINDS, draw, history, prepare
 from faults.shim import Shim
 from faults.trials import Trials, checkpoints_every
 
-SNAPSHOT_EVERY = 6
+CHECKPOINT_EVERY = 6
 LENGTH = 12  # operations of a history
 OF_EACH = 60  # disks of a history
 QUICK = 12  # disks
@@ -165,7 +165,7 @@ class Cutting(Trials):
 def main(options: argparse.Namespace) -> dict[str, Any]:
     """As many disks as asked."""
     disks = QUICK if options.quick else options.disks
-    checkpoints_every(SNAPSHOT_EVERY)
+    checkpoints_every(CHECKPOINT_EVERY)
     one_scale()
     warm()
     with folder(options, in_memory=True) as home:

@@ -37,7 +37,7 @@ from faults.zygote import Zygote
 from store import CompactedError, LockedError
 
 KINDS = ("observe", "observe", "observe", "batch", "retract", "forget", "describe", "compact", "fine_tune")
-SNAPSHOT_EVERY = 6
+CHECKPOINT_EVERY = 6
 LOOKS = 16  # of a reader, while a writer compacts
 PACE = 0.1  # seconds, at most, between two operations of the writer
 HELD = re.compile(r"by process (\d+) on (\S+) since (\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\S*)")
@@ -121,7 +121,7 @@ def _taken_over(path: Path, children: list[Any], told: Counter[str], failures: l
 
 def write(channel: Connection, path: Path, seed: int, seconds: float) -> None:
     """The writer: random operations; tells each, the instants of its beginning and its end, and what it returned."""
-    checkpoints_every(SNAPSHOT_EVERY)
+    checkpoints_every(CHECKPOINT_EVERY)
     rng, state = random.Random(seed), State()
     with opened(path) as learner:
         channel.send("ready")

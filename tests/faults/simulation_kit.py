@@ -20,7 +20,7 @@ from scroll_tactile.embeddings.protocol import Capabilities
 from scroll_tactile.errors import RangeWarning
 from scroll_tactile.prediction.features import FeatureExtractor
 
-SNAPSHOT_EVERY = 7
+CHECKPOINT_EVERY = 7
 PAD = Sensor(name="tiny", channels=1, rate=50.0, low=0.0, high=1.0, unit="N", duration=0.16)
 
 
@@ -61,7 +61,7 @@ def prepare() -> None:
     KIT.embeddings = {name: Tiny(name) for name in ("own", "other")}
     KIT.settings = {"sensor": PAD, "exemplars": 1, "kept_touches": 3, "embedding": KIT.embeddings["own"]}
     scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]
-    scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY = SNAPSHOT_EVERY
+    scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY = CHECKPOINT_EVERY
     worked, known = FeatureExtractor.codes, dict[Any, Any]()
 
     def codes(self: FeatureExtractor, image: Any, key: bytes) -> Any:

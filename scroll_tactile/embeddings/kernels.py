@@ -1,7 +1,7 @@
 """The default embedding: random convolution kernels and level features, made from a seed, for any sensor.
 
-Competing kernels (see `counting`) tell at how many steps of time each kernel of a group responds most, and least.
-Beside the proportions they gain 0.84 ± 0.26 points, the mean over fourteen sets.
+Competing kernels (see `convolution.counting`) tell at how many steps of time each kernel of a group responds most, and
+least. Beside the proportions they gain 0.84 ± 0.26 points, the mean over fourteen sets.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.blas import one_thread
-from scroll_tactile.embeddings.banks import (
+from scroll_tactile.embeddings.convolution.banks import (
     LEVELS,
     bank,
     bank_size,
@@ -25,8 +25,8 @@ from scroll_tactile.embeddings.banks import (
     triangle_features,
     window_statistics,
 )
-from scroll_tactile.embeddings.convolution import TAPS, Bank
-from scroll_tactile.embeddings.counting import GROUP, CountRequest, competing_groups, count
+from scroll_tactile.embeddings.convolution.counting import GROUP, CountRequest, competing_groups, count
+from scroll_tactile.embeddings.convolution.responses import TAPS, Bank
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import ENOUGH
@@ -163,7 +163,7 @@ class Kernels:
     def embed_competing(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
     ) -> tuple[dict[int, npt.NDArray[np.float32]], npt.NDArray[np.float32]]:
-        """Embed windows of an image and, by the same responses, all of it by competing kernels; see `competing_counts`.
+        """Embed windows of an image and, by the same responses, all of it by competing kernels; see `Counts`.
 
         image: shape (C, T), T at most 2048. width: that it stands for, at least T. Returns what `embed_windows` does,
         and features of shape (d,): proportions p of the steps of time, as (2/π)·asin √p; zeros behind the last group.

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile import native
 from scroll_tactile.errors import InputError
+from scroll_tactile.matching.comparing import QUARTERS, mean_distances
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 
@@ -23,8 +23,6 @@ FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
-AT_ONCE = 128  # kept touches whose means are multiplied at once: more leave the processor's cache
-QUARTERS = 4  # steps of a guess in one level
 GUESSED = (-256.0, 510.0)  # levels: a guess of what was before noise may lie beyond the range
 COARSER = 8  # blocks in one where touches of another speed are compared: finer ones are not side by side
 
@@ -236,7 +234,7 @@ class KeptArrays:
         level, divided once: the same on every machine. The largest float where both have no block.
         """
         steps = np.rint(np.clip(guesses, *GUESSED) * QUARTERS).astype(np.int16)
-        return _distances(self.wide_blocks if whole else self.blocks, steps, known)
+        return mean_distances(self.wide_blocks if whole else self.blocks, steps, known)
 
     def nearest_alike(self, row: int) -> tuple[LevelArray, LevelArray] | None:
         """The levels of a touch and of the nearest other one of its material; None where there is no other."""
@@ -244,7 +242,7 @@ class KeptArrays:
         if not len(others):
             return None
         blocks = self.blocks[row]
-        far = _distances(self.blocks[others], QUARTERS * blocks[None].astype(np.int16), blocks != MISSING)[:, 0]
+        far = mean_distances(self.blocks[others], QUARTERS * blocks[None].astype(np.int16), blocks != MISSING)[:, 0]
         own, other = self.prefixes([row, int(others[np.argmin(far)])])
         return own, other
 
@@ -253,22 +251,6 @@ def _edges(longest: int, channels: int) -> Rows:
     """The edges of the blocks of touches of so many columns at most."""
     blocks = max(1, min(longest, BLOCK_VALUES // channels))
     return np.linspace(0, longest, blocks + 1).astype(np.intp)
-
-
-def _distances(rows: LevelArray, guesses: npt.NDArray[np.int16], known: npt.NDArray[np.bool_]) -> FloatArray:
-    """Mean squared distances of rows of levels (rows, blocks) from guesses in quarters, (rows, guesses)."""
-    sums, seen = np.empty((len(rows), len(guesses)), np.int64), np.empty(len(rows), np.int64)
-    if native.available and len(rows):
-        native.distances(np.ascontiguousarray(rows), np.ascontiguousarray(guesses), known, sums, seen)
-    else:
-        exact = guesses.astype(np.float64)
-        for first in range(0, len(rows), AT_ONCE):
-            part = slice(first, first + AT_ONCE)
-            both = (rows[part] != MISSING) & known
-            quarters = np.where(both, QUARTERS * rows[part].astype(np.float64), 0.0)
-            square = np.square(quarters).sum(axis=1)[:, None] + both @ np.square(exact).T
-            sums[part], seen[part] = square - 2 * (quarters @ exact.T), both.sum(axis=1)
-    return np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], np.finfo(np.float64).max)
 
 
 def _block_levels(levels: LevelArray, edges: Rows) -> LevelArray:

@@ -22,8 +22,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile import native
 from scroll_tactile.errors import InputError
+from scroll_tactile.matching.comparing import compiled, log_sums_by_c, log_sums_by_numpy
 from scroll_tactile.matching.kept_arrays import KeptArrays, blends, block_means, unchanging, weighted_means
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT, LevelArray, Likelihood, Noise, Table
 from scroll_tactile.matching.match import (
@@ -114,11 +114,10 @@ class _Pairs:
 
     def logs(self, table: Table) -> FloatArray:
         """Log-likelihood of the touch by each of the others, (others,)."""
-        if native.available:
-            sums = np.empty(len(self.others), np.int64)
-            native.sum_logs(self.own, self.others, table.logs, sums)
+        if compiled():
+            sums = log_sums_by_c(self.own, self.others, table.logs)
         else:
-            sums = table.logs.take(self.places).sum(axis=1, dtype=np.int64)
+            sums = log_sums_by_numpy(self.places, table.logs)
         return np.asarray(sums / UNIT * self.weights)
 
     def logs_by(self, likelihood: Likelihood, noise: Noise) -> FloatArray:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from images import image
 
 from scroll_tactile import Kernels
-from scroll_tactile.embeddings import banks, kernels
+from scroll_tactile.embeddings import kernels
+from scroll_tactile.embeddings.convolution import banks
 from scroll_tactile.embeddings.protocol import embed_windows
 
 SMALL = Kernels(dimension=64)

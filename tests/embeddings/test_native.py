@@ -14,11 +14,17 @@ from hypothesis import strategies as st
 from images import image
 
 from scroll_tactile import Kernels, native
-from scroll_tactile.embeddings import counting
-from scroll_tactile.embeddings.banks import LEVELS, MOST_CHANNELS, bank
-from scroll_tactile.embeddings.convolution import ROUND, Bank
-from scroll_tactile.embeddings.counting import GROUP, CountRequest, competing_groups, count_by_c, count_by_numpy
-from scroll_tactile.matching.kept_arrays import _distances
+from scroll_tactile.embeddings.convolution import counting
+from scroll_tactile.embeddings.convolution.banks import LEVELS, MOST_CHANNELS, bank
+from scroll_tactile.embeddings.convolution.counting import (
+    GROUP,
+    CountRequest,
+    competing_groups,
+    count_by_c,
+    count_by_numpy,
+)
+from scroll_tactile.embeddings.convolution.responses import ROUND, Bank
+from scroll_tactile.matching import comparing
 from scroll_tactile.matching.likelihood import MISSING, Table
 from scroll_tactile.matching.matcher import _Pairs
 from scroll_tactile.signals.image import stretched
@@ -109,6 +115,26 @@ def test_a_module_that_counts_wrong_is_not_used(monkeypatch):
         counting._agrees.cache_clear()
 
 
+@compiled
+@pytest.mark.parametrize("name", ["sum_logs", "distances"])
+def test_a_module_that_compares_wrong_is_not_used(name, monkeypatch):
+    right = getattr(native, name)
+
+    def wrong(*arguments):
+        right(*arguments)
+        arguments[-1].reshape(-1)[-1] += 1
+
+    rows, guesses, known = np.arange(12, dtype=np.uint8).reshape(3, 4), np.int16([[4, 8, 12, 16]]), np.ones(4, bool)
+    expected = comparing.mean_distances(rows, guesses, known)
+    monkeypatch.setattr(native, name, wrong)
+    comparing._agrees.cache_clear()
+    try:
+        assert comparing.mean_distances(rows, guesses, known).tobytes() == expected.tobytes()
+        assert not comparing.compiled()
+    finally:
+        comparing._agrees.cache_clear()
+
+
 def arguments():
     """Those of a sound call, by name, for an image of 3 channels and 40 readings."""
     own = bank(1, 3, 2)
@@ -182,7 +208,7 @@ def test_touches_are_compared_as_by_numpy(data):
     with pytest.MonkeyPatch.context() as monkeypatch:
         by_c, by_numpy = both(
             monkeypatch,
-            lambda: (_distances(rows, guesses, known), _Pairs(own, rows, np.ones(others)).logs(table)),
+            lambda: (comparing.mean_distances(rows, guesses, known), _Pairs(own, rows, np.ones(others)).logs(table)),
         )
     assert [array.tobytes() for array in by_c] == [array.tobytes() for array in by_numpy]
 
@@ -221,7 +247,7 @@ import importlib.util, sys, numpy as np
 spec = importlib.util.spec_from_file_location("scroll_tactile.native._kernels", sys.argv[1])
 module = importlib.util.module_from_spec(spec); spec.loader.exec_module(module)
 from scroll_tactile import Kernels, native
-from scroll_tactile.embeddings import counting
+from scroll_tactile.embeddings.convolution import counting
 native._module, native.available = module, True
 rows, known = np.full((3, 300), 254, np.uint8), np.ones(300, np.bool_)
 sums, seen = np.empty((3, 2), np.int64), np.empty(3, np.int64)

@@ -20,7 +20,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.convolution import HEAVY, ROUND, TAPS, Bank, Floats, workspace
+from scroll_tactile.embeddings.convolution.responses import HEAVY, ROUND, TAPS, Bank, Floats, workspace
 
 __all__ = [
     "LEVELS",

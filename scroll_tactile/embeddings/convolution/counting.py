@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from scroll_tactile import native
 from scroll_tactile.blas import one_thread
-from scroll_tactile.embeddings.banks import LEVELS, MOST_CHANNELS
-from scroll_tactile.embeddings.convolution import HEAVY, ROUND, Bank, Floats, workspace
+from scroll_tactile.embeddings.convolution.banks import LEVELS, MOST_CHANNELS
+from scroll_tactile.embeddings.convolution.responses import HEAVY, ROUND, Bank, Floats, workspace
 
 __all__ = [
     "GROUP",

@@ -30,8 +30,8 @@ WIDE static void convolve(const int32_t *restrict sums, int32_t readings, int32_
                           int32_t *restrict twos, int32_t *restrict fours, int32_t *restrict responses)
 {
     const int32_t *first = sums + heavy[0] * dilation, *second = sums + heavy[1] * dilation;
-    const int32_t *third = sums + heavy[2] * dilation, *last = sums + 8 * dilation;
-    const int32_t places = readings - 8 * dilation;
+    const int32_t *third = sums + heavy[2] * dilation, *last = sums + TACTILE_SPAN * dilation;
+    const int32_t places = readings - TACTILE_SPAN * dilation;
     for (int32_t t = 0; t < readings - dilation; t++)
         twos[t] = sums[t] + sums[t + dilation];
     for (int32_t t = 0; t < readings - 3 * dilation; t++)
@@ -119,7 +119,7 @@ static void count_features(const tactile_bank *bank, const tactile_request *requ
 
 static void compete(state *at, const tactile_request *request, int32_t group, int32_t *contests)
 {
-    const int32_t places = at->readings - 8 * at->bank->dilation;
+    const int32_t places = at->readings - TACTILE_SPAN * at->bank->dilation;
     const uint16_t *members = request->members + TACTILE_GROUP * group;
     const uint8_t *weights = request->weights + TACTILE_GROUP * group;
     int32_t *most = at->twos, *least = at->fours; /* free between two convolutions */

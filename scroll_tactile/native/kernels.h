@@ -1,7 +1,8 @@
 /* Counts of the default embedding's convolution kernels, in whole numbers, without an allocation: for a PC and a chip.
  *
  * A kernel sums some channels; its response at a place is 2 at three of nine taps and −1 at the six others, times these
- * sums. A feature is the number of places of a window at which a response exceeds a threshold. See embeddings/banks.py.
+ * sums. A feature is the number of places of a window at which a response exceeds a threshold. See
+ * embeddings/convolution/banks.py.
  */
 #ifndef SCROLL_TACTILE_KERNELS_H
 #define SCROLL_TACTILE_KERNELS_H
@@ -10,6 +11,7 @@
 
 enum {
     TACTILE_TAPS = 9,
+    TACTILE_SPAN = TACTILE_TAPS - 1, /* dilations from the first tap to the last */
     TACTILE_GROUP = 8,          /* kernels that compete */
     TACTILE_MOST_CHANNELS = 64, /* to a kernel */
     TACTILE_LEVELS = 2048,      /* levels lie in ± so many: with 64 channels a response stays below 2^21 */
@@ -28,7 +30,7 @@ typedef struct {
 
 /* What is counted of one dilation.
  *
- * Places 0 … readings − 8 · dilation − 1 are cut into segments by ascending edges; a window is some segments in a row.
+ * Places 0 … readings − TACTILE_SPAN · dilation − 1 are cut into segments by ascending edges; a window is some segments in a row.
  */
 typedef struct {
     int32_t features;        /* F: of threshold 0 of each kernel, then of threshold 1 …; at most rounds · K */
@@ -48,7 +50,7 @@ typedef struct {
  *
  * levels: (C, readings). counted: (W, F). contests: (2, G, 8): at how many places each member of a group has the greatest
  * response above 0, and the least below 0; members that share a place both have it. work: see TACTILE_WORK.
- * readings must exceed 8 · dilation. All arrays must be as described: nothing is checked here.
+ * readings must exceed TACTILE_SPAN · dilation. All arrays must be as described: nothing is checked here.
  */
 void tactile_count(const tactile_bank *bank, const int16_t *levels, int32_t readings, const tactile_request *request,
                    int32_t *counted, int32_t *contests, int32_t *work);

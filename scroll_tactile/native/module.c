@@ -96,15 +96,15 @@ static int count_into(Py_buffer *with, int readings, int dilation, int features)
                                with[BEGINS].buf,      with[CHANNELS].buf, with[THRESHOLDS].buf};
     const tactile_request request = {features,           (int32_t)n[EDGES] - 1, with[EDGES].buf,   (int32_t)n[SPANS],
                                      with[SPANS].buf, (int32_t)n[MEMBERS],   with[MEMBERS].buf, with[WEIGHTS].buf};
-    if (!require(dilation >= 1 && dilation <= INT32_MAX / 8 && readings > 8 * dilation, "readings for a dilation") ||
+    if (!require(dilation >= 1 && dilation <= INT32_MAX / TACTILE_SPAN && readings > TACTILE_SPAN * dilation, "readings for a dilation") ||
         !require(n[LEVELS] > 0 && n[LEVELS] % readings == 0 && n[LEVELS] / readings <= 65536, "levels (C, readings)") ||
         !require(n[HEAVY] > 0 && n[HEAVY] <= 65535 && n[BEGINS] == n[HEAVY] + 1, "a bank of kernels") ||
         !require(features >= 0 && features <= n[THRESHOLDS], "a threshold to each feature") ||
         !require(n[EDGES] >= 1 && n[EDGES] <= readings && n[WEIGHTS] == n[MEMBERS], "edges, and a weight to each member") ||
-        !require(n[COUNTED] == n[SPANS] * features && n[CONTESTS] == 16 * n[MEMBERS], "room for the counts") ||
+        !require(n[COUNTED] == n[SPANS] * features && n[CONTESTS] == 2 * TACTILE_GROUP * n[MEMBERS], "room for the counts") ||
         !sound_levels(with[LEVELS].buf, n[LEVELS]) ||
         !sound_bank(&bank, n[CHANNELS], (int32_t)(n[LEVELS] / readings)) ||
-        !sound_request(&request, &bank, readings - 8 * dilation))
+        !sound_request(&request, &bank, readings - TACTILE_SPAN * dilation))
         return -1;
     int32_t *work = PyMem_RawMalloc(TACTILE_WORK((size_t)readings, (size_t)request.segments) * sizeof *work);
     if (work == NULL) {
@@ -196,7 +196,7 @@ static PyMethodDef methods[] = {
      "counted, contests): see kernels.h. The last two are written. Raises ValueError for what does not fit together."},
     {NULL, NULL, 0, NULL}};
 
-static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_kernels", "The kernels' counts in C.", 0, methods,
+static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_kernels", "What is counted and compared in C.", 0, methods,
                                         NULL, NULL, NULL, NULL};
 
 PyMODINIT_FUNC PyInit__kernels(void) { return PyModule_Create(&definition); }

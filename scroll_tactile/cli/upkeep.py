@@ -235,8 +235,11 @@ def merge(
     shared: Annotated[Shared, typer.Option(help="How a stream that both observed is counted.", show_default=False)],
 ) -> None:
     """Make a memory the one that observed all that both did, exactly."""
+    from scroll_tactile.pipelines.learning import store_model
+
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         done = learner.merge(other, shared=shared.value, progress=progress)
+        store_model(learner, progress)
         digest, count = learner.digest(), sum(learner.materials.values())
     say(f"{done.observations} observations came in; {done.shared} streams were observed by both; {count} are there now")
     say(f"[bold]digest:[/] {digest}")

@@ -114,7 +114,7 @@ def learn(
         stack.callback(steps.leave)
         report.refused += steps.begin(found)
         _work(_Run(steps, report, into, progress, found), workers, client, patience)
-        into.close()
+        into.close(progress)
         report.range_problem = steps.range_problem
         steps.end()
     report.seconds = time.perf_counter() - begun

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import capabilities_of
-from scroll_tactile.errors import EmbeddingMismatchError, InputError
+from scroll_tactile.errors import EmbeddingMismatchError, InputError, ScrollTactileError
 from scroll_tactile.memory.descriptions import require_constituents
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.state import Memory
@@ -37,6 +38,8 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
 
 __all__ = ["LogitsReader", "Predictor", "nothing_known"]
+
+logger = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer")
 
@@ -222,6 +225,17 @@ class Predictor:
         """As `TactileLearner.settle`."""
         with self.ledger.lock, enough_memory():
             self.current.settle(self.ledger)
+
+    def prepare_to_store(self) -> None:
+        """Make a model for `close` to store, unless there is one: each process that opens the memory reads it then.
+
+        For a writer that learned many touches and predicted none. Where the fit fails, as without memory for it, the
+        touches are learned all the same, and a warning is logged.
+        """
+        try:
+            self.frozen()
+        except ScrollTactileError as error:
+            logger.warning("the touches are learned, but no model is stored beside them: %s", error)
 
     def close(self) -> None:
         """As `TactileLearner.close`."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.persistence.merge import Choice, MergeRules
-from scroll_tactile.pipelines.learning import learn_sources
+from scroll_tactile.pipelines.learning import learn_sources, store_model
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches
 from scroll_tactile.pipelines.workers.jobs import Made, Making, hush
 from scroll_tactile.pipelines.workers.steps import Step
@@ -121,8 +121,11 @@ class Destination:
         if ledger is not None:
             ledger.checkpoint_in_background(SAVED_EVERY)
 
-    def close(self) -> None:
-        """Write a checkpoint, and close it. Raises InputError where nothing was learned; it is not there then."""
+    def close(self, progress: Progress) -> None:
+        """Write a checkpoint and a fitted model, and close it.
+
+        Raises InputError where nothing was learned; it is not there then.
+        """
         if self.learner is None or (self._made and not self.learner.memory.sequence):
             if self.learner is not None:
                 self.learner.close()
@@ -132,4 +135,5 @@ class Destination:
             raise InputError(f"nothing was learned, and no memory made: {len(refused)} sources were refused{first}")
         self._report.held, self._report.digest = sum(self.learner.materials.values()), self.learner.digest()
         self.learner._ledger.saves = True
+        store_model(self.learner, progress)
         self.learner.close()

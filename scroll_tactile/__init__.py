@@ -16,6 +16,8 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.embeddings.modules import ModuleEmbedding
     from scroll_tactile.embeddings.protocol import Capabilities, Embedding
     from scroll_tactile.embeddings.vision import Vision
+    from scroll_tactile.firmware.c_files import write_firmware
+    from scroll_tactile.firmware.exported_judge import ExportedAnswer, ExportedJudge
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
@@ -47,6 +49,8 @@ __all__ = [
     "Composition",
     "Constituent",
     "Embedding",
+    "ExportedAnswer",
+    "ExportedJudge",
     "FleetReport",
     "Frames",
     "Joined",
@@ -74,9 +78,10 @@ __all__ = [
     "learn",
     "recordings",
     "sensors",
+    "write_firmware",
 ]
 
-__version__ = "0.13.0"
+__version__ = "0.14.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
@@ -87,6 +92,8 @@ _MODULES = {
     "Composition": "results",
     "Constituent": "results",
     "Embedding": "embeddings.protocol",
+    "ExportedAnswer": "firmware.exported_judge",
+    "ExportedJudge": "firmware.exported_judge",
     "FleetReport": "pipelines.fleet",
     "Frames": "embeddings.frames",
     "Joined": "embeddings.joined",
@@ -110,6 +117,7 @@ _MODULES = {
     "check_embedding": "testing.embedding_checks",
     "check_learner": "testing.learner_checks",
     "learn": "pipelines.fleet",
+    "write_firmware": "firmware.c_files",
 }
 
 

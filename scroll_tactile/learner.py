@@ -31,6 +31,7 @@ from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import WindowPlan
 
 if TYPE_CHECKING:
+    from scroll_tactile.firmware.exported_judge import ExportedJudge
     from scroll_tactile.live.session import LiveSession
 
 __all__ = ["TactileLearner"]
@@ -295,6 +296,20 @@ class TactileLearner(MemoryKeeper):
         require_arguments({"unfamiliar": unfamiliar})
         named = names_of("constituents", constituents, DescriptionError)
         return self._predictor.compose(stream, named, unfamiliar)
+
+    def exported(self, scene: Sequence[str] | None = None) -> ExportedJudge:
+        """The reduced judge of a scene, in whole numbers: what a microcontroller answers, to the bit.
+
+        scene: as for `predict`, at most 64 materials. Write it as C by `firmware.write_firmware`. It rests on windows
+        alone: no kept touches, no views of a whole touch, no f*; it is of the memory as it is now.
+
+        Raises UnknownMaterialError, InputError for an empty scene, a greater one, a camera, or an embedding that is not
+        `Kernels`.
+        """
+        from scroll_tactile.firmware.quantising import exported_judge
+
+        names = names_of("scene", scene)
+        return self._ledger.read(lambda memory, _: exported_judge(self._recipe, memory, names))
 
     def settle(self) -> None:
         """Fit all that answers rest on to the memory as it is now: they are then a function of what was observed.

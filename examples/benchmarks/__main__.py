@@ -9,6 +9,7 @@ import typer
 
 from examples.benchmarks.appending import log
 from examples.benchmarks.buffers import buffers
+from examples.benchmarks.chips.comparison import chips
 from examples.benchmarks.fleet import fleet
 from examples.benchmarks.interleaved import interleaved
 from examples.benchmarks.live_decision import decisions
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 BENCHMARKS: tuple[Callable[..., None], ...] = (
     *(speed, live, decisions, ros2, vision),
-    *(buffers, interleaved, log, fleet),
+    *(buffers, interleaved, log, fleet, chips),
 )
 for benchmark in BENCHMARKS:
     app.command()(benchmark)

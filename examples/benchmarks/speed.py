@@ -347,11 +347,12 @@ def _many(bench: _Bench, sides: Sides, materials: int) -> None:
 
 
 def _filled(checkout: Path, touches: Path, path: Path, total: int) -> None:
-    """A memory of the first touches, made in batches and closed."""
+    """A memory of the first touches, made in batches, fitted and closed."""
     with Worker(checkout, touches) as worker:
         worker.call("open", path=str(path))
         for first in range(0, total, TOGETHER):
             worker.call("fill", first=first, last=min(first + TOGETHER, total))
+        worker.call("settle")  # as `scroll_tactile.learn` does, so that whoever opens the memory reads the fitted model
         worker.call("close")
 
 

@@ -66,7 +66,7 @@ class _Calls:
                 return lambda: learner.predict(readings, scene=take.get("scene")).material
             case "fill":
                 return lambda: self._fill(take["first"], take["last"])
-            case "refresh" | "close":
+            case "refresh" | "settle" | "close":
                 plain: Callable[[], Any] = getattr(learner, name)
                 return plain
             case _:

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from scroll_tactile.cli.options import MemoryFolder
-from scroll_tactile.cli.terminal import Commands, opened_for_upkeep, progress_bar, say, say_json, shown
-from scroll_tactile.errors import ScrollTactileError
+from scroll_tactile.cli.terminal import Commands, opened, opened_for_upkeep, progress_bar, say, say_json, shown
+from scroll_tactile.errors import InputError, ScrollTactileError
 from store import Store, StoreError, repair_store
 
 __all__ = ["memory"]
@@ -24,6 +24,13 @@ class Shared(StrEnum):
 
     ONCE = "once"
     TWICE = "twice"
+
+
+class ExportForm(StrEnum):
+    """As what a memory is written."""
+
+    PLAIN = "plain"
+    C = "c"
 
 
 @memory.command()
@@ -131,13 +138,43 @@ def backup(
 def export(
     folder: MemoryFolder,
     target: Annotated[Path, typer.Argument(help="A new or empty folder.", show_default=False)],
+    form: Annotated[
+        ExportForm,
+        typer.Option(
+            "--format",
+            help="plain: all it holds, as CSV, JSON and NumPy files. c: a judge for a microcontroller.",
+        ),
+    ] = ExportForm.PLAIN,
+    scene: Annotated[
+        str | None, typer.Option(help="Of c: the materials that can be there, with commas between; all unless given.")
+    ] = None,
 ) -> None:
-    """Write all that a memory holds as CSV, JSON and NumPy files, which need no scroll-tactile to be read."""
+    """Write a memory so that it is read without scroll-tactile: all that it holds, or its judge as C for a chip."""
+    if form is ExportForm.C:
+        say(f"written: {shown(target)}, {_export_c(folder, target, scene)}")
+        return
+    if scene is not None:
+        raise InputError("--scene is for --format c; all that a memory holds is of all materials")
     from scroll_tactile.pipelines.plain_export import export_plain
 
     with opened_for_upkeep(folder, mode="read") as learner, progress_bar() as progress:
         export_plain(learner, target, progress)
     say(f"written: {shown(target)}")
+
+
+def _export_c(folder: Path, target: Path, scene: str | None) -> str:
+    """Write the exported judge of a scene; what it takes, in words."""
+    from scroll_tactile.firmware.c_files import flash_bytes, kept_levels, write_firmware
+
+    with opened(folder, mode="read") as learner:
+        judge = learner.exported(None if scene is None else [name.strip() for name in scene.split(",") if name.strip()])
+        touches = kept_levels(judge, learner.memory)
+    write_firmware(judge, target, touches)
+    return (
+        f"{len(judge.materials)} materials, {flash_bytes(judge) / 1024:.0f} kB of tables in flash, "
+        f"{judge.ram_bytes / 1024:.0f} kB of RAM; `make` there checks {len(touches)} touches. Left out of it: kept "
+        "touches, views of a whole touch, fine-tuning"
+    )
 
 
 @memory.command()

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scroll_tactile.blas import one_thread
 from scroll_tactile.embeddings.convolution.banks import (
     LEVELS,
+    TriangleFeatures,
     bank,
     bank_size,
     to_levels,
@@ -104,7 +105,7 @@ class Kernels:
 
     def banks(self) -> dict[tuple[int, int], Bank]:
         """The banks that were used or given, by channels and dilation."""
-        return {key: self._bank(*key) for key in sorted({*self._used.copy(), *(self._given or ())})}
+        return {key: self.bank_of(*key) for key in sorted({*self._used.copy(), *(self._given or ())})}
 
     def with_banks(self, banks: Mapping[tuple[int, int], Bank]) -> Kernels:
         """The same embedding with some banks that need not be made: a fifth of a second before the first touch."""
@@ -113,7 +114,8 @@ class Kernels:
         other.__dict__.pop("fingerprint", None)  # it shows what these banks give
         return other
 
-    def _bank(self, channels: int, dilation: int) -> Bank:
+    def bank_of(self, channels: int, dilation: int) -> Bank:
+        """The kernels of a dilation, for images of so many channels."""
         self._used.add((channels, dilation))
         given = None if self._given is None else self._given.get((channels, dilation))
         return bank(self.seed, channels, dilation) if given is None else given
@@ -176,6 +178,34 @@ class Kernels:
             features, (_, parts) = self.embed_windows(image, windows), self._read(_mirrored(levels, wide), {}, wide)
         return features, np.concatenate([*parts, np.zeros(self.dimension % (2 * GROUP), np.float32)])
 
+    def window_counts(
+        self, levels: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
+    ) -> dict[int, list[tuple[npt.NDArray[np.integer], int]]]:
+        """What the proportions of windows are made of, for each width dilation by dilation: (counts, places).
+
+        levels: whole numbers in ±LEVELS, float32 of shape (C, T). windows: width → first columns; T is at least 12 and
+        0.65 of every width. counts: at how many of the places each threshold is exceeded, shape (windows, features).
+        """
+        channels, readings = levels.shape
+        parts = _parts(
+            self.dimension, channels, readings, tuple((w, tuple(starts)) for w, starts in windows.items()), None
+        )
+        requests = [part.request(self.bank_of(channels, part.dilation)) for part in parts]
+        found: dict[int, list[tuple[npt.NDArray[np.integer], int]]] = {width: [] for width in windows}
+        for part, counts in zip(parts, count(levels, requests), strict=True):
+            for width, rows, features, places in part.pools:
+                found[width].append((counts.features[rows, :features], places))
+        return found
+
+    def triangles(self, channels: int, width: int) -> TriangleFeatures | None:
+        """The features of levels of windows of a width; None where it has none."""
+        count = self.dimension - _thresholded(self.dimension, width)
+        return triangle_features(self.seed, channels, count) if count else None
+
+    def dilations(self, channels: int, width: int) -> dict[int, int]:
+        """Dilation → how many of the proportions of windows of a width it gives."""
+        return _shares(channels, _thresholded(self.dimension, width), width)
+
     def _embedded(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], competing: int | None = None
     ) -> tuple[dict[int, npt.NDArray[np.float32]], list[npt.NDArray[np.float32]]]:
@@ -201,7 +231,7 @@ class Kernels:
         channels, readings = levels.shape
         widths = tuple(windows.items())
         parts = _parts(self.dimension, channels, readings, widths, competing)
-        requests = [part.request(self._bank(channels, part.dilation)) for part in parts]
+        requests = [part.request(self.bank_of(channels, part.dilation)) for part in parts]
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
         proportions: list[npt.NDArray[np.float32]] = []
         for part, found in zip(parts, count(levels, requests), strict=True):
@@ -209,10 +239,10 @@ class Kernels:
             for width, rows, features, places in part.pools:
                 pooled[width].append(angles(places)[found.features[rows, :features]])
         for width, starts in widths:
-            if more := self.dimension - _thresholded(self.dimension, width):
+            if (triangles := self.triangles(channels, width)) is not None:
                 cut = np.stack([levels[:, start : start + width] for start in starts])
                 with one_thread():
-                    pooled[width].append(triangle_features(self.seed, channels, more)(window_statistics(cut)))
+                    pooled[width].append(triangles(window_statistics(cut)))
         return {width: np.concatenate(arrays, axis=1) for width, arrays in pooled.items()}, proportions
 
 

@@ -5,21 +5,21 @@
 #include "wide.h"
 
 /* Sum a kernel's channels at each reading. */
-WIDE static void sum_channels(const int16_t *restrict levels, int32_t readings, const uint16_t *restrict channels,
-                              int32_t count, int32_t *restrict sums)
+WIDE static void sum_channels(const int16_t *restrict levels, int32_t stride, int32_t readings,
+                              const uint16_t *restrict channels, int32_t count, int32_t *restrict sums)
 {
-    const int16_t *one = levels + (size_t)channels[0] * readings;
+    const int16_t *one = levels + (size_t)channels[0] * stride;
     int32_t i = 1;
     for (int32_t t = 0; t < readings; t++)
         sums[t] = one[t];
     for (; i + 3 < count; i += 4) {
-        const int16_t *a = levels + (size_t)channels[i] * readings, *b = levels + (size_t)channels[i + 1] * readings;
-        const int16_t *c = levels + (size_t)channels[i + 2] * readings, *d = levels + (size_t)channels[i + 3] * readings;
+        const int16_t *a = levels + (size_t)channels[i] * stride, *b = levels + (size_t)channels[i + 1] * stride;
+        const int16_t *c = levels + (size_t)channels[i + 2] * stride, *d = levels + (size_t)channels[i + 3] * stride;
         for (int32_t t = 0; t < readings; t++)
             sums[t] += (int32_t)a[t] + b[t] + c[t] + d[t];
     }
     for (; i < count; i++) {
-        one = levels + (size_t)channels[i] * readings;
+        one = levels + (size_t)channels[i] * stride;
         for (int32_t t = 0; t < readings; t++)
             sums[t] += one[t];
     }
@@ -40,9 +40,8 @@ WIDE static void convolve(const int32_t *restrict sums, int32_t readings, int32_
         responses[t] = 3 * (first[t] + second[t] + third[t]) - fours[t] - fours[t + 4 * dilation] - last[t];
 }
 
-/* before[s]: how many values of the segments before s exceed a threshold; `segments` + 1 of them. */
-WIDE static void count_segments(const int32_t *restrict values, int32_t threshold, const int32_t *restrict edges,
-                                int32_t segments, int32_t *restrict before)
+WIDE void tactile_exceeding(const int32_t *restrict values, int32_t threshold, const int32_t *restrict edges,
+                            int32_t segments, int32_t *restrict before)
 {
     int32_t found = 0;
     before[0] = 0;
@@ -84,23 +83,28 @@ WIDE static int32_t winning(const int32_t *restrict responses, int32_t weight, c
     return found;
 }
 
+void tactile_respond(const tactile_bank *bank, int32_t kernel, const int16_t *levels, int32_t stride, int32_t readings,
+                     int32_t *work, int32_t *responses)
+{
+    const int32_t begin = bank->begins[kernel], count = bank->begins[kernel + 1] - begin;
+    sum_channels(levels, stride, readings, bank->channels + begin, count, work);
+    convolve(work, readings, bank->dilation, bank->heavy + 3 * kernel, work + readings, work + 2 * readings, responses);
+}
+
 typedef struct {
     const tactile_bank *bank;
     const int16_t *levels;
     int32_t readings;
     int32_t held[TACTILE_GROUP]; /* the kernel whose responses lie in each of `responses`, or −1 */
-    int32_t *sums, *twos, *fours, *responses;
+    int32_t *work, *responses;
 } state;
 
 /* The responses of a kernel, in one of the places that a group's have; made unless they are there. */
-static const int32_t *respond(state *at, int32_t kernel, int32_t slot)
+static const int32_t *responses_of(state *at, int32_t kernel, int32_t slot)
 {
-    const tactile_bank *bank = at->bank;
     int32_t *responses = at->responses + (size_t)slot * at->readings;
     if (at->held[slot] != kernel) {
-        const int32_t begin = bank->begins[kernel];
-        sum_channels(at->levels, at->readings, bank->channels + begin, bank->begins[kernel + 1] - begin, at->sums);
-        convolve(at->sums, at->readings, bank->dilation, bank->heavy + 3 * kernel, at->twos, at->fours, responses);
+        tactile_respond(at->bank, kernel, at->levels, at->readings, at->readings, at->work, responses);
         at->held[slot] = kernel;
     }
     return responses;
@@ -110,7 +114,7 @@ static void count_features(const tactile_bank *bank, const tactile_request *requ
                            const int32_t *responses, int32_t *counted, int32_t *before)
 {
     for (int32_t feature = kernel; feature < request->features; feature += bank->kernels) {
-        count_segments(responses, bank->thresholds[feature], request->edges, request->segments, before);
+        tactile_exceeding(responses, bank->thresholds[feature], request->edges, request->segments, before);
         for (int32_t w = 0; w < request->windows; w++)
             counted[(size_t)w * request->features + feature] =
                 before[request->spans[2 * w + 1]] - before[request->spans[2 * w]];
@@ -122,9 +126,9 @@ static void compete(state *at, const tactile_request *request, int32_t group, in
     const int32_t places = at->readings - TACTILE_SPAN * at->bank->dilation;
     const uint16_t *members = request->members + TACTILE_GROUP * group;
     const uint8_t *weights = request->weights + TACTILE_GROUP * group;
-    int32_t *most = at->twos, *least = at->fours; /* free between two convolutions */
+    int32_t *most = at->work, *least = at->work + at->readings; /* free between two convolutions */
     for (int32_t i = 0; i < TACTILE_GROUP; i++)
-        respond(at, members[i], i);
+        responses_of(at, members[i], i);
     extremes(at->responses, at->readings, places, weights, most, least);
     for (int32_t i = 0; i < TACTILE_GROUP; i++) {
         const int32_t *own = at->responses + (size_t)i * at->readings, place = TACTILE_GROUP * group + i;
@@ -136,11 +140,10 @@ static void compete(state *at, const tactile_request *request, int32_t group, in
 void tactile_count(const tactile_bank *bank, const int16_t *levels, int32_t readings, const tactile_request *request,
                    int32_t *counted, int32_t *contests, int32_t *work)
 {
-    state at = {bank, levels, readings, {-1, -1, -1, -1, -1, -1, -1, -1}, work, work + readings, work + 2 * readings,
-                work + 3 * readings};
+    state at = {bank, levels, readings, {-1, -1, -1, -1, -1, -1, -1, -1}, work, work + 3 * readings};
     int32_t *before = work + (TACTILE_GROUP + 3) * readings, group = 0;
     for (int32_t kernel = 0; kernel < bank->kernels && kernel < request->features; kernel++) {
-        count_features(bank, request, kernel, respond(&at, kernel, kernel % TACTILE_GROUP), counted, before);
+        count_features(bank, request, kernel, responses_of(&at, kernel, kernel % TACTILE_GROUP), counted, before);
         /* The first groups are kernels in a row: their responses are here now. */
         if (kernel % TACTILE_GROUP == TACTILE_GROUP - 1 && group < request->groups)
             compete(&at, request, group++, contests);

@@ -46,6 +46,16 @@ typedef struct {
 /* How many int32_t `tactile_count` needs to work in. */
 #define TACTILE_WORK(readings, segments) ((TACTILE_GROUP + 3) * (readings) + (segments) + 1)
 
+/* A kernel's responses: `readings` − TACTILE_SPAN · dilation of them, in as many places as there are readings.
+ *
+ * levels: of each channel `stride` readings, of which the first `readings` count. work: (3, readings).
+ */
+void tactile_respond(const tactile_bank *bank, int32_t kernel, const int16_t *levels, int32_t stride, int32_t readings,
+                     int32_t *work, int32_t *responses);
+
+/* before[s]: how many values of the segments before s exceed a threshold; `segments` + 1 of them. */
+void tactile_exceeding(const int32_t *values, int32_t threshold, const int32_t *edges, int32_t segments, int32_t *before);
+
 /* Count.
  *
  * levels: (C, readings). counted: (W, F). contests: (2, G, 8): at how many places each member of a group has the greatest

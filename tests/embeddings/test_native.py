@@ -139,7 +139,7 @@ def arguments():
     """Those of a sound call, by name, for an image of 3 channels and 40 readings."""
     own = bank(1, 3, 2)
     groups = competing_groups(own, 2)
-    heavy, begins, channels, thresholds = counting._compiled(own)
+    heavy, begins, channels, thresholds = counting.compiled_bank(own)
     return {
         "readings": 40, "dilation": 2, "features": 20,
         "levels": np.zeros((3, 40), np.int16), "heavy": heavy, "begins": begins, "channels": channels,

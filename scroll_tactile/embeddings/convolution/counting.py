@@ -26,6 +26,7 @@ __all__ = [
     "Groups",
     "competing_counts",
     "competing_groups",
+    "compiled_bank",
     "count",
     "count_by_c",
     "count_by_numpy",
@@ -97,7 +98,7 @@ def count_by_c(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]
 
 
 def _counted(levels: npt.NDArray[np.int16], request: CountRequest) -> Counts:
-    bank, (edges, spans), groups = _compiled(request.bank), _segments(request.windows), request.groups
+    bank, (edges, spans), groups = compiled_bank(request.bank), _segments(request.windows), request.groups
     competing = 0 if groups is None else len(groups.members)
     counted = np.empty((len(spans), request.features), np.int32)
     contests = np.empty((2, competing, GROUP), np.int32)
@@ -110,7 +111,7 @@ def _counted(levels: npt.NDArray[np.int16], request: CountRequest) -> Counts:
 
 
 @lru_cache(maxsize=64)
-def _compiled(bank: Bank) -> tuple[Integers, ...]:
+def compiled_bank(bank: Bank) -> tuple[Integers, ...]:
     """A bank as C reads it: see `tactile_bank` in kernels.h."""
     summed = bank.channels[bank.rows] != 0
     begins = np.concatenate([[0], np.cumsum(summed.sum(axis=1))])

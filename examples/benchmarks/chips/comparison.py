@@ -25,7 +25,7 @@ from scroll_tactile import Stream, TactileLearner
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.firmware.c_files import flash_bytes, touches_to_check, write_firmware
 from scroll_tactile.firmware.exported_judge import ExportedJudge, LevelRows
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error
+from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
 
 __all__ = ["chips", "run_chips"]
 
@@ -48,7 +48,21 @@ def run_chips(data: Path, *, folds: str = "all", seed: int = 0, note: Note = lam
             records.append({"set": name, "fold": fold, **_accuracies(learner, tested)})
             if fold == 0:
                 boards += [record | {"set": name} for record in _on_boards(learner, recordings, seed, note)]
-    return {"bench": "chips", "records": records, "boards": boards}
+    return {"bench": "chips", "judges": judges(records), "boards": boards, "records": records}
+
+
+def judges(records: Sequence[Record]) -> list[Record]:
+    """Means over the folds of a set of the exported judge and of the learner, of all materials and of a scene."""
+    found = []
+    for name in dict.fromkeys(record["set"] for record in records):
+        own = [record for record in records if record["set"] == name]
+        for judge in [key for key in own[0] if "/" in key]:
+            row: Record = {"set": name, "scene": judge.partition("/")[0], "judge": judge.partition("/")[2]}
+            for figure in own[0][judge]:
+                mean, spread = mean_and_spread([record[judge][figure] for record in own])
+                row[figure] = {"mean": mean, "sd": spread, "folds": len(own)}
+            found.append(row)
+    return found
 
 
 def _learned(recordings: Recordings, fold: int) -> tuple[TactileLearner, list[tuple[str, Stream]]]:

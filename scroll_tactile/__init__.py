@@ -23,6 +23,7 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.live.session import LiveSession
     from scroll_tactile.pipelines.fleet import FleetReport, learn
     from scroll_tactile.pipelines.sources import SourceOptions
+    from scroll_tactile.quantities import Quantity
     from scroll_tactile.results import (
         Candidates,
         Compacted,
@@ -63,6 +64,7 @@ __all__ = [
     "ModuleEmbedding",
     "Observation",
     "Prediction",
+    "Quantity",
     "Receipt",
     "Scene",
     "Sensor",
@@ -106,6 +108,7 @@ _MODULES = {
     "ModuleEmbedding": "embeddings.modules",
     "Observation": "results",
     "Prediction": "results",
+    "Quantity": "quantities",
     "Receipt": "results",
     "Scene": "simulation.scene",
     "Sensor": "sensors",

@@ -13,6 +13,7 @@
     │   │   └── ReadingsTypeError (TypeError)    they are not real numbers
     │   ├── MaterialError                    a material's name is not usable
     │   ├── DescriptionError                 what a material is said to be made of cannot be
+    │   ├── AnnotationError                  a value or label of a touch cannot be kept, or its quantity not declared
     │   ├── UnknownMaterialError (KeyError)  a material that was never observed is asked for
     │   ├── ObservationError (KeyError)      an observation that is not there, or can no longer be retracted
     │   ├── RecordingError                   a file of readings is damaged, empty or of no known format
@@ -105,6 +106,10 @@ class MaterialError(InputError):
 
 class DescriptionError(InputError):
     """What a material is said to be made of cannot be: shares that do not sum to one, or a name that is none."""
+
+
+class AnnotationError(InputError):
+    """A touch's value or label cannot be kept: out of its range, undeclared, or another than the touch has already."""
 
 
 class UnknownMaterialError(InputError, KeyError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -29,6 +29,7 @@ from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import WindowPlan
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 
 if TYPE_CHECKING:
     from scroll_tactile.firmware.exported_judge import ExportedJudge
@@ -156,7 +157,16 @@ class TactileLearner(MemoryKeeper):
         """
         return self._predictor.extractor.stream(readings)
 
-    def observe(self, material: str, stream: Readings, *, source: str | None = None, again: bool = False) -> Receipt:
+    def observe(
+        self,
+        material: str,
+        stream: Readings,
+        *,
+        values: Mapping[str, float] | None = None,
+        labels: Mapping[str, str] | None = None,
+        source: str | None = None,
+        again: bool = False,
+    ) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
 
         One content is one touch: of readings that the memory has under this name nothing is learned a second time, and
@@ -165,16 +175,21 @@ class TactileLearner(MemoryKeeper):
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
         unit, T of at least two: an array, a tensor, lists, or an iterable of readings; of a camera frames,
         (T, height, width, 3), the first of the gel at rest (see `Frames`), of which those in contact are kept.
+        values: what was measured of the touch, by quantity, each declared before and in its unit; see `declare`.
+        labels: what else it is, by axis, such as {"slip": "north"}; axes and labels need no announcement.
         source: where it comes from, such as a file's name: kept in the journal for `observations`, and nothing else.
 
         Raises StreamError (NoContactError where the gel was not pressed), MaterialError or InputError for a name or a
-        source that is none (nothing was kept), CapacityError, or StoreError. Warns once, by a RangeWarning, where a
-        touch does not fit the sensor's range; it is learned all the same.
+        source that is none, AnnotationError for a value that is none of its quantity, or other values or labels than
+        the memory has of this touch (nothing was kept), CapacityError, or StoreError. Warns once, by a RangeWarning,
+        where a touch does not fit the sensor's range; it is learned all the same.
         """
         material, source = require_name(material), None if source is None else require_source(source)
         predictor = self._predictor  # one: `reembed` puts another in its place
+        noted = Annotation.of(self.quantities, values, labels) if values or labels else NO_ANNOTATION
         touch = predictor.extractor.verified().stream(stream)
-        receipt = predictor.ledger.observe(material, touch, *predictor.extractor.learned(touch), source, again=again)
+        learned = predictor.extractor.learned(touch)
+        receipt = predictor.ledger.observe(material, touch, *learned, source, noted, again=again)
         with predictor.ledger.lock:
             predictor.current.prepare(predictor.ledger)
         if not self._range_warned and (problem := range_problem(touch)) is not None:

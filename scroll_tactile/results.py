@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Self
 
@@ -52,7 +52,7 @@ class Observation:
 
     sequence, material, key: as in its receipt. time: when it was observed, in seconds since 1970. state: "kept", with
     its features; "compacted", learned and without them; or "retracted". source: the file or place it came from, where
-    `observe` was given one.
+    `observe` was given one. values: quantity → value in its unit, to its resolution. labels: axis → label.
     """
 
     sequence: int
@@ -61,6 +61,8 @@ class Observation:
     time: float
     state: Literal["kept", "compacted", "retracted"]
     source: str | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, LevelArray, Likelihood, Noise
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.statistics.annotations import Annotations
 
 __all__ = [
     "KeptTouch",
@@ -26,11 +27,12 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class KeptTouch:
-    """A kept touch: its material, its content hash, and its levels, uint8 of shape (C, T)."""
+    """A kept touch: its material, its content hash, its levels, uint8 of shape (C, T), and how it was annotated."""
 
     material: str
     key: bytes
     levels: LevelArray
+    annotations: Annotations = ()
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -10,71 +11,38 @@ from typing import Any, Self, cast
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.matching.likelihood import LevelArray, levels_of
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
-from scroll_tactile.memory.touch_rows import Added, Arrays, Codes, Encode, Readings, row_codes, unpack_readings
+from scroll_tactile.memory.kept_touches import KeptTouches
+from scroll_tactile.memory.touch_rows import (
+    Added,
+    Arrays,
+    Codes,
+    Encode,
+    Readings,
+    annotation_of,
+    annotations_from,
+    annotations_to_json,
+    declaration,
+    row_codes,
+    unpack_readings,
+)
 from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.sensors import Sensor
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, together
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
+from scroll_tactile.statistics.targets import TargetSums
 from store import Head, Record
 from store.records import LateArray
 
-__all__ = ["LATE_ROWS", "LATE_SECOND", "KeptTouches", "Memory"]
+__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "Memory"]
 
 LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
-LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
+ANNOTATED = "sample-annotations", "kept-annotations"  # attributes: of each of their touches, how it was annotated
 Chosen = tuple["TouchSample", "KeptTouches | None", "ExemplarSample | None"]
-
-
-class KeptTouches(Sample[LevelArray]):
-    """Kept touches: a bounded sample of what was observed, as levels, to compare others with (see `matching.matcher`).
-
-    A function of the set of touches observed: at most `capacity` of a sensor's. In a checkpoint these are `kept-keys`
-    (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their materials are the attribute `kept`.
-    """
-
-    def __init__(self, sensor: Sensor, capacity: int) -> None:
-        super().__init__(capacity)
-        self.sensor = sensor
-
-    @property
-    def most_columns(self) -> int:
-        """Of a touch that is kept: twice the usual length."""
-        return max(2, round(LONGEST_KEPT * self.sensor.readings))
-
-    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
-        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most `most_columns`."""
-        return levels_of(readings[: self.most_columns], self.sensor)
-
-    def touches(self) -> list[KeptTouch]:
-        """All of them, by material and key."""
-        return [KeptTouch(material, key, levels) for material, key, levels in self]
-
-    def take(self, material: str, key: bytes, readings: npt.NDArray[np.floating] | None) -> None:
-        """Keep a touch where it belongs in, if its readings are there."""
-        if readings is not None and self.wants(material, key):
-            self.add(material, key, self.levels(readings))
-
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-        """What a store keeps: arrays by name, and the material of each touch."""
-        kept = self.touches()
-        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept)])
-        return {
-            "kept-keys": np.array([list(touch.key) for touch in kept] or [[]], np.uint8)[: len(kept)],
-            "kept-columns": np.array([touch.levels.shape[1] for touch in kept], dtype=np.int64),
-            "kept-levels": np.diff(levels, prepend=np.uint8(0)),
-        }, [touch.material for touch in kept]
-
-    def fill(self, arrays: Arrays, materials: Sequence[str]) -> None:
-        """Take in what `to_arrays` described."""
-        columns, channels = arrays["kept-columns"], self.sensor.channels
-        parts = np.split(np.cumsum(arrays["kept-levels"], dtype=np.uint8), np.cumsum(columns * channels)[:-1])
-        for i, material in enumerate(materials):
-            self.add(material, arrays["kept-keys"][i].tobytes(), parts[i].reshape(channels, -1))
 
 
 class Memory:
@@ -85,11 +53,12 @@ class Memory:
 
     What was learned:
 
-    - statistics: exact sums by scale.
+    - statistics: exact sums by scale. targets: those of values and labels.
     - sample: the touches that readouts are calibrated on.
     - kept: touches to match with; None where the recipe keeps none.
     - exemplars: the candidates for the buffer, and where their readings lie; None where the recipe has no buffer.
     - descriptions: material → what it is made of; the material need not have been observed.
+    - quantities: those that touches can carry, by name.
     - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.
     - tuned_last_sequence: the last sequence that the tuned model was trained on.
 
@@ -108,6 +77,7 @@ class Memory:
         self.recipe, self.plan = recipe, recipe.plan
         self.encode = encode
         self.statistics = Statistics(recipe.embedding.dimension, self.plan.scales)
+        self.targets = TargetSums(recipe.embedding.dimension, self.plan.scales)
         self._sample: TouchSample | Callable[[], TouchSample] = TouchSample()
         self.kept = KeptTouches(recipe.sensor, recipe.kept_touches) if recipe.kept_touches else None
         self.exemplars = ExemplarSample(recipe.exemplars) if recipe.exemplars else None
@@ -118,7 +88,13 @@ class Memory:
         self.checkpoint: int | None = None
         self.sequence = self.compacted = self.saved = self.retractions = 0
         self.descriptions: dict[str, Description] = {}
+        self.quantities: dict[str, Quantity] = {}
         self.stale = False
+
+    def digest(self) -> str:
+        """Hex of a SHA-256 over all sums, those of values and labels where there are any."""
+        own = self.statistics.digest()
+        return hashlib.sha256((own + self.targets.digest()).encode()).hexdigest() if self.targets else own
 
     @property
     def sample(self) -> TouchSample:
@@ -140,6 +116,7 @@ class Memory:
         sequence: int,
         source: Source | None,
         readings: Readings | None,
+        annotation: Annotation = NO_ANNOTATION,
     ) -> None:
         """Add an observation without a journal: a touch of so many columns, its rows of codes by scale, and its number.
 
@@ -147,22 +124,23 @@ class Memory:
         `replaying.replay` adds what a journal has. Raises CapacityError before anything is added.
         """
         self.statistics.add(material, codes, columns)
+        self.targets.add(material, key, annotation, codes, columns)
         if self.sample.wants(material, key) or self.sample.holds(material, key):
-            self.sample.add(material, key, self._touch(columns, codes))
-        if self.kept is not None:
-            self.kept.take(material, key, readings)
+            self.sample.add(material, key, self._touch(columns, codes, annotation))
+        if self.kept is not None and source is not None:
+            self.kept.take(material, key, readings, annotation)
         if self.exemplars is not None and source is not None:
             self.exemplars.add(material, key, source)
         self.sequence = sequence
 
-    def undo(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
+    def undo(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
         """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
         parts = [
             sample.undo(material, key)
             for sample in self._samples()
             if sample.wants(material, key) or sample.holds(material, key)
         ]
-        parts.append(self.statistics.undo(material, columns))
+        parts += [self.statistics.undo(material, columns), self.targets.undo(annotation, columns)]
         sequence = self.sequence
 
         def undo() -> None:
@@ -174,16 +152,17 @@ class Memory:
 
     def retract(self, record: Record) -> Added:
         """Subtract an observation from the sums; call `replaying.refill` afterwards, for what was chosen."""
-        material, key = record.label, record.key
+        material, key, annotation = record.label, record.key, annotation_of(record.attributes)
         columns, codes = self.codes(record)
         self.statistics.remove(material, codes, columns)
+        self.targets.remove(material, key, annotation, codes, columns)
         self.retracted.add(record.sequence)
         self.retractions += 1
         if any(sample.holds(material, key) for sample in self._samples()):
             self.stale = True
         if record.sequence <= self.tuned_last_sequence:
             self.tuned = None
-        return material, codes, -1
+        return Added(material, codes, -1, annotation.labels)
 
     def _samples(self) -> list[Sample[Any]]:
         return [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
@@ -192,6 +171,7 @@ class Memory:
         """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and the tuned model."""
         columns, codes = self.codes(record)
         self.statistics.add(record.label, codes, columns)
+        self.targets.add(record.label, record.key, annotation_of(record.attributes), codes, columns)
         self.retracted.discard(record.sequence)
         self.stale = False
 
@@ -204,19 +184,28 @@ class Memory:
 
         def touch(material: str, key: bytes, sequence: int) -> SampledTouch:
             own = touches.get((material, key))
-            return self._touch(*self.codes(record(sequence))) if own is None else replace(own, copies=1)
+            if own is None:
+                return self._touch(*self.codes(record(sequence)), NO_ANNOTATION)
+            return replace(own, copies=1, annotations=())
 
         self.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
+        noted = [(head, annotation) for head in heads if (annotation := annotation_of(head.attributes))]
+        for head, annotation in noted:
+            self.sample.note(head.label, head.key, annotation)
         read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
         if self.kept is not None:
             mine, kept = {(material, key): own for material, key, own in made.kept or ()}, self.kept
 
-            def levels(material: str, key: bytes, sequence: int) -> LevelArray:
+            def keep(material: str, key: bytes, sequence: int) -> KeptTouch:
                 if (own := mine.get((material, key))) is not None:
-                    return own
-                return kept.levels(cast(Readings, unpack_readings(record(sequence).arrays)))
+                    return replace(own, annotations=())
+                levels = kept.levels(cast(Readings, unpack_readings(record(sequence).arrays)))
+                return KeptTouch(material, key, levels)
 
-            self.kept.refill(((head.label, head.key, head.sequence) for head in read), levels)
+            self.kept.refill(((head.label, head.key, head.sequence) for head in read), keep)
+            for head, annotation in noted:
+                if head.attributes.get("nbytes"):
+                    self.kept.note(head.label, head.key, annotation)
         if self.exemplars is not None:
             self.exemplars.update((head.label, head.key, head.sequence) for head in read)
 
@@ -233,8 +222,9 @@ class Memory:
         columns = cast(int, record.attributes["columns"])
         return columns, row_codes(record.arrays, self.encode)
 
-    def _touch(self, columns: int, codes: Codes) -> SampledTouch:
-        return SampledTouch.of(self.plan.scored_stages(columns), codes)
+    def _touch(self, columns: int, codes: Codes, annotation: Annotation) -> SampledTouch:
+        touch = SampledTouch.of(self.plan.scored_stages(columns), codes)
+        return replace(touch, annotations=together([(annotation, 1)])) if annotation else touch
 
     @property
     def chosen(self) -> Chosen:
@@ -248,7 +238,7 @@ class Memory:
 
     def take_sums(self, memory: Memory, later: Memory, last_sequence: int) -> None:
         """Take the sums of a memory without those of the rows behind one; `chosen` is of the rows up to it already."""
-        self.statistics = memory.statistics - later.statistics
+        self.statistics, self.targets = memory.statistics - later.statistics, memory.targets - later.targets
         self.compacted, self.sequence, self.tuned = memory.compacted, last_sequence, None
         self.retracted = set(memory.retracted)
 
@@ -259,8 +249,8 @@ class Memory:
         self.retracted = {sequence for sequence in self.retracted if sequence > last}
 
     def join(self, other: Memory, *, exemplars: bool = True) -> None:
-        """Add another memory of the same making; descriptions and the tuned model are left out."""
-        self.statistics = self.statistics + other.statistics
+        """Add another memory of the same making; descriptions, quantities and the tuned model are left out."""
+        self.statistics, self.targets = self.statistics + other.statistics, self.targets + other.targets
         self.sample.update(other.sample)
         if self.kept is not None and other.kept is not None:
             self.kept.update(other.kept)
@@ -290,6 +280,16 @@ class Memory:
         if self.kept is not None:
             levels, attributes["kept"] = self.kept.to_arrays()
             arrays |= levels
+        if self.quantities:
+            declared = sorted(self.quantities.items())
+            attributes["quantities"] = {name: declaration(quantity) for name, quantity in declared}
+        if self.targets:
+            sums, attributes["targets"] = self.targets.to_arrays(self.statistics.touches)
+            arrays |= sums
+            attributes["sample-annotations"] = [annotations_to_json(touch.annotations) for *_, touch in self.sample]
+            if self.kept is not None:
+                kept = [annotations_to_json(touch.annotations) for *_, touch in self.kept]
+                attributes["kept-annotations"] = kept
         # The rows after a compaction checkpoint are replayed, and say themselves which of them were retracted.
         retracted = sorted(self.retracted if compaction_at is None else ())
         compacted = self.compacted if compaction_at is None else compaction_at
@@ -323,17 +323,23 @@ class Memory:
         names, scales, reads = attributes["materials"], self.plan.scales, dict(late or {})
         seconds = {name: each.read for name, each in reads.items()}
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names, seconds)
+        if "targets" in attributes:
+            self.targets = TargetSums.from_arrays(self.statistics, arrays, attributes["targets"])
+        noted = {which: [annotations_from(told) for told in attributes.get(which, ())] for which in ANNOTATED}
+        sampled = attributes["sample"], attributes["copies"], noted[ANNOTATED[0]]
         if LATE_ROWS in reads:
             small = {name: array for name, array in arrays.items() if name.startswith("sample-")}
-            self._sample = partial(_sample_of, reads[LATE_ROWS], small, attributes["sample"], attributes["copies"])
+            self._sample = partial(_sample_of, reads[LATE_ROWS], small, *sampled)
         else:
-            self.sample = TouchSample.from_arrays(arrays, attributes["sample"], attributes["copies"])
+            self.sample = TouchSample.from_arrays(arrays, *sampled)
         if self.kept is not None:
-            self.kept.fill(arrays, attributes["kept"])
+            self.kept.fill(arrays, attributes["kept"], noted[ANNOTATED[1]])
         if self.exemplars is not None and "exemplars" in attributes:
             self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.recipe.exemplars, source)
         self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("retracted", "excluded"))
         self.descriptions = dict(attributes.get("descriptions", {}))  # a merge brings them as rows
+        for name, fields in attributes.get("quantities", {}).items():
+            self.quantities[name] = Quantity(name=name, **fields)
         self.take_tuned(arrays, attributes)
         return self
 
@@ -346,5 +352,5 @@ class Memory:
                 self.tuned = tuned
 
 
-def _sample_of(rows: LateArray, arrays: Arrays, materials: Sequence[str], copies: Sequence[int]) -> TouchSample:
-    return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, materials, copies)
+def _sample_of(rows: LateArray, arrays: Arrays, *about: Any) -> TouchSample:
+    return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, *about)

@@ -3,31 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import MismatchError, StreamError
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Annotations, together
 from store import Head
 
 __all__ = [
+    "DECLARE",
     "DESCRIBE",
     "KINDS",
+    "LABELS",
     "MEMBER",
     "MERGE",
     "MOST_BYTES",
     "OBSERVE",
     "RETRACT",
     "SOURCE",
+    "VALUES",
     "Added",
     "Arrays",
     "Codes",
     "Encode",
     "Readings",
     "active_rows",
+    "annotated",
+    "annotation_of",
+    "annotations_from",
+    "annotations_to_json",
+    "declaration",
+    "declared_by",
     "only_readings",
     "pack_codes",
     "pack_readings",
@@ -45,8 +56,10 @@ RETRACT = "retract"  # observations were retracted; the attribute "sequences" ho
 MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those of its compaction checkpoint
 MEMBER = "member"  # a stream that such a memory had observed: its name and hash alone
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
+DECLARE = "declare"  # a quantity that touches can carry: its unit, low, high and resolution; the label is its name
 SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
-KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE]
+VALUES, LABELS = "values", "labels"  # of an observation or a member: quantity → steps, and axis → label, if any
+KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE]
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = dict[Scale, npt.NDArray[np.int32]]
@@ -54,8 +67,19 @@ Readings = npt.NDArray[np.float32]
 Encode = Callable[[Readings], Codes]
 """Embeds the readings of a touch: its rows of codes by scale."""
 
-Added = tuple[str, Codes, int]
-"""A material, the rows of codes of a touch of it by scale, and 1 where they came or −1 where they were retracted."""
+
+class Added(NamedTuple):
+    """A touch that came, or was retracted.
+
+    material: its name. codes: its rows of codes by scale. sign: 1, or −1 where it was retracted. labels: its axes and
+    labels.
+    """
+
+    material: str
+    codes: Codes
+    sign: int
+    labels: tuple[tuple[str, str], ...] = ()
+
 
 MOST_BYTES = 2**28  # of the readings of a touch as float32: a row is read into memory whole
 CODES = "codes-"  # and a scale
@@ -121,6 +145,41 @@ def unpack_readings(arrays: Arrays) -> Readings | None:
 def only_readings(arrays: Arrays) -> dict[str, npt.NDArray[Any]]:
     """Of the arrays of a row, those that hold its readings."""
     return {name: array for name, array in arrays.items() if name.startswith("readings")}
+
+
+def declaration(quantity: Quantity) -> dict[str, Any]:
+    """The attributes of the row that declares a quantity; its label is the name."""
+    return quantity.model_dump(exclude={"name"})
+
+
+def declared_by(row: Head) -> Quantity:
+    """The quantity that a row declares. Raises InputError for what is none."""
+    fields: dict[str, Any] = {name: row.attributes.get(name) for name in ("unit", "low", "high", "resolution")}
+    return Quantity(name=row.label, **fields)
+
+
+def annotated(annotation: Annotation) -> dict[str, Any]:
+    """The attributes of a row with which an annotation is kept: none where there is nothing in it."""
+    found = {VALUES: dict(annotation.values), LABELS: dict(annotation.labels)}
+    return {name: told for name, told in found.items() if told}
+
+
+def annotation_of(attributes: Mapping[str, Any]) -> Annotation:
+    """The annotation that `annotated` made attributes of."""
+    values, labels = (attributes.get(name, {}) for name in (VALUES, LABELS))
+    return (
+        Annotation(tuple(sorted(values.items())), tuple(sorted(labels.items()))) if values or labels else NO_ANNOTATION
+    )
+
+
+def annotations_to_json(annotations: Annotations) -> list[list[Any]]:
+    """The annotations of one content, as a checkpoint has them: the attributes of each, and how often it was so."""
+    return [[annotated(annotation), copies] for annotation, copies in annotations]
+
+
+def annotations_from(told: Any) -> Annotations:
+    """The annotations that `annotations_to_json` told."""
+    return together((annotation_of(attributes), copies) for attributes, copies in told)
 
 
 def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:

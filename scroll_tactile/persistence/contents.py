@@ -11,8 +11,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE
+from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, annotation_of
 from scroll_tactile.signals.ranges import CURE
+from scroll_tactile.statistics.annotations import Annotation
 from store import DamageError, Head, Store
 
 __all__ = ["ListedContents", "StoredContents", "refusal"]
@@ -36,12 +37,12 @@ def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str |
 
 
 class ListedContents:
-    """The touches of a memory by their keys. rows: (material, key, row in the journal) of each."""
+    """The touches of a memory by their keys. rows: (material, key, row in the journal, annotation) of each."""
 
-    def __init__(self, rows: Iterable[tuple[str, bytes, int]] = ()) -> None:
-        self._rows: dict[bytes, tuple[tuple[str, int], ...]] = {}
-        for material, key, sequence in rows:
-            self.add(material, key, sequence)
+    def __init__(self, rows: Iterable[tuple[str, bytes, int, Annotation]] = ()) -> None:
+        self._rows: dict[bytes, tuple[tuple[str, int, Annotation], ...]] = {}
+        for row in rows:
+            self.add(*row)
 
     def copy(self) -> ListedContents:
         """A copy that changes independently."""
@@ -49,13 +50,13 @@ class ListedContents:
         other._rows = dict(self._rows)
         return other
 
-    def add(self, material: str, key: bytes, sequence: int) -> None:
+    def add(self, material: str, key: bytes, sequence: int, annotation: Annotation) -> None:
         """Add a touch, also one more of the same content."""
-        self._rows[key] = (*self._rows.get(key, ()), (material, sequence))
+        self._rows[key] = (*self._rows.get(key, ()), (material, sequence, annotation))
 
     def remove(self, material: str, key: bytes, sequence: int) -> None:
         """Take a touch out; nothing where it is not there."""
-        left = tuple(row for row in self._rows.get(key, ()) if row != (material, sequence))
+        left = tuple(row for row in self._rows.get(key, ()) if row[:2] != (material, sequence))
         if left:
             self._rows[key] = left
         else:
@@ -63,11 +64,11 @@ class ListedContents:
 
     def names(self, key: bytes) -> list[str]:
         """The names of a content, oldest first; none where it is not there."""
-        return list(dict.fromkeys(name for name, _ in self._rows.get(key, ())))
+        return list(dict.fromkeys(name for name, *_ in self._rows.get(key, ())))
 
-    def find(self, material: str, key: bytes) -> int | None:
-        """The first row that has a content under this name; None where there is none."""
-        return min((sequence for name, sequence in self._rows.get(key, ()) if name == material), default=None)
+    def rows(self, material: str, key: bytes) -> dict[int, Annotation]:
+        """The rows that have a content under this name, and how it was annotated in each."""
+        return {sequence: noted for name, sequence, noted in self._rows.get(key, ()) if name == material}
 
 
 class StoredContents:
@@ -83,16 +84,16 @@ class StoredContents:
     def copy(self) -> ListedContents:
         """A copy in memory that changes independently, without damaged rows."""
         heads = self._active(_sound(self._store))
-        return ListedContents((head.label, head.key, head.sequence) for head in heads)
+        return ListedContents((head.label, head.key, head.sequence, annotation_of(head.attributes)) for head in heads)
 
     def names(self, key: bytes) -> list[str]:
         """As `ListedContents.names`."""
         return list(dict.fromkeys(head.label for head in self._active(self._store.with_key(key))))
 
-    def find(self, material: str, key: bytes) -> int | None:
-        """As `ListedContents.find`."""
+    def rows(self, material: str, key: bytes) -> dict[int, Annotation]:
+        """As `ListedContents.rows`."""
         found = self._active(self._store.with_key(key))
-        return min((head.sequence for head in found if head.label == material), default=None)
+        return {head.sequence: annotation_of(head.attributes) for head in found if head.label == material}
 
 
 def _sound(store: Store) -> Iterator[Head]:

@@ -17,6 +17,7 @@ from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Compacted, Observation, Receipt
 from scroll_tactile.settings import require_name, require_source, require_text
 
@@ -48,7 +49,7 @@ class MemoryKeeper(ABC):
 
     def digest(self) -> str:
         """Hex, equal for two memories if and only if they hold the same bytes of statistics."""
-        return self._ledger.read(lambda memory, _: memory.statistics.digest())
+        return self._ledger.read(lambda memory, _: memory.digest())
 
     @property
     def descriptions(self) -> dict[str, Description]:
@@ -71,6 +72,28 @@ class MemoryKeeper(ABC):
         """
         material = require_name(material)
         self._ledger.describe(material, None if constituents is None else checked(material, constituents))
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Name → the declared quantity, in alphabetical order, whether a touch carries a value of it or not."""
+        return self._ledger.read(lambda memory, _: dict(sorted(memory.quantities.items())))
+
+    @property
+    def axes(self) -> dict[str, dict[str, int]]:
+        """Axis → label → the number of observations that carry it, both in alphabetical order."""
+        return self._ledger.read(
+            lambda memory, _: {axis: own.materials for axis, own in sorted(memory.targets.axes.items())}
+        )
+
+    def declare(self, quantity: Quantity) -> None:
+        """Have touches carry values of this quantity from now on; durable when this returns. For ever: see `Quantity`.
+
+        The same one again changes nothing. Statistics and `digest` stay as they are.
+
+        Raises AnnotationError for another unit, range or resolution under a name that was declared, and for one of more
+        than 64 (nothing was changed); StoreError.
+        """
+        self._ledger.declare(quantity)
 
     @contextmanager
     def batch(self) -> Iterator[None]:

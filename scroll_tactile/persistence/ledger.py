@@ -7,16 +7,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from scroll_tactile.errors import FineTuneError, InputError
+from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
 from scroll_tactile.memory.descriptions import Description, describe
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    DECLARE,
     DESCRIBE,
     OBSERVE,
     RETRACT,
     SOURCE,
+    Added,
     Codes,
+    annotated,
+    declaration,
     pack_codes,
     pack_readings,
     require_row,
@@ -28,8 +32,10 @@ from scroll_tactile.persistence.merge import MergePlan, MergeRules
 from scroll_tactile.persistence.observations import compaction_point, observation_of, observations_from, observations_of
 from scroll_tactile.persistence.open_memory import OpenMemory, give_back_scratch
 from scroll_tactile.persistence.replaying import apply_description, refill, replay, until
+from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.results import Compacted, Merged, Receipt
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.validation.gate import MemoryStore
 from store import Head, Record, Store
 
@@ -54,35 +60,54 @@ class Ledger(OpenMemory):
         columns: int,
         codes: Codes,
         source: str | None = None,
+        annotation: Annotation = NO_ANNOTATION,
         *,
         again: bool = False,
     ) -> Receipt:
         """Append an observation to the journal, then add it to the memory; durable on return, in a batch at its end.
 
-        again: observe once more a touch that the memory has under this name.
+        again: observe once more a touch that the memory has under this name. Raises AnnotationError for one that it has
+        with another annotation.
         """
         require_row(stream)
         with self.lock:
             self.require_open()
             # A memory opened to read skips this: its journal refuses the row below.
             if not again and (self.store is None or self.store.mode == "write"):
-                known = self.contents().find(material, stream.key)
+                known = self._known(material, stream.key, annotation)
                 if known is not None:
                     return self._receipt(known, material, stream, repeated=True)
             # Checked before the row is in the journal: the next opening must be able to add every row.
             self.memory.statistics.require_room(codes)
-            undo = self._undo_of(material, stream.key, columns) if self.store is None else None
+            self.memory.targets.require_room(annotation)
+            undo = self._undo_of(material, stream.key, columns, annotation) if self.store is None else None
             with self._mutation(_nothing, undo):
-                sequence = self._append(material, stream, columns, codes, source)
+                sequence = self._append(material, stream, columns, codes, source, annotation)
                 if self._contents is not None:
-                    self._contents.add(material, stream.key, sequence)
-                self._changed([(material, codes, 1)])
+                    self._contents.add(material, stream.key, sequence, annotation)
+                self._changed([Added(material, codes, 1, annotation.labels)])
             self._checkpoint_if_due()
             return self._receipt(sequence, material, stream)
 
-    def _undo_of(self, material: str, key: bytes, columns: int) -> Callable[[], None]:
+    def _known(self, material: str, key: bytes, annotation: Annotation) -> int | None:
+        """The first row that has a touch under this name, and so annotated unless nothing is said; None without any.
+
+        Raises AnnotationError where it has the touch annotated otherwise.
+        """
+        rows = self.contents().rows(material, key)
+        if not rows or not annotation:
+            return min(rows, default=None)
+        if same := [sequence for sequence, there in rows.items() if there == annotation]:
+            return min(same)
+        quantities, first = self.memory.quantities, min(rows)
+        raise AnnotationError(
+            f"observation {first} has this touch of {material!r} with {rows[first].shown(quantities)}; came "
+            f"{annotation.shown(quantities)}. Retract it first, or count the touch once more with again=True"
+        )
+
+    def _undo_of(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
         """A function that undoes the next observation, for a memory without a store."""
-        memory, sequence = self._memory.undo(material, key, columns), self._memory.sequence + 1
+        memory, sequence = self._memory.undo(material, key, columns, annotation), self._memory.sequence + 1
 
         def undo() -> None:
             memory()
@@ -91,7 +116,9 @@ class Ledger(OpenMemory):
 
         return undo
 
-    def _append(self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None) -> int:
+    def _append(
+        self, material: str, stream: Stream, columns: int, codes: Codes, source: str | None, annotation: Annotation
+    ) -> int:
         memory = self._memory
         # Readings of every stream are kept, not of exemplars alone: any can take the place of a retracted exemplar.
         kept = self._bare or memory.exemplars is not None or memory.kept is not None
@@ -99,9 +126,9 @@ class Ledger(OpenMemory):
         if self.store is None:
             sequence, stages = memory.sequence + 1, memory.plan.scored_stages(columns)
             held = Exemplar.of(material, stream.key, packed, stages, codes) if kept else None
-            memory.add(material, stream.key, columns, codes, sequence, held, stream.readings)
+            memory.add(material, stream.key, columns, codes, sequence, held, stream.readings, annotation)
             return sequence
-        attributes: dict[str, Any] = {"columns": columns}
+        attributes: dict[str, Any] = {"columns": columns} | annotated(annotation)
         attributes |= ({"nbytes": stream.readings.nbytes} if kept else {}) | ({SOURCE: source} if source else {})
         arrays = packed if self._bare else packed | pack_codes(codes)
         head = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays)
@@ -126,6 +153,25 @@ class Ledger(OpenMemory):
                     memory.sequence = self.store.append(DESCRIBE, material, b"", attributes=attributes).sequence
                 describe(memory.descriptions, material, constituents)
                 self.described += 1
+            self._checkpoint_if_due()
+
+    def declare(self, quantity: Quantity) -> None:
+        """As `TactileLearner.declare`."""
+        with self.lock:
+            self.require_open()
+            memory = self.memory
+            if not require_declarable(memory.quantities, quantity):
+                return
+            before = dict(memory.quantities)
+
+            def undo() -> None:
+                memory.quantities = before
+
+            with self._mutation(_nothing, undo if self.store is None else None):
+                if self.store is not None:
+                    head = self.store.append(DECLARE, quantity.name, b"", attributes=declaration(quantity))
+                    memory.sequence = head.sequence
+                memory.quantities[quantity.name] = quantity
             self._checkpoint_if_due()
 
     def retract(self, receipt: Receipt | int) -> None:

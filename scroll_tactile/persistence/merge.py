@@ -8,14 +8,29 @@ from typing import Any, Literal, Self, cast
 
 from pydantic import BaseModel
 
-from scroll_tactile.errors import MismatchError, ObservationError
+from scroll_tactile.errors import AnnotationError, MismatchError, ObservationError
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import DESCRIBE, MEMBER, MERGE, OBSERVE, SOURCE, active_rows
+from scroll_tactile.memory.touch_rows import (
+    DECLARE,
+    DESCRIBE,
+    LABELS,
+    MEMBER,
+    MERGE,
+    OBSERVE,
+    SOURCE,
+    VALUES,
+    active_rows,
+    annotated,
+    annotation_of,
+    declaration,
+    declared_by,
+)
 from scroll_tactile.persistence.contents import ListedContents, StoredContents, refusal
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import apply_description, replay
+from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.validation.gate import MemoryStore, require_counted, wrong_retractions
 from store import Checkpoint, Head, Record, Store
 from store.files import same_folder
@@ -51,8 +66,9 @@ class MergePlan:
     source: the other memory. rows: heads of its journal that are appended. compaction: its compaction checkpoint, which
     stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
     rows that are not appended: shared streams that count once, and refused ones. refused: touches that have another
-    name already, each with the reason. descriptions: material → the description that is taken over. default_source: see
-    `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be added in place of its rows.
+    name already, each with the reason. descriptions: material → the description that is taken over. quantities: that
+    ours lacks. default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be
+    added in place of its rows.
     """
 
     source: MemoryStore
@@ -62,6 +78,7 @@ class MergePlan:
     left_out: list[Head]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
+    quantities: list[Quantity]
     default_source: str | None
     newest: Checkpoint | None
 
@@ -76,11 +93,13 @@ class MergePlan:
     ) -> Self:
         """Plan a merge from both journals. contents: which touches ours has.
 
-        Raises MismatchError where the two recipes differ, or their descriptions and `descriptions` is "same";
-        ObservationError where a touch that must be left out was compacted; DamageError for a damaged row of theirs, and
-        for a shared stream whose readings do not hash to its key, in either memory.
+        Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a stream that
+        counts once, or their descriptions and `descriptions` is "same"; ObservationError where a touch that must be
+        left out was compacted; DamageError for a damaged row of theirs, and for a shared stream whose readings do not
+        hash to its key, in either memory.
         """
         _require_mergeable(ours, memory, theirs)
+        quantities = _quantities(ours, memory, theirs)
         compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
         if found is not None:
             require_counted(theirs.path, found, heads)
@@ -89,6 +108,8 @@ class MergePlan:
         refused, again = (
             _by_first_names(incoming, contents, compacted, rules.clipped) if rules.one_name else ([], set())
         )
+        if rules.once:
+            _require_same_annotations(ours, theirs, [head for head in incoming if head.sequence in both], contents)
         out = {*(both if rules.once else ()), *again, *(head.sequence for head, _ in refused)}
         if fixed := [
             head for head in incoming if head.sequence in out and (head.sequence <= compacted or head.kind == MEMBER)
@@ -111,7 +132,8 @@ class MergePlan:
                     ours.record(sequence)
         shared = len(both) + len(again)
         summed = newest if theirs.is_packed else None
-        return cls(theirs, found, rows, shared, left_out, refused, described, rules.default_source, summed)
+        source = rules.default_source
+        return cls(theirs, found, rows, shared, left_out, refused, described, quantities, source, summed)
 
     def append_to(self, ours: Store, memory: Memory, progress: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; returns the number of observations added.
@@ -127,6 +149,9 @@ class MergePlan:
             else sum(head.kind == MERGE and head.sequence <= compaction.last_sequence for head in self.rows) - 1
         )
         total = len(self.rows) - part
+        for quantity in self.quantities:
+            head = ours.append(DECLARE, quantity.name, b"", attributes=declaration(quantity))
+            replay(memory, Record(**vars(head), arrays={}), ours)
         for material, description in self.descriptions.items():
             head = ours.append(DESCRIBE, material, b"", attributes={"constituents": description})
             replay(memory, Record(**vars(head), arrays={}), ours)
@@ -163,7 +188,8 @@ class MergePlan:
         for head in self.rows:
             if compaction is not None and head.sequence <= compaction.last_sequence:
                 if head.kind != MERGE:  # a merge before the compaction checkpoint is a part of it
-                    kept = {name: value for name, value in self._attributes_of(head).items() if name == SOURCE}
+                    attributes = self._attributes_of(head)
+                    kept = {name: value for name, value in attributes.items() if name in (SOURCE, VALUES, LABELS)}
                     yield MEMBER, head.label, head.key, kept, None, head.time
             else:
                 record = self.source.record(head.sequence)
@@ -176,7 +202,34 @@ class MergePlan:
 
 def _row(contents: ListedContents | StoredContents, head: Head) -> int | None:
     """Our row of their touch, under the same name; None where ours has none."""
-    return contents.find(head.label, head.key)
+    return min(contents.rows(head.label, head.key), default=None)
+
+
+def _quantities(ours: Store, memory: Memory, theirs: MemoryStore) -> list[Quantity]:
+    """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
+    new: dict[str, Quantity] = {}
+    for head in theirs.heads(kind=DECLARE):
+        quantity = declared_by(head)
+        try:
+            if require_declarable(memory.quantities | new, quantity):
+                new[quantity.name] = quantity
+        except AnnotationError as error:
+            raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {error}") from None
+    return list(new.values())
+
+
+def _require_same_annotations(
+    ours: Store, theirs: MemoryStore, shared: Sequence[Head], contents: ListedContents | StoredContents
+) -> None:
+    """Raise MismatchError for a touch that both observed, with values or labels there that ours has not."""
+    for head in shared:
+        there = annotation_of(head.attributes)
+        if there and there not in (here := contents.rows(head.label, head.key)).values():
+            raise MismatchError(
+                f"{ours.path} and {theirs.path} both have a touch of {head.label!r}, here row {min(here)} with "
+                f"{annotated(here[min(here)]) or 'no values or labels'}, there row {head.sequence} with "
+                f"{annotated(there)}: retract one of them, or count both with shared='twice'"
+            )
 
 
 def _by_first_names(

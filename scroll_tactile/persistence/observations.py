@@ -6,7 +6,16 @@ from typing import Literal, cast
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, SOURCE, active_rows, retracted_by
+from scroll_tactile.memory.touch_rows import (
+    DECLARE,
+    MEMBER,
+    OBSERVE,
+    SOURCE,
+    active_rows,
+    annotation_of,
+    declared_by,
+    retracted_by,
+)
 from scroll_tactile.results import Observation, Receipt
 from store import Head, Record, Store
 
@@ -106,11 +115,14 @@ def observations(store: Store) -> list[Observation]:
             return "retracted"
         return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
 
-    return [
-        Observation(head.sequence, head.label, head.key, head.time, state(head), _source(head))
-        for head in heads
-        if head.kind in (OBSERVE, MEMBER)
-    ]
+    quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
+
+    def told(head: Head) -> Observation:
+        annotation = annotation_of(head.attributes)
+        values, labels = annotation.measured(quantities), dict(annotation.labels)
+        return Observation(head.sequence, head.label, head.key, head.time, state(head), _source(head), values, labels)
+
+    return [told(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
 
 
 def _source(head: Head) -> str | None:

@@ -12,7 +12,16 @@ from typing import Any, cast
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import DESCRIBE, MERGE, OBSERVE, SOURCE, active_rows
+from scroll_tactile.memory.touch_rows import (
+    DECLARE,
+    DESCRIBE,
+    MERGE,
+    OBSERVE,
+    SOURCE,
+    active_rows,
+    annotation_of,
+    declaration,
+)
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.validation.gate import MemoryStore
 from store import Checkpoint, DamageError, Head, Store
@@ -44,6 +53,8 @@ def pack_memory(
     with made as folder:
         with Store.open(folder, identity=identity) as into:
             with into.batch():
+                for quantity in memory.quantities.values():
+                    into.append(DECLARE, quantity.name, b"", attributes=declaration(quantity))
                 touches = [_append(into, store, head, source, arrays=with_rows, readings=readings) for head in heads]
                 for material, constituents in memory.descriptions.items():
                     into.append(DESCRIBE, material, b"", attributes={"constituents": constituents})
@@ -87,7 +98,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]
     counts = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
-    if len(heads) != sum(1 for head in source.heads() if head.kind != DESCRIBE):
+    if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE)):
         return None
     if observed.ndim != 1 or counts != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
@@ -99,7 +110,8 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
         record = source.record(sequence)
         steps, codes = memory.codes(record)
         gone.statistics.add(record.label, codes, steps)
-    rest.statistics = sums.statistics - gone.statistics
+        gone.targets.add(record.label, record.key, annotation_of(record.attributes), codes, steps)
+    rest.statistics, rest.targets = sums.statistics - gone.statistics, sums.targets - gone.targets
     rest.exemplars = None  # the rows have them
     rest.choose([head for head in heads if head.sequence not in left_out], source.record, sums)
     return rest

@@ -20,6 +20,7 @@ from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    DECLARE,
     DESCRIBE,
     OBSERVE,
     RETRACT,
@@ -141,7 +142,7 @@ class Reembedding:
 
 def _require_readings(store: Store) -> None:
     heads = list(store.heads())
-    brought = [head.sequence for head in heads if head.kind not in (OBSERVE, RETRACT, DESCRIBE)]
+    brought = [head.sequence for head in heads if head.kind not in (OBSERVE, RETRACT, DESCRIBE, DECLARE)]
     bare = [head.sequence for head in heads if head.kind == OBSERVE and "nbytes" not in head.attributes]
     if store.compacted:
         what = f"rows 1 to {store.compacted} were compacted, and their readings given up"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
@@ -13,6 +12,7 @@ from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description, describe
 from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from scroll_tactile.memory.touch_rows import (
+    DECLARE,
     DESCRIBE,
     MEMBER,
     MERGE,
@@ -21,14 +21,27 @@ from scroll_tactile.memory.touch_rows import (
     Added,
     Codes,
     active_rows,
+    annotation_of,
+    declared_by,
     only_readings,
     retracted_by,
     unpack_readings,
     unspanned,
 )
+from scroll_tactile.quantities import Quantity
+from scroll_tactile.statistics.annotations import Annotation, Annotations, together
 from store import CompactedError, DamageError, Head, Record, Store
 
-__all__ = ["apply_appended", "apply_description", "load", "refill", "replay", "require_compaction", "until"]
+__all__ = [
+    "apply_appended",
+    "apply_declaration",
+    "apply_description",
+    "load",
+    "refill",
+    "replay",
+    "require_compaction",
+    "until",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -81,8 +94,10 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         source = record.sequence if only_readings(record.arrays) else None
         wanted = memory.kept is not None and memory.kept.wants(record.label, record.key)
         readings = unpack_readings(record.arrays) if wanted else None
-        memory.add(record.label, record.key, steps, codes, record.sequence, source, readings)
-        changed = [(record.label, codes, 1)]
+        annotation = annotation_of(record.attributes)
+        _require_declared(memory, record, annotation, store)
+        memory.add(record.label, record.key, steps, codes, record.sequence, source, readings, annotation)
+        changed = [Added(record.label, codes, 1, annotation.labels)]
     elif record.kind == RETRACT:
         gone = unspanned(record.attributes["sequences"])
         changed = [_retracted(memory, record, sequence, store) for sequence in gone if sequence > memory.compacted]
@@ -95,11 +110,12 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
                 record.sequence,
             )
     elif record.kind == MERGE:
-        _join(memory, record)
+        _join(memory, record, store)
         changed = None
     else:
-        assert record.kind in (MEMBER, DESCRIBE), "the gate lets no other row through"
+        assert record.kind in (MEMBER, DESCRIBE, DECLARE), "the gate lets no other row through"
     apply_description(memory.descriptions, record)
+    apply_declaration(memory.quantities, record, store)
     memory.sequence = record.sequence
     return changed
 
@@ -120,9 +136,29 @@ def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> A
     )
 
 
-def _join(memory: Memory, record: Record) -> None:
+def _require_declared(memory: Memory, record: Record, annotation: Annotation, store: Store) -> None:
+    """Raise DamageError for a value of a quantity that no row before this one declared, or outside of its range."""
+    for name, steps in annotation.values:
+        quantity = memory.quantities.get(name)
+        if quantity is None or steps > quantity.steps:
+            raise _misdeclared(record, store, f"a value of {name!r}, {steps} steps, of {quantity or 'no quantity'}")
+
+
+def _misdeclared(row: Head, store: Store, what: str) -> DamageError:
+    return DamageError(
+        f"row {row.sequence} of {store.path} has {what}: it is damaged, or was made by another program "
+        "(scroll-tactile memory check)",
+        path=store.path,
+        sequence=row.sequence,
+    )
+
+
+def _join(memory: Memory, record: Record, store: Store) -> None:
     """Add another memory of the same recipe, from a row with the arrays and attributes of its compaction checkpoint."""
     other = memory.empty_like().fill(record.arrays, record.attributes, source=record.sequence)
+    for name, quantity in other.quantities.items():
+        if memory.quantities.get(name) != quantity:
+            raise _misdeclared(record, store, f"values of {quantity}, which is not what was declared")
     memory.join(other, exemplars="exemplar-readings" in record.arrays)
 
 
@@ -130,6 +166,14 @@ def apply_description(descriptions: dict[str, Description], row: Head | Record) 
     """Apply a journal row to descriptions; a forgotten material loses its description."""
     if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
         describe(descriptions, row.label, row.attributes.get("constituents"))
+
+
+def apply_declaration(quantities: dict[str, Quantity], row: Head | Record, store: Store) -> None:
+    """Apply a journal row to the declared quantities. Raises DamageError for one that was declared otherwise."""
+    if row.kind == DECLARE:
+        quantity = declared_by(row)
+        if quantities.setdefault(quantity.name, quantity) != quantity:
+            raise _misdeclared(row, store, f"{quantity}, which was declared as {quantities[quantity.name]}")
 
 
 def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Added] | None:
@@ -157,9 +201,11 @@ def refill(memory: Memory, store: Store) -> None:
 def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
     """The memory of all observations up to a row, without retracted ones: a compaction at that row keeps it."""
     made, later = _chosen(memory, store, last_sequence), memory.empty_like()
+    later.quantities = dict(memory.quantities)
     for head in store.heads(memory.compacted):  # whoever compacts has read all
         if head.sequence <= last_sequence:
             apply_description(made.descriptions, head)
+            apply_declaration(made.quantities, head, store)
         elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             replay(later, store.record(head.sequence), store)
     made.take_sums(memory, later, last_sequence)
@@ -170,8 +216,9 @@ def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
     """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
     fresh, heads = _compaction_samples(memory, store), _behind_compaction(memory, store, last_sequence)
     for head in heads:
+        apply_declaration(fresh.quantities, head, store)
         if head.kind == MERGE:
-            _join(fresh, store.record(head.sequence))
+            _join(fresh, store.record(head.sequence), store)
     observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]
     fresh.choose(observed, store.record, memory)
     return fresh
@@ -213,25 +260,35 @@ def _compaction_samples(memory: Memory, store: Store) -> Memory:
             damage,
         )
         counted = _counted(memory, store)
+        fresh.quantities = dict(memory.quantities)
         fresh.sample.update(
-            (name, key, replace(touch, copies=counted[name, key]))
+            (name, key, replace(touch, copies=count, annotations=noted))
             for name, key, touch in memory.sample
-            if counted[name, key]
+            for count, noted in counted.get((name, key), ())
         )
         if fresh.kept is not None and memory.kept is not None:
-            fresh.kept.update(item for item in memory.kept if item[:2] in counted)
+            fresh.kept.update(
+                (name, key, replace(touch, annotations=noted))
+                for name, key, touch in memory.kept
+                for _, noted in counted.get((name, key), ())
+            )
         if fresh.exemplars is not None and memory.exemplars is not None:
             fresh.exemplars.update(item for item in memory.exemplars if item[:2] in counted)
     return fresh
 
 
-def _counted(memory: Memory, store: Store) -> Counter[tuple[str, bytes]]:
-    """(material, key) → how often the compacted rows observed the stream, without retracted observations.
+def _counted(memory: Memory, store: Store) -> dict[tuple[str, bytes], list[tuple[int, Annotations]]]:
+    """(material, key) → how often the compacted rows observed the stream, without retracted observations, and how
+    these were annotated: a list of one.
 
     `memory.is_gone` is asked as well: a row that retracts one of them may have been lost to damage.
     """
     rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
-    return Counter((head.label, head.key) for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence))
+    left = [head for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence)]
+    noted: dict[tuple[str, bytes], list[Annotation]] = {}
+    for head in left:
+        noted.setdefault((head.label, head.key), []).append(annotation_of(head.attributes))
+    return {stream: [(len(own), together((one, 1) for one in own))] for stream, own in noted.items()}
 
 
 def require_compaction(memory: Memory, store: Store) -> None:

@@ -181,7 +181,7 @@ class Model:
     def needs_renewal(self, behind: Sequence[Added]) -> bool:
         """Whether a readout, with the touches still to be taken in, has used five eighths of its room for columns."""
         for scale, readout in self.readouts.items():
-            columns = sum(len(codes[scale]) for _, codes, _ in behind if scale in codes)
+            columns = sum(len(codes[scale]) for _, codes, *_ in behind if scale in codes)
             if 3 * (readout.system.rank + columns) > 5 * (readout.system.room - columns):
                 return True
         return False
@@ -379,7 +379,7 @@ class Model:
 
 def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:
     """The changes at one scale by touches that came and went."""
-    return [(name, codes[scale], sign) for name, codes, sign in added if len(codes.get(scale, ()))]
+    return [(name, codes[scale], sign) for name, codes, sign, _ in added if len(codes.get(scale, ()))]
 
 
 def _chances(logits: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from collections.abc import Callable, Iterator
 
@@ -99,6 +100,10 @@ class SecondMoment:
         """
         return self._kept.codes() if isinstance(self._kept, _Rows) else None
 
+    def copy(self) -> SecondMoment:
+        """One that changes independently; a triangle is of both until it changes."""
+        return SecondMoment(self.dimension, self.rows, self._kept.copy())
+
     def undo(self) -> Callable[[], None]:
         """What takes the next `add` back, however much of it was done; it can be called again."""
         kept, state, rows = self._kept, dict(self._kept.__dict__), self.rows
@@ -129,6 +134,12 @@ class _Rows:
         self._count = len(self._codes)
         self._packed: IntArray | None = None
         self._formed = 0  # of the rows, in the triangle
+
+    def copy(self) -> _Rows:
+        """The same rows, with room of their own."""
+        other = copy.copy(self)
+        other._codes = self._codes.copy()
+        return other
 
     def add(self, codes: Codes) -> None:
         """Add rows."""
@@ -182,6 +193,12 @@ class _Triangle:
         self._dimension, self._packed = dimension, packed
         self._waiting = np.empty((0, dimension), dtype=np.int32)
         self._count = 0  # of rows that wait
+
+    def copy(self) -> _Triangle:
+        """The same triangle, with rows of its own that wait."""
+        other = copy.copy(self)
+        other._waiting = self._waiting.copy()
+        return other
 
     def add(self, codes: Codes) -> None:
         """Add at most 512 rows."""

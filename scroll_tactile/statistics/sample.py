@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.annotations import Annotation, Annotations, together
 from scroll_tactile.statistics.grid import mean_code
 
 __all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage_rows"]
@@ -52,12 +53,14 @@ class SampledTouch:
 
     rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
     the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of
-    shape (pairs, 3). copies: how often this very content was observed under this name.
+    shape (pairs, 3). copies: how often this very content was observed under this name. annotations: how these were
+    annotated.
     """
 
     rows: npt.NDArray[np.int32]
     pairs: npt.NDArray[np.int64]
     copies: int = 1
+    annotations: Annotations = ()
 
     @property
     def learned(self) -> npt.NDArray[np.int64]:
@@ -151,6 +154,11 @@ class Sample(Generic[T]):
 
         return undo
 
+    def change(self, material: str, key: bytes, changed: Callable[[T], T]) -> None:
+        """Change the item of a stream, if it holds that."""
+        if self.holds(material, key):
+            self._items[material, key] = changed(self._items[material, key])
+
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
         given = list(items)
@@ -185,9 +193,15 @@ class TouchSample(Sample[SampledTouch]):
     def __init__(self, capacity: int = CAPACITY) -> None:
         super().__init__(capacity)
 
+    def note(self, material: str, key: bytes, annotation: Annotation) -> None:
+        """Note how an observation of a touch that is held was annotated; nothing of another touch."""
+        more = [(annotation, 1)]
+        self.change(material, key, lambda held: replace(held, annotations=together(held.annotations, more)))
+
     def joined(self, held: SampledTouch, item: SampledTouch) -> SampledTouch:
         """The touch with the copies of both."""
-        return replace(held, copies=held.copies + item.copies)
+        annotations = together(held.annotations, item.annotations)
+        return replace(held, copies=held.copies + item.copies, annotations=annotations)
 
     def refill(
         self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], SampledTouch]
@@ -219,16 +233,21 @@ class TouchSample(Sample[SampledTouch]):
 
     @classmethod
     def from_arrays(
-        cls, arrays: Mapping[str, npt.NDArray[Any]], materials: Sequence[str], copies: Sequence[int]
+        cls,
+        arrays: Mapping[str, npt.NDArray[Any]],
+        materials: Sequence[str],
+        copies: Sequence[int],
+        annotations: Sequence[Annotations] = (),
     ) -> TouchSample:
-        """The sample that `to_arrays` described; copies: of each touch."""
-        sample = cls()
+        """The sample that `to_arrays` described; copies, annotations: of each touch."""
+        sample, noted = cls(), annotations or [()] * len(materials)
         edges = np.cumsum(arrays["sample-sizes"])[:-1]
         together = np.empty(arrays["sample-rows"].shape[::-1], np.int32)
         together[_by_scale(arrays["sample-pairs"])] = arrays["sample-rows"].T
         rows, pairs = np.split(together, edges), np.split(arrays["sample-pairs"], edges)
         for i, material in enumerate(materials):
-            sample.add(material, arrays["sample-keys"][i].tobytes(), SampledTouch(rows[i], pairs[i], copies[i]))
+            touch = SampledTouch(rows[i], pairs[i], copies[i], noted[i])
+            sample.add(material, arrays["sample-keys"][i].tobytes(), touch)
         return sample
 
 

@@ -291,10 +291,12 @@ class Statistics:
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
         late: Mapping[str, Callable[[], npt.NDArray[Any]]] | None = None,
+        like: Statistics | None = None,
     ) -> Statistics:
         """The statistics that `to_arrays` described; the arrays are taken over or copied.
 
-        late: what reads those arrays of second moments that are not among the arrays, when they are needed.
+        late: what reads those arrays of second moments that are not among the arrays, when they are needed. like: those
+        whose second moments these have too, where there are no arrays of any.
         """
         statistics = cls(dimension, scales)
         statistics._places = {name: place for place, name in enumerate(names)}
@@ -305,7 +307,12 @@ class Statistics:
             narrow = max(int(sums.max(initial=0)), -int(sums.min(initial=0))) <= LARGEST
             statistics._sums[scale] = sums.astype(np.int32) if narrow else sums
             if rows := int(statistics._rows[scale].sum()):
-                statistics._seconds[scale] = _second(int(scale), rows, dimension, arrays, late or {})
+                own = any(f"{name}-{scale}" in arrays for name in SECOND)
+                statistics._seconds[scale] = (
+                    _second(int(scale), rows, dimension, arrays, late or {})
+                    if own or like is None
+                    else like.second(scale).copy()
+                )
         return statistics
 
 

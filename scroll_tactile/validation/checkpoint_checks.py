@@ -15,6 +15,7 @@ from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
+from scroll_tactile.statistics.statistics import SECOND
 from scroll_tactile.statistics.tables import rows_of
 from scroll_tactile.validation.expected import (
     LONGEST_TOUCH,
@@ -29,6 +30,7 @@ from scroll_tactile.validation.expected import (
     name,
     whole,
 )
+from scroll_tactile.validation.target_checks import check_targets
 from store.records import LateArray
 
 __all__ = ["CheckpointChecks"]
@@ -63,18 +65,16 @@ class CheckpointChecks:
         expect(scales == own and all(type(scale) is int for scale in scales), "scales", f"{own}", scales)
         materials = _names("materials", attributes.get("materials"))
         expect(len(set(materials)) == len(materials), "materials", "different names", materials)
-        touches = self._check_touches(arrays, len(materials))
-        totals = {scale: self._check_sums(arrays, scale, len(materials), thorough) for scale in self._plan.scales}
+        touches, totals = self._check_statistics(arrays, len(materials), thorough)
         rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
-        expect(all(touches), "observations", "a touch or more of each material", touches)
-        for view in self._plan.views:
-            expect(bool((totals[view] >= touches).all()), f"rows-{view}", "a row or more of each touch", totals[view])
         sampled = _names("sample", attributes.get("sample"), materials)
         self._check_sample(arrays, sampled)
         copies: Any = attributes.get("copies")
         expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of sample", copies)
         for each in copies:
             whole("copies", each, 1, MOST_ROWS)
+        check_axis = partial(self._check_axis, arrays, totals, thorough=thorough)
+        check_targets(arrays, attributes, dict(zip(materials, touches, strict=True)), check_axis)
         if self._keeps or "kept" in attributes:
             self._check_kept(arrays, _names("kept", attributes.get("kept"), materials))
         if "exemplars" in attributes:
@@ -88,6 +88,29 @@ class CheckpointChecks:
             whole("tuned_last_sequence", attributes.get("tuned_last_sequence"), 0, last_sequence or 2**63 - 1)
         if "tuned" in attributes:
             self._check_tuned(arrays, attributes["tuned"])
+
+    def _check_axis(
+        self, whole_: Arrays, totals: Mapping[Scale, IntArray], arrays: Arrays, labels: list[str], *, thorough: bool
+    ) -> None:
+        """Check the statistics of an axis, whose second moments may be those of all touches.
+
+        whole_: the arrays of all touches. totals: their rows by material, at each scale.
+        """
+        shared = not any(field.startswith(SECOND) for field in arrays)
+        seconds = {field: values for field, values in whole_.items() if shared and field.startswith(SECOND)}
+        _, own = self._check_statistics({**arrays, **seconds}, len(labels), thorough and not shared)
+        for scale, rows in own.items():
+            total, most = int(rows.sum()), int(totals[scale].sum())
+            expect(total == most if shared else total <= most, f"axis.rows-{scale}", f"{most} rows", total)
+
+    def _check_statistics(self, arrays: Arrays, count: int, thorough: bool) -> tuple[list[int], dict[Scale, IntArray]]:
+        """The touches of each of so many materials, or labels, and their rows by scale."""
+        touches = self._check_touches(arrays, count)
+        totals = {scale: self._check_sums(arrays, scale, count, thorough) for scale in self._plan.scales}
+        expect(all(touches), "observations", "a touch or more of each material", touches)
+        for view in self._plan.views:
+            expect(bool((totals[view] >= touches).all()), f"rows-{view}", "a row or more of each touch", totals[view])
+        return touches, totals
 
     def _check_touches(self, arrays: Arrays, count: int) -> list[int]:
         observations = array(arrays, "observations", ("int64",), (count,))

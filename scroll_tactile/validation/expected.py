@@ -15,8 +15,10 @@ from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.memory.descriptions import checked
 from scroll_tactile.memory.touch_rows import (
     CODES,
+    DECLARE,
     DESCRIBE,
     KINDS,
+    LABELS,
     LARGEST_EXPONENT,
     MEMBER,
     MOST_BYTES,
@@ -27,14 +29,18 @@ from scroll_tactile.memory.touch_rows import (
     PACKED_ZERO,
     RETRACT,
     SOURCE,
+    VALUES,
     Arrays,
+    declaration,
     only_readings,
     unpack_readings,
 )
+from scroll_tactile.quantities import MOST_QUANTITIES, MOST_STEPS, Quantity
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name, require_source
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import MOST_WINDOWS, WindowPlan
+from scroll_tactile.statistics.annotations import MOST_AXES
 from scroll_tactile.statistics.grid import BITS
 from store import Head, Record
 from store.records import LateArray
@@ -45,7 +51,9 @@ __all__ = [
     "RowChecks",
     "Unexpected",
     "array",
+    "check_annotation",
     "check_description",
+    "check_quantity",
     "check_readings",
     "check_values",
     "codes",
@@ -119,7 +127,14 @@ def array(
 def check_values(values: npt.NDArray[Any] | LateArray, check: Callable[[npt.NDArray[Any]], None]) -> None:
     """Check values; those that are read later, then."""
     if isinstance(values, LateArray):
-        values.check = check
+        before = values.check
+
+        def both(read: npt.NDArray[Any]) -> None:
+            if before is not None:
+                before(read)
+            check(read)
+
+        values.check = both
     else:
         check(values)
 
@@ -172,12 +187,15 @@ class RowChecks:
             expect(len(head.key) == KEY_BYTES, "key", f"{KEY_BYTES} bytes", head.key)
             if SOURCE in head.attributes:
                 source(SOURCE, head.attributes[SOURCE])
+            check_annotation("", head.attributes)
         if head.kind == OBSERVE:
             self._check_observation(head.attributes)
         elif head.kind == RETRACT:
             if head.label:
                 name("label", head.label)
             _check_spans(head.attributes.get("sequences"), head.sequence, most_rows())
+        elif head.kind == DECLARE:
+            check_quantity("quantity", head.label, head.attributes)
         elif head.kind == DESCRIBE:
             name("label", head.label)
             expect("constituents" in head.attributes, "constituents", "a description", None)
@@ -260,6 +278,30 @@ def check_description(field: str, material: str, constituents: Any) -> None:
         raise Unexpected(f"{field}: {error}") from None
     same = all(type(value) is type(kept[constituent]) for constituent, value in constituents.items())
     expect(same, field, "shares as floats", constituents)
+
+
+def check_annotation(field: str, attributes: Mapping[str, Any]) -> None:
+    """Raise Unexpected for values or labels of a touch that `observe` would not keep; field: where they lie."""
+    for what, most in ((VALUES, MOST_QUANTITIES), (LABELS, MOST_AXES)):
+        if what in attributes:
+            told = attributes[what]
+            expect(isinstance(told, dict) and 0 < len(told) <= most, field + what, f"1 to {most} by name", told)
+            for named, value in told.items():
+                name(field + what, named)
+                whole(field + what, value, 0, MOST_STEPS) if what == VALUES else name(field + what, value)
+
+
+def check_quantity(field: str, named: str, attributes: Mapping[str, Any]) -> Quantity:
+    """The quantity of a name; Unexpected for what could not be declared."""
+    fields: dict[str, Any] = {own: attributes.get(own) for own in ("unit", "low", "high", "resolution")}
+    numbers = all(type(fields[own]) is float for own in ("low", "high", "resolution"))
+    expect(numbers and isinstance(fields["unit"], str), field, "a unit, a range and a resolution", fields)
+    try:
+        quantity = Quantity(name=name(field, named), **fields)
+    except InputError as error:
+        raise Unexpected(f"{field}: {error}") from None
+    expect(repr(declaration(quantity)) == repr(fields), field, "what `declare` keeps", fields)
+    return quantity
 
 
 def _unpacked(packed: Arrays, size: int, sensor: Sensor) -> npt.NDArray[np.float32]:

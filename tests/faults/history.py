@@ -143,10 +143,14 @@ class History(RuleBasedStateMachine):
         sides: tuple[list[Any], list[Any]] = ([], [])
         for pair in self.state.pairs:
             sides[rng.randrange(2)].append(pair)
-        ours, theirs = (fed(tuple(side), self.state.embedding).memory.statistics for side in sides)
+        memories = [fed(tuple(side), self.state.embedding).memory for side in sides]
+        ours, theirs = (memory.statistics for memory in memories)
         whole = self.learner.memory.statistics
         assert ours + theirs == whole
         assert whole - ours == theirs
+        of_ours, of_theirs = (memory.targets for memory in memories)
+        assert of_ours + of_theirs == self.learner.memory.targets
+        assert self.learner.memory.targets - of_ours == of_theirs
         assert whole - whole == Statistics(SMALL.dimension, whole.scales)
 
     @invariant()

@@ -10,6 +10,7 @@ import hashlib
 import itertools
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,29 +21,45 @@ from touches import PAD, SETTINGS, SMALL, SmallSample, stream
 
 import scroll_tactile.memory.state
 from faults.model import Operation, Pairs, State, Touch
-from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.persistence.merge import MergeRules
 from store import check_store
 
+FORCE = Quantity(name="force", unit="N", low=0, high=1, resolution=0.01)
+VALUED = 5  # the seed of the touches that have a value
 SEEDS = 6  # few touches, so that the same is observed again, by this memory and by those merged into it
 LENGTHS = (2, 16, 25, 40, 60, 90, 120)  # the widest scale needs 37, a fine-tune some of two materials
 
 
 @dataclass
 class Kit:
-    """What touches are, their names, and what memories are made with; embeddings: by the names that a `State` has."""
+    """What touches are, their names, and what memories are made with; embeddings: by the names that a `State` has.
+
+    noted: values and labels of a touch.
+    """
 
     touches: tuple[Touch, ...]
     stream: Callable[[Touch], Any]
+    noted: Callable[[Touch], tuple[dict[str, float], dict[str, str]]]
     materials: tuple[str, ...]
     settings: dict[str, Any]
     embeddings: dict[str, Any]
 
 
+def noted(touch: Touch) -> tuple[dict[str, float], dict[str, str]]:
+    """Half of the touches have a label, some of these another on a second axis; a sixth have a value, too."""
+    seed, length = touch
+    if seed % 3 and seed != VALUED:
+        return {}, {}
+    labels = {"slip": "north" if length % 4 else "south"} | ({"grip": "firm"} if length % 5 else {})
+    return {"force": (length % 7) / 10} if seed == VALUED else {}, labels
+
+
 KIT = Kit(
     tuple(itertools.product(range(SEEDS), LENGTHS)),
     stream,
+    noted,
     ("a", "b", "c", "ü"),
     # Fewer kept touches than are observed, so that what was left out of them has to come back.
     SETTINGS | {"kept_touches": 5},
@@ -77,8 +94,9 @@ def opened(path: Path, mode: Any = "write", **more: Any) -> TactileLearner:
 def fed(pairs: Pairs, embedding: str = "own", **more: Any) -> TactileLearner:
     """A memory without a path of these touches."""
     learner = TactileLearner(**KIT.settings | {"embedding": KIT.embeddings[embedding]} | more)
+    learner.declare(FORCE)
     for material, touch in pairs:
-        learner.observe(material, KIT.stream(touch), again=True)
+        _observe(learner, Path(), material, touch)
     return learner
 
 
@@ -92,7 +110,12 @@ def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
 
 
 def _observe(learner: TactileLearner, _: Path, material: str, touch: Touch, again: bool = True) -> int:
-    return learner.observe(material, KIT.stream(touch), again=again).sequence
+    values, labels = KIT.noted(touch)
+    if values and not learner.quantities:  # durable together
+        with learner.batch():
+            learner.declare(FORCE)
+            return _observe(learner, _, material, touch, again)
+    return learner.observe(material, KIT.stream(touch), values=values, labels=labels, again=again).sequence
 
 
 def _batch(learner: TactileLearner, home: Path, operations: tuple[Operation, ...]) -> list[Any]:
@@ -143,8 +166,9 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
         pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.copies)).encode())
+        pool.update(repr(touch.annotations).encode())
     arrays, materials = ({}, None) if memory.kept is None else memory.kept.to_arrays()
-    kept = hashlib.sha256(repr(materials).encode())
+    kept = hashlib.sha256(repr((materials, [touch.annotations for *_, touch in memory.kept or ()])).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())
     return {"digest": learner.digest(), "pool": pool.hexdigest(), "kept": kept.hexdigest()}
@@ -163,6 +187,8 @@ def seen(learner: TactileLearner) -> dict[str, Any]:
     return held(learner) | {
         "embedding": learner.embedding.fingerprint,  # memories without a touch differ in nothing else
         "materials": learner.materials,
+        "axes": learner.axes,
+        "quantities": sorted(learner.quantities),
         "names": {touch: names for touch, names in named if names},
         "descriptions": learner.descriptions,
         "tuned": learner.tuned_digest(),
@@ -180,12 +206,21 @@ def expected(state: State) -> dict[str, Any]:
     return _held(state.pairs, state.embedding) | {
         "embedding": KIT.embeddings[state.embedding].fingerprint,
         "materials": state.materials,
+        "axes": _axes(state.pairs),
+        "quantities": ["force"] if state.declared else [],
         "names": names,
         "descriptions": state.said,
         "tuned": None if state.tuned is None else tuned_digest(state.tuned, state.embedding),
         "last": state.last,
         "compacted": state.compacted,
     }
+
+
+def _axes(pairs: Pairs) -> dict[str, dict[str, int]]:
+    """Axis → label → touches."""
+    found = Counter(told for _, touch in pairs for told in KIT.noted(touch)[1].items())
+    axes = dict.fromkeys(sorted({axis for axis, _ in found}))
+    return {axis: {label: found[one, label] for one, label in sorted(found) if one == axis} for axis in axes}
 
 
 @functools.lru_cache(maxsize=4096)

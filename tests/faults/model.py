@@ -1,8 +1,9 @@
 """The dumb model of a memory: the rows that were acknowledged, which cannot go wrong, and what operations make of them.
 
 A row is ("observe", material, touch), ("retract", sequences, material or ""), ("describe", material, constituents),
-("merge", pairs), what a compacted memory brought, or ("member", material, touch), a touch that it had. All in all they
-are a multiset of (material, touch).
+("merge", pairs), what a compacted memory brought, ("member", material, touch), a touch that it had, or ("declare",), of
+the quantity that some touches have a value of. All in all they are a multiset of (material, touch); what is noted of a
+touch follows from it.
 
 An operation is a tuple: ("observe", material, touch, again), ("batch", operations), ("retract", sequence),
 ("forget", material), ("relabel", sequence, material), ("describe", material, constituents or None),
@@ -94,6 +95,11 @@ class State:
         return said
 
     @property
+    def declared(self) -> bool:
+        """Whether the quantity was declared."""
+        return ("declare",) in self.rows
+
+    @property
     def loose(self) -> list[int]:
         """The observations that can still be retracted."""
         return [at for at, row in self.standing if row[0] == "observe" and at > self.compacted]
@@ -123,7 +129,8 @@ class State:
 
     def pack(self, *, rows: bool) -> State:
         """The packed memory that is made of it; its rows stay behind where any are missing."""
-        told = tuple(self.rows[sequence - 1] for sequence, _ in self.listed)
+        told = (("declare",),) if self.declared else ()
+        told += tuple(self.rows[sequence - 1] for sequence, _ in self.listed)
         told += tuple(("describe", material, tuple(said.items())) for material, said in self.said.items())
         if rows and self.whole:
             return State(told, embedding=self.embedding)
@@ -144,6 +151,10 @@ def _observe(state: State, _: Others, material: str, touch: Touch, again: bool =
     there = [sequence for sequence, pair in state.listed if pair == (material, touch)]
     if there and not again:
         return state, min(there)
+    from faults.learners import KIT
+
+    if KIT.noted(touch)[0] and not state.declared:
+        state = state.plus(("declare",))
     return state.plus(("observe", material, touch)), state.last + 1
 
 
@@ -220,7 +231,8 @@ def _merge(
         return ours, "MismatchError"
     new = {name: said for name, said in new.items() if descriptions != "ours" or name not in ours.said}
     coming = [(sequence, row) for sequence, row in theirs.standing if sequence not in out]
-    added: list[Row] = [("describe", name, tuple(said.items())) for name, said in new.items()]
+    added: list[Row] = [("declare",)] if theirs.declared and not ours.declared else []
+    added += [("describe", name, tuple(said.items())) for name, said in new.items()]
     added += [("merge", theirs.stands)] if theirs.compacted else []
     for sequence, row in coming:
         if sequence > theirs.compacted:

@@ -84,7 +84,8 @@ def _material(rng: random.Random, state: State) -> str:
 def _of_one_name(rng: random.Random, state: State) -> tuple[tuple[str, Touch], ...]:
     """Touches, some of which are there, in this list or in the memory; each content under one name only."""
     names = {touch: material for _, (material, touch) in state.listed}
-    drawn = [touch(rng) for _ in range(rng.randrange(1, 6))]
+    bare = [one for one in KIT.touches if not any(KIT.noted(one))]  # what is in a file has no values or labels
+    drawn = [rng.choice(bare) for _ in range(rng.randrange(1, 6))]
     return tuple((names.setdefault(one, rng.choice(KIT.materials)), one) for one in drawn)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import store.backup
 from faults.cases import Wrong
-from faults.learners import KIT
+from faults.learners import KIT, perform
 from faults.model import after
 from faults.plans import draw, touch
 from faults.simulation_disk import abandon
@@ -121,7 +121,7 @@ class OneMemory(World):
             then, _ = after(state, observation, {})
 
         def between() -> None:
-            learner.observe(observation[1], KIT.stream(observation[2]), again=True)
+            perform(learner, observation, machine.path)
             learner._ledger.require_writing()  # passes over the failure of an earlier checkpoint
             learner._ledger._write_checkpoint()
 

@@ -58,6 +58,7 @@ def prepare() -> None:
     warnings.simplefilter("ignore", RangeWarning)
     simulation_disk.prepare()
     KIT.touches, KIT.stream, KIT.materials = tuple(range(9)), stream, ("a", "b", "ü")
+    KIT.noted = lambda touch: ({}, {"slip": f"{touch % 2}"} if touch % 3 == 0 else {})
     KIT.embeddings = {name: Tiny(name) for name in ("own", "other")}
     KIT.settings = {"sensor": PAD, "exemplars": 1, "kept_touches": 3, "embedding": KIT.embeddings["own"]}
     scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]

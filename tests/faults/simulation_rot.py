@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from faults.cases import Wrong
-from faults.learners import KIT
+from faults.learners import KIT, perform
 from faults.model import State
 from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
 from faults.simulation_events import OneMemory
@@ -148,7 +148,7 @@ class Rotting(OneMemory):
         try:
             for candidate in (rows, rows.plus(("observe", KIT.materials[0], 0))):
                 if candidate is not rows:
-                    learner.observe(KIT.materials[0], KIT.stream(0), again=True)
+                    perform(learner, ("observe", KIT.materials[0], 0), machine.path)
                 machine.candidates = [candidate]
                 self.look(machine, learner, "repaired with less", but=("listed", "names", *KEPT))
         finally:

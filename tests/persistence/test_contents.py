@@ -11,6 +11,7 @@ from touches import fed, filled, held, stream
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.simulation.scene import Scene
+from scroll_tactile.statistics.annotations import NO_ANNOTATION
 from store import StoreClosedError, StoreError, StoreFullError
 from store.log_writer import LogWriter
 
@@ -141,10 +142,10 @@ def many(touches, **settings):
 
 
 def test_a_row_that_is_not_there_is_no_error():
-    held = ListedContents([("a", b"1", 1)])
+    held = ListedContents([("a", b"1", 1, NO_ANNOTATION)])
     held.remove("a", b"1", 2)
     held.remove("b", b"2", 1)
-    assert held.names(b"1") == ["a"] and held.find("a", b"1") == 1 and held.find("a", b"3") is None
+    assert held.names(b"1") == ["a"] and [*held.rows("a", b"1")] == [1] and not held.rows("a", b"3")
 
 
 def given(pair):

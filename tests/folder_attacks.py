@@ -212,7 +212,26 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "an escape for a source": ("printable", {"attributes": {"columns": 60, "nbytes": 480, "source": "\x1b[2J"}}),
     "a long source": ("1 to 1000", {"attributes": {"columns": 60, "nbytes": 480, "source": "x" * 10**6}}),
     "no text for a source": ("as a string", {"attributes": {"columns": 60, "nbytes": 480, "source": ["x"]}}),
+    **{
+        f"{which} {told}"[:40]: (which, {"attributes": {"columns": 60, "nbytes": 480, which: told}})
+        for which, several in {
+            "values": [None, [], {}, {"force": 1.5}, {"force": True}, {"force": -1}, {"force": 2**20 + 1}, {"": 1}],
+            "labels": [None, {}, {"slip": 3}, {"slip": ""}, {"\x1b[2J": "x"}, {str(i): "x" for i in range(17)}],
+        }.items()
+        for told in several
+    },
 }
+# Of a row that declares a quantity: its name and attributes.
+QUANTITY: dict[str, Any] = {"unit": "N", "low": 0.0, "high": 1.0, "resolution": 0.01}
+QUANTITIES: list[tuple[str, Any]] = [
+    *((label, QUANTITY) for label in ("", "\x1b[2J", "x" * 201)),
+    *(
+        ("force", QUANTITY | change)
+        for change in ({"unit": 3}, {"unit": ""}, {"low": 0}, {"low": 1.0}, {"high": 1e300})
+    ),
+    *(("force", QUANTITY | change) for change in ({"resolution": 0.0}, {"resolution": "x"}, {"resolution": True})),
+    ("force", {}),
+]
 CONSTITUENTS = ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}]
 
 

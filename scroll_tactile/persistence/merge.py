@@ -25,13 +25,18 @@ from scroll_tactile.memory.touch_rows import (
     annotated,
     annotation_of,
     declaration,
-    declared_by,
 )
 from scroll_tactile.persistence.contents import ListedContents, StoredContents, refusal
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import apply_description, replay
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.validation.gate import MemoryStore, require_counted, wrong_retractions
+from scroll_tactile.validation.gate import (
+    MemoryStore,
+    quantities_of,
+    require_counted,
+    wrong_retractions,
+    wrong_values,
+)
 from store import Checkpoint, Head, Record, Store
 from store.files import same_folder
 
@@ -99,8 +104,8 @@ class MergePlan:
         hash to its key, in either memory.
         """
         _require_mergeable(ours, memory, theirs)
-        quantities = _quantities(ours, memory, theirs)
         compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
+        quantities = _quantities(ours, memory, theirs, found, heads)
         if found is not None:
             require_counted(theirs.path, found, heads)
         incoming = active_rows(heads)
@@ -205,17 +210,21 @@ def _row(contents: ListedContents | StoredContents, head: Head) -> int | None:
     return min(contents.rows(head.label, head.key), default=None)
 
 
-def _quantities(ours: Store, memory: Memory, theirs: MemoryStore) -> list[Quantity]:
+def _quantities(
+    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, heads: Sequence[Head]
+) -> list[Quantity]:
     """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
-    new: dict[str, Quantity] = {}
-    for head in theirs.heads(kind=DECLARE):
-        quantity = declared_by(head)
+    declared = quantities_of(compaction)
+    for wrong in wrong_values(theirs.path, (head for head in heads if head.sequence > theirs.compacted), declared):
+        raise wrong
+    both = dict(memory.quantities)
+    for name, quantity in sorted(declared.items()):
         try:
-            if require_declarable(memory.quantities | new, quantity):
-                new[quantity.name] = quantity
+            require_declarable(both, quantity)
         except AnnotationError as error:
             raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {error}") from None
-    return list(new.values())
+        both[name] = quantity
+    return [quantity for name, quantity in both.items() if name not in memory.quantities]
 
 
 def _require_same_annotations(

@@ -22,7 +22,6 @@ from scroll_tactile.memory.touch_rows import (
     Codes,
     active_rows,
     annotation_of,
-    declared_by,
     only_readings,
     retracted_by,
     unpack_readings,
@@ -30,6 +29,7 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.statistics.annotations import Annotation, Annotations, together
+from scroll_tactile.validation.gate import misdeclared, wrong_values
 from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
@@ -88,6 +88,7 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
     CapacityError before anything is added.
     """
     changed: list[Added] | None = []
+    apply_declaration(memory.quantities, record, store)
     if record.kind == OBSERVE:
         steps = cast(int, record.attributes["columns"])
         codes = memory.codes(record)[1] if codes is None else codes
@@ -95,7 +96,6 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         wanted = memory.kept is not None and memory.kept.wants(record.label, record.key)
         readings = unpack_readings(record.arrays) if wanted else None
         annotation = annotation_of(record.attributes)
-        _require_declared(memory, record, annotation, store)
         memory.add(record.label, record.key, steps, codes, record.sequence, source, readings, annotation)
         changed = [Added(record.label, codes, 1, annotation.labels)]
     elif record.kind == RETRACT:
@@ -115,7 +115,6 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
     else:
         assert record.kind in (MEMBER, DESCRIBE, DECLARE), "the gate lets no other row through"
     apply_description(memory.descriptions, record)
-    apply_declaration(memory.quantities, record, store)
     memory.sequence = record.sequence
     return changed
 
@@ -136,29 +135,12 @@ def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> A
     )
 
 
-def _require_declared(memory: Memory, record: Record, annotation: Annotation, store: Store) -> None:
-    """Raise DamageError for a value of a quantity that no row before this one declared, or outside of its range."""
-    for name, steps in annotation.values:
-        quantity = memory.quantities.get(name)
-        if quantity is None or steps > quantity.steps:
-            raise _misdeclared(record, store, f"a value of {name!r}, {steps} steps, of {quantity or 'no quantity'}")
-
-
-def _misdeclared(row: Head, store: Store, what: str) -> DamageError:
-    return DamageError(
-        f"row {row.sequence} of {store.path} has {what}: it is damaged, or was made by another program "
-        "(scroll-tactile memory check)",
-        path=store.path,
-        sequence=row.sequence,
-    )
-
-
 def _join(memory: Memory, record: Record, store: Store) -> None:
     """Add another memory of the same recipe, from a row with the arrays and attributes of its compaction checkpoint."""
     other = memory.empty_like().fill(record.arrays, record.attributes, source=record.sequence)
     for name, quantity in other.quantities.items():
         if memory.quantities.get(name) != quantity:
-            raise _misdeclared(record, store, f"values of {quantity}, which is not what was declared")
+            raise misdeclared(store.path, record, f"values of {quantity}, which is not what was declared")
     memory.join(other, exemplars="exemplar-readings" in record.arrays)
 
 
@@ -168,12 +150,10 @@ def apply_description(descriptions: dict[str, Description], row: Head | Record) 
         describe(descriptions, row.label, row.attributes.get("constituents"))
 
 
-def apply_declaration(quantities: dict[str, Quantity], row: Head | Record, store: Store) -> None:
-    """Apply a journal row to the declared quantities. Raises DamageError for one that was declared otherwise."""
-    if row.kind == DECLARE:
-        quantity = declared_by(row)
-        if quantities.setdefault(quantity.name, quantity) != quantity:
-            raise _misdeclared(row, store, f"{quantity}, which was declared as {quantities[quantity.name]}")
+def apply_declaration(quantities: dict[str, Quantity], row: Head, store: Store) -> None:
+    """Apply a journal row to the declared quantities. Raises DamageError for a value or a quantity that cannot be."""
+    for wrong in wrong_values(store.path, [row], quantities):
+        raise wrong
 
 
 def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Added] | None:

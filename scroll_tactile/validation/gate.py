@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
@@ -23,7 +23,17 @@ from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
-from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE, RETRACT, unspanned
+from scroll_tactile.memory.touch_rows import (
+    DECLARE,
+    MEMBER,
+    MERGE,
+    OBSERVE,
+    RETRACT,
+    annotation_of,
+    declared_by,
+    unspanned,
+)
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.validation.checkpoint_checks import CheckpointChecks
@@ -40,9 +50,12 @@ __all__ = [
     "beside",
     "check_memory",
     "finish_interrupted",
+    "misdeclared",
     "open_memory",
+    "quantities_of",
     "require_counted",
     "wrong_retractions",
+    "wrong_values",
 ]
 
 SMALLEST_ROW = 128  # bytes of the log: a frame and a row without texts
@@ -258,7 +271,7 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
         heads, wrong = _in_rows(store)
         passed = [head for head in heads if head.sequence not in wrong]
         retractions = map(str, wrong_retractions(store.path, passed))
-        return [*_in_checkpoints(store, heads), *wrong.values(), *retractions]
+        return [*_in_checkpoints(store, heads), *wrong.values(), *retractions, *_in_values(store, passed)]
 
 
 def _in_checkpoints(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
@@ -268,6 +281,15 @@ def _in_checkpoints(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
                 require_counted(store.path, checkpoint, heads)
         except DamageError as damage:
             yield str(damage)
+
+
+def _in_values(store: MemoryStore, heads: list[Head]) -> list[str]:
+    try:
+        quantities = quantities_of(store.compaction())
+    except DamageError:  # it is told of already, and what was declared is not known
+        return []
+    later = (head for head in heads if head.sequence > store.compacted)
+    return [str(wrong) for wrong in wrong_values(store.path, later, quantities)]
 
 
 def _in_rows(store: MemoryStore) -> tuple[list[Head], dict[int, str]]:
@@ -297,6 +319,40 @@ def wrong_retractions(path: Path, heads: Sequence[Head]) -> Iterator[DamageError
                 sequence=head.sequence,
             )
         kinds.update((sequence, RETRACT) for sequence in gone)
+
+
+def wrong_values(path: Path, heads: Iterable[Head], quantities: dict[str, Quantity]) -> Iterator[DamageError]:
+    """What is wrong with the rows, in order, that have a value of no quantity, or declare one otherwise.
+
+    quantities: those that were declared before; what the rows declare is added.
+    """
+    for head in heads:
+        if head.kind == DECLARE:
+            quantity = declared_by(head)
+            if quantities.setdefault(quantity.name, quantity) != quantity:
+                before = quantities[quantity.name]
+                yield misdeclared(path, head, f"{quantity}, which was declared as {before}")
+        elif head.kind in (OBSERVE, MEMBER):
+            for name, steps in annotation_of(head.attributes).values:
+                known = quantities.get(name)
+                if known is None or steps > known.steps:
+                    yield misdeclared(path, head, f"a value of {name!r}, {steps} steps, of {known or 'no quantity'}")
+
+
+def misdeclared(path: Path, row: Head, what: str) -> DamageError:
+    """The error for a row that has something that cannot be after the rows before it."""
+    return DamageError(
+        f"row {row.sequence} of {path} has {what}: it is damaged, or was made by another program (scroll-tactile "
+        "memory check)",
+        path=path,
+        sequence=row.sequence,
+    )
+
+
+def quantities_of(compaction: Checkpoint | None) -> dict[str, Quantity]:
+    """The quantities that were declared up to a compaction checkpoint; none without one."""
+    declared = {} if compaction is None else cast("dict[str, Any]", compaction.attributes.get("quantities", {}))
+    return {name: Quantity(name=name, **fields) for name, fields in declared.items()}
 
 
 def _rows(store: MemoryStore) -> Iterator[Head]:

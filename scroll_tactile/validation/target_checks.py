@@ -44,7 +44,8 @@ def check_targets(
     for which, of in zip(ANNOTATED, SAMPLES, strict=True):
         if of in attributes:
             copies = attributes["copies"] if of == "sample" else [touches[material] for material in attributes[of]]
-            _check_annotations(which, attributes.get(which), copies, quantities, axes)
+            noted = _check_annotations(which, attributes.get(which), copies, quantities, axes)
+            expect(noted <= about["touches"], which, f"those of {about['touches']} touches", noted)
 
 
 def _quantities(declared: Any) -> dict[str, Quantity]:
@@ -87,8 +88,8 @@ def _axes(told: Any) -> dict[str, list[str]]:
 
 def _check_annotations(
     field: str, told: Any, copies: Sequence[int], quantities: Mapping[str, Quantity], axes: Mapping[str, list[str]]
-) -> None:
-    """Check how the touches of a sample were annotated; copies: at most so many of each."""
+) -> int:
+    """How many observations of the touches of a sample were annotated; copies: at most so many of each."""
     expect(isinstance(told, list) and len(told) == len(copies), field, "one of each touch", told)
     for of, most in zip(told, copies, strict=True):
         pairs = isinstance(of, list) and all(isinstance(each, list) and len(each) == 2 for each in of)
@@ -103,3 +104,4 @@ def _check_annotations(
             for axis, label in attributes.get(LABELS, {}).items():
                 expect(label in axes.get(axis, ()), field, "labels that touches have", attributes)
         expect(sum(count for _, count in of) <= most, field, f"at most {most} observations", of)
+    return sum(count for of in told for _, count in of)

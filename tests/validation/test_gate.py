@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from folder_attacks import CONSTITUENTS, ROW, ROWS, description, identities, row
+from folder_attacks import CONSTITUENTS, QUANTITIES, QUANTITY, ROW, ROWS, description, identities, row
 from forging import checkpoint_of, copied, get_identity, put_arrays, put_checkpoint, put_row, row_of, seal, set_identity
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from touches import PAD, SETTINGS, filled, held, stream
 
-from scroll_tactile import Augmented, Kernels, TactileLearner
+from scroll_tactile import Augmented, Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.touch_rows import pack_readings
 from scroll_tactile.pipelines.plain_export import export_plain
@@ -38,10 +38,15 @@ STORED = SETTINGS | {"embedding": Inexact(seed=0, dimension=64)}
 def made(tmp_path_factory):
     """A memory with a checkpoint, one as if its power had failed, one with codes in its rows, and a compacted one."""
     folder = tmp_path_factory.mktemp("made")
-    for name, settings_ in (("whole", {}), ("coded", STORED), ("compacted", {}), ("other", {})):
+    kinds = (("whole", {}), ("coded", STORED), ("compacted", {}), ("other", {}), ("noted", {}))
+    for name, settings_ in kinds:
         learner, _ = (
             filled(folder / name, OTHER, **settings_) if name == "other" else filled(folder / name, **settings_)
         )
+        if name == "noted":
+            learner.declare(Quantity(name="force", **QUANTITY))
+            learner.observe("a", stream((8, 60)), values={"force": 0.5}, labels={"slip": "north"})
+            learner.observe("b", stream((9, 60)), labels={"slip": "south"})
         learner.describe("a", {"wool": 0.5, "silk": 0.5})
         if name == "compacted":
             learner.compact()
@@ -81,16 +86,17 @@ def require_refused(path, match, expected=DamageError, others=None, modes=("read
     assert any(found for found in check_memory(path))
 
 
-def readings_row(path, **changes):
-    """A row of readings with some of its arrays changed; None leaves one out."""
+def readings_row(path, values=None, **changes):
+    """A row of readings, and of values, with some of its arrays changed; None leaves one out."""
     touch = validate(stream((20, 60)), PAD)
     arrays = {**pack_readings(touch.readings), **changes}
     arrays = {name: array for name, array in arrays.items() if array is not None}
-    return put_row(path, key=touch.key, attributes={"columns": 60, "nbytes": 480}, payload=arrays)
+    attributes = {"columns": 60, "nbytes": 480} | ({} if values is None else {"values": values})
+    return put_row(path, key=touch.key, attributes=attributes, payload=arrays)
 
 
 def test_a_sound_memory_has_nothing_that_is_found(made):
-    for name in ("whole", "coded", "compacted", "other"):
+    for name in ("whole", "coded", "compacted", "other", "noted"):
         assert check_memory(made / name) == []
 
 
@@ -194,6 +200,10 @@ def attributed(name, value):
     return checkpoint(lambda attributes, arrays: attributes.update({name: value}))
 
 
+def targeted(name, value):
+    return checkpoint(lambda attributes, _: attributes.update(targets=attributes["targets"] | {name: value}))
+
+
 def pairs(values_by_name):
     return ((name, value) for name, values in values_by_name.items() for value in values)
 
@@ -250,7 +260,51 @@ ABOUT = {
     "tuned_last_sequence": [None, -1, 10**9, "x"],
     "tuned": [None, {}, {"names": ["a"], "mode": "head", "kept": True, "report": {}}],
 }
-IN_GENERATIONS = "observations|lengths|rows|sums|second|values|places|sample|kept|exemplar|retracted|excluded"
+AXIS = {
+    "axis-0-observations": [lambda a: a - 1, lambda a: a + 20, lambda a: None],
+    "axis-0-rows-15": [lambda a: a * 0, lambda a: a + 10**6],
+    "axis-0-sums-15": [lambda a: a + 2**62, lambda a: a[:1], lambda a: None],
+    "axis-0-values-15": [lambda a: a[::-1], lambda a: a * 0],
+    "axis-0-places-15": [lambda a: a[:, :-1], lambda a: None],
+    "quantity-sums": [
+        lambda a: a[:0],
+        lambda a: a.astype(float),
+        lambda a: a * 0,
+        lambda a: a * 20,
+        lambda a: a * [1, 2, 1],
+    ],
+}
+NOTED = [[{"values": {"force": 50}, "labels": {"slip": "north"}}, 1]]
+TOLD = {
+    "quantities": [None, [], {"force": 3}, {"speed": QUANTITY}, {"force": QUANTITY | {"low": 0}}],
+    "targets": [None, [], {}, {"touches": 1}],
+    "touches": [None, 0, 10**6, True],
+    "total": [None, 3, "", "x" * 64],
+    "sums": [None, [3], [["force"]], [["speed", "a"]], [["force", "z"]], [["force", "a"]] * 2],
+    "axes": [
+        None,
+        {},
+        [3],
+        [["slip"]],
+        [["slip", []]],
+        [["slip", ["north", "north"]]],
+        [["slip", ["x"]], ["slip", []]],
+    ],
+    "sample-annotations": [
+        None,
+        [],
+        [[]],
+        {},
+        [3] * 14,
+        [NOTED] * 14,
+        [[[{}, 1]]] * 14,
+        [[[{"labels": {"slip": "x"}}, 1]]] * 14,
+    ],
+    "kept-annotations": [None, [[[{"values": {"force": 101}}, 1]]] * 14, [[[NOTED[0][0], 0]]] * 14, [NOTED * 20] * 14],
+}
+IN_GENERATIONS = (
+    "axis|quantity|observations|lengths|rows|sums|second|values|places|sample|kept|exemplar|retracted|excluded"
+)
 
 
 def forged_rows():
@@ -263,6 +317,19 @@ def forged_rows():
         yield f"a retraction of {spans}", retraction(spans), "sequences: expected", DamageError
     for said in CONSTITUENTS:
         yield f"a description {said}", description(said), "constituents", DamageError
+    for label, said in QUANTITIES:
+        yield (
+            f"a quantity {label[:9]} {said}"[:60],
+            row(kind="declare", label=label, attributes=said),
+            "quantity",
+            DamageError,
+        )
+    undeclared = packed_row(values={"force": 1})
+    yield "an undeclared value", undeclared, "a value of 'force', 1 steps, of no quantity", DamageError
+    declared = [row(kind="declare", label="force", attributes=QUANTITY | {"unit": unit}) for unit in ("N", "mN")]
+    yield "two units", one_after_another(*declared), r"was declared as force \[N\]", DamageError
+    beyond = packed_row(values={"force": 101})
+    yield "a value beyond", one_after_another(declared[0], beyond), r"'force', 101 steps, of force \[N\]", DamageError
     twice = one_after_another(retraction([[1, 1]]), retraction([[1, 1]]))
     yield "a retracted description", retraction([[13, 13]]), "retracts", DamageError
     yield "two retractions", twice, "retracts", DamageError
@@ -295,6 +362,18 @@ def forged_memories():
         yield f"identity: {name}", "whole", do, match, expected
     for i, (name, spoil) in enumerate(pairs(SUMS)):
         yield f"{name} {i}", "whole", summed(name, spoil), f"checkpoint 1 .*: ({IN_GENERATIONS})", DamageError
+    for i, (name, spoil) in enumerate(pairs(AXIS)):
+        yield f"{name} {i}", "noted", summed(name, spoil), f"checkpoint 1 .*: ({IN_GENERATIONS})", DamageError
+    for name, value in pairs(TOLD):
+        inside = name in ("touches", "total", "sums", "axes")
+        do = targeted(name, value) if inside else attributed(name, value)
+        yield (
+            f"{name} {value}"[:60],
+            "noted",
+            do,
+            "checkpoint 1 .*(quantities|quantity|targets|annotations)",
+            DamageError,
+        )
     for name, value in pairs(ABOUT):
         said = f"checkpoint 1 .*({name}|tuned|exemplar)"
         yield f"{name} {str(value)[:40]}", "whole", attributed(name, value), said, DamageError

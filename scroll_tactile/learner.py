@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import DescriptionError, RangeWarning
+from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.persistence.keeper import MemoryKeeper
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.prediction.features import Readings
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.prediction.reembedding import embed_again
 from scroll_tactile.recipe import Recipe, RecipeRequest
-from scroll_tactile.results import Composition, Merged, Prediction, Receipt
+from scroll_tactile.results import Composition, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.copies import Augmented
@@ -190,8 +189,7 @@ class TactileLearner(MemoryKeeper):
         touch = predictor.extractor.verified().stream(stream)
         learned = predictor.extractor.learned(touch)
         receipt = predictor.ledger.observe(material, touch, *learned, source, noted, again=again)
-        with predictor.ledger.lock:
-            predictor.current.prepare(predictor.ledger)
+        predictor.prepare()
         if not self._range_warned and (problem := range_problem(touch)) is not None:
             self._range_warned = True
             warnings.warn(problem, RangeWarning, stacklevel=2)
@@ -204,30 +202,6 @@ class TactileLearner(MemoryKeeper):
         """
         touch = self._predictor.extractor.stream(stream)
         return self._ledger.names(touch.key)
-
-    def merge(
-        self,
-        other: TactileLearner | str | os.PathLike[str],
-        *,
-        shared: Literal["once", "twice"],
-        descriptions: Choice = "same",
-        progress: Callable[[str, int, int], object] | None = None,
-    ) -> Merged:
-        """Add everything that another memory observed; durable, as a whole, when this returns.
-
-        other: a memory with a path, its path, or a file that `pack` wrote; it stays as it is. shared: whether a stream
-        that both observed (one material, one content hash) counts once or twice. Receipts of the other memory are not
-        receipts of this one.
-        descriptions: which to keep of a material that both describe: "ours", "theirs", or "same", if they must agree.
-
-        Raises MismatchError for a memory of another sensor, embedding or grid, and for a different description where
-        they must agree; ObservationError where a shared stream was compacted and cannot be left out; CapacityError,
-        InputError, StoreError. Nothing was changed then.
-        """
-        path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
-        require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
-        rules = MergeRules(once=shared == "once", descriptions=descriptions)
-        return self._ledger.merge(path, rules, progress or _silent)[0]
 
     def reembed(
         self, embedding: Embedding | None = None, *, progress: Callable[[str, int, int], object] | None = None
@@ -249,21 +223,33 @@ class TactileLearner(MemoryKeeper):
         before, self._predictor = embed_again(self._predictor, embedding, progress or _silent)
         return before
 
-    def predict(self, *streams: Readings, scene: Sequence[str] | None = None, tuned: bool = False) -> Prediction:
+    def predict(
+        self,
+        *streams: Readings,
+        of: str | None = None,
+        scene: Sequence[str] | None = None,
+        tuned: bool = False,
+    ) -> Prediction:
         """Classify a stream among the materials observed; the memory stays as it is, and the answer is of one state.
 
         streams: one, as for `observe`, or several touches of one thing: what they say adds up, as far as touches of one
         material do not say the same anyway. Their order makes no difference, and one that comes twice counts once.
-        scene: the materials that can be here; None: all that were observed.
+        of: an axis of labels, such as "slip", to answer by in place of materials: `Prediction.material` is a label
+        then, `known` and all else as for materials, from the touches that have a label on it. Its readouts are fitted
+        when it is first asked for.
+        scene: the materials, or labels, that can be here; None: all that were observed.
         tuned: let f* answer (see `fine_tune`), if one was kept, knows all candidates, and the touch is long enough for
         it; f answers otherwise. `Prediction.tuned` says which of them did: of several touches, whether f* did of all.
 
-        Raises StreamError, UnknownMaterialError for a scene that names a material never observed, InputError for an
-        empty one, and for no stream. Before anything was observed the answer is material None, known False.
+        Raises StreamError, UnknownMaterialError for a scene that names a material never observed, AnnotationError for
+        an axis that no touch has a label on, InputError for an empty scene, for no stream, and for `of` with `tuned`.
+        Before anything was observed the answer is material None, known False.
         """
         wanted = names_of("scene", scene)
+        if of is not None and tuned:
+            raise InputError(f"f* answers by materials, and not by labels on {of!r}: leave out tuned, or of")
         if not tuned:
-            return self._predictor.predict(streams, wanted)
+            return self._by(of).predict(streams, wanted)
         from scroll_tactile.finetune.network import reader_of
 
         return self._predictor.predict(streams, wanted, reader_of)
@@ -275,22 +261,28 @@ class TactileLearner(MemoryKeeper):
         contact: Literal["auto", "manual"] = "auto",
         false_contacts: float = 1.0,
         scene: Sequence[str] | None = None,
+        of: str | None = None,
     ) -> LiveSession:
         """Begin to take readings as they come; see `LiveSession.push`.
 
         risk: the share of wrong answers among those that are decided. contact: "auto" finds touches by the sensor's own
         noise at rest, which it learns first: for two seconds nothing may touch it. "manual" leaves that to
-        `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene: as for `predict`.
+        `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene, of: as for `predict`.
 
         Each touch is predicted by the memory as it was when it began, and by itself unless `LiveSession.again` says
         that it is of the same thing as the last.
 
         Raises InputError for values that cannot be, and for "auto" with frames that have no resting image;
-        UnknownMaterialError for a scene that names a material never observed.
+        UnknownMaterialError for a scene that names a material never observed; AnnotationError for an axis that no
+        touch has a label on.
         """
         from scroll_tactile.live.session import LiveSession
 
-        return LiveSession(self._predictor, risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)
+        return LiveSession(self._by(of), risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)
+
+    def _by(self, axis: str | None) -> Predictor:
+        """What answers by the labels on an axis; by materials where it is None."""
+        return self._predictor if axis is None else self._predictor.of_axis(axis)
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5

@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.errors import InputError
@@ -15,10 +16,11 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.results import Compacted, Observation, Receipt
+from scroll_tactile.results import Compacted, Merged, Observation, Receipt
 from scroll_tactile.settings import require_name, require_source, require_text
 
 __all__ = ["MemoryKeeper"]
@@ -145,6 +147,31 @@ class MemoryKeeper(ABC):
             require_text(material)
         return self._ledger.forget(material, None if source is None else require_source(source))
 
+    def merge(
+        self,
+        other: MemoryKeeper | str | os.PathLike[str],
+        *,
+        shared: Literal["once", "twice"],
+        descriptions: Choice = "same",
+        progress: Callable[[str, int, int], object] | None = None,
+    ) -> Merged:
+        """Add everything that another memory observed; durable, as a whole, when this returns.
+
+        other: a memory with a path, its path, or a file that `pack` wrote; it stays as it is. shared: whether a stream
+        that both observed (one material, one content hash) counts once or twice. Receipts of the other memory are not
+        receipts of this one.
+        descriptions: which to keep of a material that both describe: "ours", "theirs", or "same", if they must agree.
+
+        Raises MismatchError for a memory of another sensor, embedding or grid, or of a quantity with another unit or
+        range, for a shared stream with other values or labels, and for a different description where they must agree;
+        ObservationError where a shared stream was compacted and cannot be left out; CapacityError, InputError,
+        StoreError. Nothing was changed then.
+        """
+        path = other._ledger.require_store("be merged").path if isinstance(other, MemoryKeeper) else other
+        require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
+        rules = MergeRules(once=shared == "once", descriptions=descriptions)
+        return self._ledger.merge(path, rules, progress or _silent)[0]
+
     def backup(
         self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
     ) -> None:
@@ -220,3 +247,7 @@ class MemoryKeeper(ABC):
         """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
         tuned = self.memory.tuned
         return None if tuned is None else tuned.digest()
+
+
+def _silent(what: str, done: int, of: int) -> None:
+    """The default progress: shows nothing."""

@@ -45,7 +45,8 @@ class OpenMemory:
 
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
     grows with each change of a description. added: if `follow` is set, the touches observed and retracted since the
-    list was last cleared; None where these are too many, or something else has changed. saves: whether checkpoints are
+    list was last cleared; None where these are too many, or something else has changed. followers: are called with the
+    same at each change. saves: whether checkpoints are
     written; the journal alone has every row, too.
     """
 
@@ -65,6 +66,7 @@ class OpenMemory:
         self.follow = False
         self.saves = True
         self.added: list[Added] | None = []
+        self.followers: list[Callable[[list[Added] | None], None]] = []
         self._load = load
         self._memory = load()
         self._saved = self._memory.saved
@@ -136,6 +138,8 @@ class OpenMemory:
 
     def _changed(self, added: list[Added] | None = None) -> None:
         self.version += 1
+        for follow in self.followers:
+            follow(added)
         if added is None or (self.added is not None and len(self.added) + len(added) > MOST_ADDED):
             self.added = None
         elif self.follow and self.added is not None:

@@ -60,9 +60,13 @@ class FrozenModel:
 
 @dataclass
 class _Job:
-    """A model that a thread makes. since: the touches that came since it was begun; None if they are too many."""
+    """A model that a thread makes.
+
+    version: of the memory when it was begun. since: the touches that came since; None if they are too many.
+    """
 
     future: Future[Model]
+    version: int
     since: list[Added] | None = field(default_factory=list)
 
     @property
@@ -186,14 +190,16 @@ class CurrentModel:
         # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
         with suppress(MemoryError, InputError, RuntimeError):
             if self._fit is None and lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16):
-                self._fit = _Job(self._worker("fit").submit(Draft.of(memory, self._kind).fit, self._reading))
+                draft = Draft.of(memory, self._kind)
+                self._fit = _Job(self._worker("fit").submit(draft.fit, self._reading), self._version)
             if (
                 self._renewal is None
                 and self._behind
                 and model.needs_renewal(self._behind)
                 and _has_all_of(memory, model)
             ):
-                self._renewal = _Job(self._worker("renewal").submit(Renewal.of(model, memory).solve))
+                solving = self._worker("renewal").submit(Renewal.of(model, memory).solve)
+                self._renewal = _Job(solving, self._version)
 
     def _worker(self, name: str) -> ThreadPoolExecutor:
         if name not in self._workers:
@@ -226,6 +232,7 @@ class CurrentModel:
             self._model.read(
                 ledger.memory.statistics
             )  # releases a snapshot, which would keep a copy of all that changes
+        self._exact = False  # of an axis, a touch without a label changes the samples alone
         added = ledger.added if self._model is not None else None
         # Unset until all is noted: cut short in between, a touch would be noted twice, or never.
         behind, jobs = self._behind, (self._fit, self._renewal)
@@ -258,7 +265,7 @@ class CurrentModel:
             model, since = fit.future.result(), fit.since or []
             late = abs(memory.statistics.touches - model.fitted_to) >= LEAST and model.fitted_to <= FEW
             if not late and model.follow(memory, since):
-                self._exact, self._renewal = not since, None
+                self._exact, self._renewal = fit.version == self._version, None
                 return model
         if before is None or before.fitted_to <= FEW or not _has_all_of(memory, before):
             self._fit = self._renewal = None

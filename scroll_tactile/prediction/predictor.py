@@ -14,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import capabilities_of
-from scroll_tactile.errors import EmbeddingMismatchError, InputError, ScrollTactileError
+from scroll_tactile.errors import AnnotationError, EmbeddingMismatchError, InputError, ScrollTactileError
 from scroll_tactile.memory.descriptions import require_constituents
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
+from scroll_tactile.persistence.axis_ledger import AxisLedger
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
@@ -65,6 +66,7 @@ class Predictor:
         self.current = CurrentModel(recipe.settings, extractor)
         self.tuned_reader: LogitsReader | None = None
         self.replaced = False
+        self._axes: dict[str, Predictor] = {}
 
     @classmethod
     def new(cls, recipe: Recipe) -> Self:
@@ -103,6 +105,26 @@ class Predictor:
             held = arrays, attributes, memory.sequence
             made_with = {"recipe": self.recipe, "check": self.extractor.check}
             return made_with | {"held": held, "contents": self.ledger.copied_contents()}
+
+    def of_axis(self, axis: str) -> Predictor:
+        """The predictor of an axis of labels, made when it is first asked for.
+
+        Raises AnnotationError where no touch has a label on it.
+        """
+        with self.ledger.lock:
+            axes = self.ledger.memory.targets.axes
+            if axis not in axes:
+                raise AnnotationError(
+                    f"expected an axis that touches have labels on, out of {sorted(axes)}; came {axis!r:.60}"
+                )
+            if axis not in self._axes:
+                self._axes[axis] = Predictor(self.recipe, self.extractor, AxisLedger(self.ledger, axis))
+            return self._axes[axis]
+
+    def replace(self) -> None:
+        """Note that the memory was embedded again, and another predictor has it."""
+        for predictor in (self, *self._axes.values()):
+            predictor.replaced = True
 
     def predict(
         self,
@@ -225,6 +247,14 @@ class Predictor:
         """As `TactileLearner.settle`."""
         with self.ledger.lock, enough_memory():
             self.current.settle(self.ledger)
+            for predictor in self._axes.values():
+                predictor.current.settle(predictor.ledger)
+
+    def prepare(self) -> None:
+        """Begin to fit models anew where enough touches came since the last fit; called after an observation."""
+        with self.ledger.lock:
+            for predictor in (self, *self._axes.values()):
+                predictor.current.prepare(predictor.ledger)
 
     def prepare_to_store(self) -> None:
         """Make a model for `close` to store, unless there is one: each process that opens the memory reads it then.
@@ -241,7 +271,8 @@ class Predictor:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
             self.ledger.close(NAME, lambda: self.current.arrays_to_store(self.ledger))
-            self.current.close()
+            for predictor in (self, *self._axes.values()):
+                predictor.current.close()
 
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""

@@ -53,7 +53,7 @@ def embed_again(
             carried.copy(progress)
             predictor.close()
             before = carried.put_in_place()
-            predictor.replaced = True
+            predictor.replace()
             kept = {"exemplars": None, "kept_touches": None}  # those of the new one
             settings = predictor.recipe.settings.model_copy(update=kept)
             return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, None, settings))

@@ -93,7 +93,7 @@ def test_a_reader_follows_every_change(made, tmp_path, monkeypatch):
             writer.forget("a")
             reader._ledger.added = []
             reader.refresh()
-            assert [(name, sign) for name, _, sign in reader._ledger.added] == [("a", -1)] * 4
+            assert [(name, sign) for name, _, sign, *_ in reader._ledger.added] == [("a", -1)] * 4
             assert held(reader) == fresh(made, [pair for pair in without(1) if pair[0] != "a"])
 
 

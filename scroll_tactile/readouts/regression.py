@@ -1,0 +1,172 @@
+"""Regression of a quantity on the features of some touches, with every touch and every material held out exactly.
+
+A head is ridge regression in its dual form (Saunders, Gammerman and Vovk 1998): with X the features of n touches at one
+scale, each in units of its standard deviation, G = X Xᵀ / s, t the targets and C the projection across 1,
+
+    B = C (C G C + λ I)⁻¹ C,    α = B t,    f(x) = mean(t) + α · X x / s.
+
+The residuals of a group of touches under the head that never had them follow from B alone (Allen 1974, PRESS, for a
+group): r_g = B_gg⁻¹ α_g. Groups are touches for a head that answers for known materials, and materials for one that
+answers for new ones; λ is the one of least r². The features' units alone rest on all touches.
+
+Each scale has a head of its own, and a quantity is Σ_s w_s f_s with w ≥ 0, Σ w = 1, of least squared residual
+(stacked regression, Breiman 1996). Residuals and weights are functions of the set of touches. Intervals are f ± a
+quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of the mean of their distributions
+(pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for many materials, and for few as far as these are like
+the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.system import contrasts
+
+__all__ = ["Head", "Spectrum", "fit_head"]
+
+FloatArray = npt.NDArray[np.float64]
+Groups = npt.NDArray[np.intp]
+
+LAMBDAS = tuple(2.0**power for power in range(5, -17, -1))  # in units of G's mean diagonal; ties go to the larger
+LEAST_VARIANCE = 1e-3  # of a feature, as a share of their mean: what hardly varies is not blown up
+PRIOR = 2.0  # touches: with fewer, the weights of scales are drawn to those of independent residuals
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """The features of n touches at one scale, and the eigenvectors of their Gram matrix; of any number of quantities.
+
+    rows: X, standardised, (n, d). unit: one over the standard deviation of each feature, (d,). center: (d,). size: s.
+    vectors: of C G C across 1, (n, n − 1). values: its eigenvalues, (n − 1,).
+    """
+
+    rows: FloatArray
+    unit: FloatArray
+    center: FloatArray
+    size: float
+    vectors: FloatArray
+    values: FloatArray
+
+    @classmethod
+    def of(cls, rows: npt.NDArray[np.number]) -> Spectrum:
+        """The spectrum of features, (n, d), n ≥ 2. The caller has set BLAS to one thread: then it is the same bits."""
+        features = rows.astype(np.float64)
+        center, variance = features.mean(axis=0), features.var(axis=0)
+        floor = LEAST_VARIANCE * float(variance.mean())
+        unit = 1.0 / np.sqrt(variance + floor) if floor > 0 else np.ones_like(variance)
+        features = (features - center) * unit
+        size = float(np.square(features).sum()) / len(rows) or 1.0  # rows that are all equal say nothing
+        across = contrasts(len(rows))
+        onto = across @ features
+        values, vectors = np.linalg.eigh(onto @ onto.T / size)
+        return cls(features, unit, center, size, across.T @ vectors, np.maximum(values, 0.0))
+
+    def fit(self, targets: FloatArray, members: Sequence[Groups]) -> tuple[FloatArray, FloatArray, float]:
+        """(weights (d,), residuals (n,), intercept) of the head with the best λ, each group held out for its residuals.
+
+        targets: (n,). members: the places of each group's touches; no group has them all.
+        """
+        onto, best = self.vectors.T @ targets, (math.inf, 0.0, np.zeros_like(targets))
+        for penalty in LAMBDAS:
+            residuals = self._held_out(1.0 / (self.values + penalty), onto, members)
+            if (loss := float(residuals @ residuals)) < best[0]:
+                best = loss, penalty, residuals
+        alpha = self.vectors @ (onto / (self.values + best[1]))
+        weights = self.unit * (alpha @ self.rows) / self.size
+        return weights, best[2], float(targets.mean() - weights @ self.center)
+
+    def _held_out(self, filters: FloatArray, onto: FloatArray, members: Sequence[Groups]) -> FloatArray:
+        """The residuals of the held-out groups, (n,). filters: the eigenvalues of B, (n − 1,)."""
+        alpha = self.vectors @ (filters * onto)
+        if len(members) == len(alpha):
+            return np.asarray(alpha / (np.square(self.vectors) @ filters))
+        residuals = np.empty_like(alpha)
+        for group in members:
+            own = self.vectors[group]
+            residuals[group] = np.linalg.solve((own * filters) @ own.T, alpha[group])
+        return residuals
+
+
+@dataclass(frozen=True)
+class Head:
+    """Predicts a quantity from a touch's features at some scales, and how far it may be off.
+
+    weights: for each scale, (S, d); a scale without weight has zeros. intercept: in the unit of the targets. shares:
+    the weight of each scale, (S,). residuals: target less prediction of each touch, held out with its group, (n,).
+    mass: the weight of each residual, all one in sum, and of each group alike, (n,).
+    """
+
+    weights: FloatArray
+    intercept: float
+    shares: FloatArray
+    residuals: FloatArray
+    mass: FloatArray
+
+    def __call__(self, features: Sequence[FloatArray]) -> float:
+        """The quantity, of mean features (d,) at each scale."""
+        own = (float(w @ x) for w, x in zip(self.weights, features, strict=True))
+        return math.fsum((self.intercept, *own))
+
+    def half_width(self, risk: float) -> float:
+        """What |error| exceeds with a probability of `risk` or less; infinite where the touches are too few to say.
+
+        The ⌈(n + 1)(1 − risk)⌉-th smallest |r|: n + 1 touches, the new one among them, have every rank alike.
+        """
+        count = len(self.residuals)
+        # Exact products such as 20 · 0.95 are not to be pushed over by rounding.
+        rank = math.ceil((count + 1) * (1 - risk) - 1e-9)
+        if rank > count:
+            return math.inf
+        order = np.argsort(np.abs(self.residuals), kind="stable")
+        reached = np.cumsum(self.mass[order]) * count >= rank - 1e-6
+        return float(np.abs(self.residuals)[order[int(np.argmax(reached))]])
+
+
+def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | None = None) -> Head:
+    """The head of some touches, read at each of the scales.
+
+    spectra: of the same n touches in the same order. targets: (n,), of any unit. groups: the material of each touch,
+    numbered, (n,), two or more; None: each touch by itself is held out.
+    """
+    numbers = np.arange(len(targets)) if groups is None else groups
+    members = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
+    fitted = [spectrum.fit(targets, members) for spectrum in spectra]
+    residuals = np.stack([own for _, own, _ in fitted], axis=1)
+    shares = stacked(residuals)
+    weights = np.stack([share * own for share, (own, _, _) in zip(shares, fitted, strict=True)])
+    intercept = math.fsum(float(share) * own for share, (_, _, own) in zip(shares, fitted, strict=True))
+    mass = np.empty(len(targets))
+    for group in members:
+        mass[group] = 1.0 / (len(members) * len(group))
+    return Head(weights, intercept, shares, residuals @ shares, mass)
+
+
+def stacked(residuals: FloatArray) -> FloatArray:
+    """The weights w ≥ 0, Σ w = 1, (S,), of least |R w|², of residuals R, (n, S).
+
+    Every subset of the scales is solved for, and the best whose weights are all positive is taken: exact, and there are
+    five scales. Of few touches the products between scales count for less, n / (n + PRIOR).
+    """
+    products = residuals.T @ residuals
+    products[np.diag_indices(len(products))] *= 1.0 + PRIOR / len(residuals)
+    count = len(products)
+    best, found = math.inf, np.full(count, 1.0 / count)
+    for size in range(1, count + 1):
+        for chosen in combinations(range(count), size):
+            among = np.ix_(chosen, chosen)
+            try:
+                own = np.linalg.solve(products[among], np.ones(size))
+            except np.linalg.LinAlgError:  # residuals that are all zero
+                continue
+            if not (own > 0).all() or not np.isfinite(own).all():
+                continue
+            if (loss := 1.0 / float(own.sum())) < best:
+                best, found = loss, np.zeros(count)
+                found[list(chosen)] = own / own.sum()
+    return found

@@ -14,6 +14,7 @@ __all__ = [
     "Compacted",
     "Composition",
     "Constituent",
+    "Estimate",
     "Merged",
     "Observation",
     "Prediction",
@@ -180,6 +181,48 @@ class Prediction:
             "known": self.known,
             "novelty": None if math.isinf(self.novelty) else self.novelty,
         }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a stream says of one quantity, such as its force.
+
+    value: in `unit`; None where no head could be learned. low, high: an interval that holds the true value in a share
+    of 1 − `risk` of touches, within the quantity's range; both None where value is. known: whether the interval is
+    calibrated for a material that was learned, on touches held out; otherwise for a new one, on materials held out,
+    which is as good as these are many and like the new one. inside: whether the touch is like those learned: of a known
+    material, and not `unusual`. An interval holds for touches like those. touches, materials: how many sampled ones the
+    value rests on. seconds: see Prediction. missing: in words, what a value or a bounded interval would take; empty
+    where there is one.
+
+    A quantity that says no more than the material's name is given away by its interval for new materials: it is wide.
+    """
+
+    value: float | None
+    low: float | None
+    high: float | None
+    unit: str
+    risk: float
+    known: bool
+    inside: bool = True
+    touches: int = 0
+    materials: int = 0
+    seconds: float = 0.0
+    missing: str = ""
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """(low, high); None without a value."""
+        return None if self.low is None or self.high is None else (self.low, self.high)
+
+    @property
+    def width(self) -> float | None:
+        """high − low; None without a value."""
+        return None if self.low is None or self.high is None else self.high - self.low
+
+    def as_json(self) -> dict[str, str | float | bool | None]:
+        """All of it by name, in JSON's types."""
+        return dict(vars(self))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from examples.paper.fabric.attributes import attributes
 from examples.paper.fabric.contactile import contactile
 from examples.paper.fabric.letters import letters
 from examples.paper.fabric.objects import gelsight
+from examples.paper.fabric.quantities import quantities
 from examples.paper.fabric.slides import slide
 from examples.paper.runs.everything import everything
 from examples.paper.studies.activation import activation
@@ -46,7 +47,7 @@ fabric = typer.Typer(
     no_args_is_help=True,
     help="What a touch is made of: fabrics, letters of dots, attributes, objects; fabrics slid over otherwise.",
 )
-OF_FABRIC: tuple[Callable[..., None], ...] = (contactile, letters, slide, attributes, gelsight)
+OF_FABRIC: tuple[Callable[..., None], ...] = (contactile, letters, slide, quantities, attributes, gelsight)
 for study in OF_FABRIC:
     fabric.command()(study)
 app.add_typer(fabric, name="fabric")

@@ -1,0 +1,186 @@
+"""Estimates of a touch's quantities, such as its force, by heads over the sampled touches (see `readouts.regression`).
+
+A touch is estimated by the heads of the length that it reached: before it is complete as it was at its last milestone,
+by the sampled touches as they were then; complete by complete ones, views among them. So a residual that calibrates an
+interval is of a touch like the one that is asked for. A head is fitted when it is first asked for, and is a function of
+the set of sampled touches and their values: no order and no earlier state has a part in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.readouts.regression import Head, Spectrum, fit_head
+from scroll_tactile.results import Estimate
+from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.sample import SampledTouch
+
+__all__ = ["Estimator", "Measured", "ValuedTouch"]
+
+FloatArray = npt.NDArray[np.float64]
+LEAST_TOUCHES = 3  # of which one is held out, and two have a slope
+LEAST_MATERIALS = 2
+
+
+@dataclass(frozen=True)
+class ValuedTouch:
+    """A sampled touch, and what was measured of it: quantity → value in its unit."""
+
+    material: str
+    touch: SampledTouch
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is known of a quantity: its unit and its range."""
+
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Heads:
+    """The heads of one quantity at one length of touch: for known materials, and for new ones.
+
+    materials: of the touches that they rest on, in the order of the heads' residuals. targets: their values, (n,).
+    """
+
+    known: Head
+    new: Head
+    materials: tuple[str, ...]
+    targets: FloatArray
+
+
+@dataclass
+class Estimator:
+    """Estimates the quantities of touches from sampled ones, in one state of a memory.
+
+    touches: those of the sample that carry a value, in the sample's order. least: the steps from which on a touch is
+    complete.
+    """
+
+    plan: WindowPlan
+    touches: Sequence[ValuedTouch]
+    quantities: Mapping[str, Measured]
+    least: int
+    _fitted: dict[int, dict[str, Heads | str]] = field(default_factory=dict)
+
+    @cached_property
+    def last(self) -> int:
+        """The stage from which on touches are complete."""
+        return len(self.plan.stages(max(self.least, self.plan.milestones()[0]))) - 1
+
+    def stage(self, steps: int) -> int:
+        """By which heads a touch of so many steps is estimated: the stage that it reached last, `last` if complete."""
+        return self.last if steps >= self.least else max(0, min(len(self.plan.stages(steps)), self.last) - 1)
+
+    def length(self, steps: int) -> int:
+        """How many steps are read of a touch of so many: those to its last milestone, all of a complete one.
+
+        Read further than the sampled touches were, a simulated slide's mean features were those of a settled contact,
+        and an interval of 90 % covered 1 %.
+        """
+        return steps if self.stage(steps) == self.last else self.plan.milestones()[self.stage(steps)]
+
+    def scales(self, stage: int) -> list[Scale]:
+        """The scales that are read at a stage: its windows; of complete touches all that each of them has."""
+        return self._judging(stage) if stage < self.last else self._of_complete
+
+    def scales_for(self, steps: int) -> list[Scale]:
+        """The scales that are read of a touch of so many steps, cut to its `length`."""
+        return self.scales(self.stage(steps))
+
+    def estimate(
+        self, wanted: Sequence[str], means: Mapping[Scale, FloatArray], steps: int, risk: float, *, known: bool
+    ) -> dict[str, Estimate]:
+        """The estimates of some quantities.
+
+        means: of a touch of so many steps cut to its `length`, at `scales_for`. known: whether its material is a
+        learned one.
+        """
+        stage = self.stage(steps)
+        features = [means[scale] for scale in self.scales(stage)]
+        found = {name: (self.heads(stage)[name], self.quantities[name]) for name in wanted}
+        return {name: _estimate(heads, of, features, risk, known=known) for name, (heads, of) in found.items()}
+
+    def heads(self, stage: int) -> dict[str, Heads | str]:
+        """The heads of a stage, by quantity, or in words why there are none."""
+        if stage not in self._fitted:
+            with one_thread():
+                self._fitted[stage] = self._fit(stage)
+        return self._fitted[stage]
+
+    def _fit(self, stage: int) -> dict[str, Heads | str]:
+        scales, spectra = self.scales(stage), dict[tuple[int, ...], list[Spectrum]]()
+        rows = {i: rows for i, touch in enumerate(self.touches) if (rows := self._rows(touch, stage))}
+        fitted: dict[str, Heads | str] = {}
+        for name in self.quantities:
+            carrying = tuple(i for i in rows if name in self.touches[i].values)
+            targets = np.array([self.touches[i].values[name] for i in carrying])
+            materials = tuple(self.touches[i].material for i in carrying)
+            if reason := _lacking(targets, materials):
+                fitted[name] = reason
+                continue
+            if carrying not in spectra:  # quantities that the same touches carry share them
+                spectra[carrying] = [Spectrum.of(np.stack([rows[i][scale] for i in carrying])) for scale in scales]
+            groups = np.unique(materials, return_inverse=True)[1]
+            known, new = fit_head(spectra[carrying], targets), fit_head(spectra[carrying], targets, groups)
+            fitted[name] = Heads(known, new, materials, targets)
+        return fitted
+
+    @cached_property
+    def _of_complete(self) -> list[Scale]:
+        complete = [set(rows) for touch in self.touches if (rows := self._rows(touch, self.last))]
+        return sorted(set.intersection(*complete)) if complete else self._judging(self.last)
+
+    def _judging(self, stage: int) -> list[Scale]:
+        return self.plan.judging(self.plan.milestones()[stage])
+
+    def _rows(self, valued: ValuedTouch, stage: int) -> dict[Scale, npt.NDArray[np.int32]]:
+        """The rows of a sampled touch as it was at a stage, by scale; none where it was not there at that length."""
+        touch = valued.touch
+        own = int(touch.pairs[:, 0].max())  # the touch's last stage, at which its length is its own
+        if own < self.last or (own > self.last and self.plan.judged == "widest"):
+            return {}
+        at = own if stage == self.last else stage
+        scales = sorted([*self._judging(at), *(self.plan.views if at == own else ())])
+        return {
+            scales[place]: row
+            for (number, place, _), row in zip(touch.pairs.tolist(), touch.rows, strict=True)
+            if number == at
+        }
+
+
+def _lacking(targets: FloatArray, materials: Sequence[str]) -> str:
+    """What is missing for a head, in words; empty where nothing is."""
+    if len(targets) < LEAST_TOUCHES:
+        return f"{len(targets)} sampled touches as long as this carry a value; it takes {LEAST_TOUCHES} or more"
+    if len(set(materials)) < LEAST_MATERIALS:
+        return f"the sampled touches that carry a value are all of {materials[0]!r}; it takes two materials or more"
+    if np.ptp(targets) == 0:
+        return f"every sampled touch has the same value, {targets[0]:g}; it takes values that differ"
+    return ""
+
+
+def _estimate(
+    heads: Heads | str, quantity: Measured, features: Sequence[FloatArray], risk: float, *, known: bool
+) -> Estimate:
+    if isinstance(heads, str):
+        return Estimate(None, None, None, quantity.unit, risk, known, missing=heads)
+    head = heads.known if known else heads.new
+    said, half = head(features), head.half_width(risk)
+    value, low, high = (min(max(one, quantity.low), quantity.high) for one in (said, said - half, said + half))
+    touches, missing = len(heads.targets), ""
+    if math.isinf(half):
+        missing = f"the interval is the range: one of risk {risk:g} takes {math.ceil(1 / risk - 1e-9) - 1} touches"
+    count = len(set(heads.materials))
+    return Estimate(value, low, high, quantity.unit, risk, known, touches=touches, materials=count, missing=missing)

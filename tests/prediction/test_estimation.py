@@ -1,0 +1,126 @@
+"""Estimates by sampled touches: which heads answer at which length, what they cover, and what they say is missing."""
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Kernels, Scene, Sensor
+from scroll_tactile.embeddings.protocol import window_plan
+from scroll_tactile.prediction.estimation import Estimator, Measured, ValuedTouch
+from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.signals.windows import SHAPE
+from scroll_tactile.statistics.sample import SampledTouch
+
+PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1.0, unit="N", duration=2.0)
+EMBEDDING = Kernels(dimension=128)
+PLAN = window_plan(PAD, EMBEDDING)
+EXTRACTOR = FeatureExtractor(PAD, EMBEDDING, PLAN, None)
+SCENE = Scene(sensor=PAD)
+FORCE = Measured("N", 0.0, 4.0)
+NAMES = ["felt", "denim", "cork", "silk"]
+
+
+def felt(name, repetition, seconds=2.0):
+    force = float(np.random.default_rng([repetition, NAMES.index(name)]).uniform(0.5, 2.0))
+    return SCENE.touch(name, repetition, seconds, force=force), force
+
+
+def valued(name, repetition, seconds=2.0, **more):
+    touch, force = felt(name, repetition, seconds)
+    steps, codes = EXTRACTOR.learned(touch)
+    return ValuedTouch(name, SampledTouch.of(PLAN.scored_stages(steps), codes), {"force": force, **more})
+
+
+LEARNED = [valued(name, repetition) for name in NAMES[:3] for repetition in range(20)]
+
+
+def estimator_of(touches=LEARNED, quantities=None, least=100):
+    return Estimator(PLAN, touches, quantities or {"force": FORCE}, least)
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return estimator_of()
+
+
+def asked(estimator, touch, risk=0.1, known=True, wanted=("force",)):
+    image = EXTRACTOR.image(touch)
+    steps = image.shape[1]
+    means = EXTRACTOR.means(image[:, : estimator.length(steps)], estimator.scales_for(steps))
+    return estimator.estimate(wanted, means, steps, risk, known=known)
+
+
+def covered(estimator, names, seconds, known):
+    """The share of new touches whose force lies in its interval, and the mean width."""
+    found = []
+    for name in names:
+        for repetition in range(100, 140):
+            touch, force = felt(name, repetition)
+            estimate = asked(estimator, touch.first(seconds), known=known)["force"]
+            found.append((estimate.low <= force <= estimate.high, estimate.width))
+    return np.mean(found, axis=0)
+
+
+def test_intervals_cover_at_every_length(estimator):
+    covers, widths = zip(*(covered(estimator, NAMES[:3], seconds, True) for seconds in (0.3, 1.0, 2.0)), strict=True)
+    assert min(covers) >= 0.84 and widths[-1] < 1.0
+
+
+def test_a_new_material_has_the_wider_interval_that_it_needs(estimator):
+    as_known, as_new = (covered(estimator, NAMES[3:], 2.0, known) for known in (True, False))
+    assert as_new[1] > 1.5 * as_known[1] and as_new[0] > as_known[0]
+
+
+def test_a_complete_touch_is_read_by_views_and_a_part_of_it_by_windows_as_they_were_then(estimator):
+    assert SHAPE in estimator.scales_for(100) and SHAPE not in estimator.scales_for(99)
+    assert estimator.stage(15) == 0 and estimator.stage(100) == estimator.last
+    assert estimator.length(99) == PLAN.milestones()[1] and estimator.length(100) == 100
+    touch = felt("cork", 3)[0]
+    assert asked(estimator, touch.first(0.3))["force"].value != asked(estimator, touch)["force"].value
+
+
+def test_a_touch_that_was_shorter_calibrates_no_other_length():
+    shorter = [valued("felt", 50 + i, 0.5) for i in range(3)]
+    more = estimator_of([*LEARNED, *shorter])
+    for stage in range(more.last + 1):
+        assert more.heads(stage)["force"].known.weights.tobytes() == (
+            estimator_of().heads(stage)["force"].known.weights.tobytes()
+        )
+
+
+def test_risks_too_small_for_the_touches_give_the_range(estimator):
+    estimate = asked(estimator, felt("felt", 3)[0], risk=0.01)["force"]
+    assert estimate.interval == (0.0, 4.0) and "takes 99 touches" in estimate.missing
+    assert 0.5 < estimate.value < 2.5 and (estimate.touches, estimate.materials) == (60, 3)
+    assert asked(estimator, felt("felt", 3)[0], risk=0.1)["force"].missing == ""
+
+
+@pytest.mark.parametrize(
+    ("touches", "missing"),
+    [
+        (LEARNED[:20], "all of 'felt'; it takes two materials"),
+        ([], "0 sampled touches"),
+        ([valued(name, 0) for name in NAMES[:2]], "2 sampled touches"),
+        ([valued(name, i, force=1.0) for name in NAMES[:2] for i in range(3)], "the same value, 1;"),
+    ],
+)
+def test_what_is_missing_is_said_and_no_number_given(touches, missing):
+    estimate = asked(estimator_of(touches), felt("felt", 3)[0])["force"]
+    assert estimate.value is None and estimate.interval is None and estimate.width is None
+    assert missing in estimate.missing and estimate.unit == "N"
+
+
+def test_touches_without_a_value_have_no_part_and_cost_nothing():
+    temperature = Measured("K", 0.0, 400.0)
+    mixed = [valued(t.material, 200 + i, hot=300.0 + i % 7) for i, t in enumerate(LEARNED[::4])]
+    both = estimator_of([*LEARNED, *mixed], {"force": FORCE, "hot": temperature})
+    alone = estimator_of(mixed, {"hot": temperature})
+    touch = felt("cork", 7)[0]
+    assert asked(both, touch, wanted=["hot"]) == asked(alone, touch, wanted=["hot"])
+    assert asked(both, touch, wanted=["hot"])["hot"].touches == len(mixed)
+
+
+def test_a_property_of_the_material_in_disguise_is_given_away_by_its_interval():
+    stiff = [ValuedTouch(t.material, t.touch, {"force": 1.0 + NAMES.index(t.material)}) for t in LEARNED]
+    touch = felt("cork", 7)[0]
+    known, new = (asked(estimator_of(stiff), touch, known=known)["force"] for known in (True, False))
+    assert new.width > 2 * known.width

@@ -37,6 +37,7 @@ from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
+from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.settings import Settings
 from scroll_tactile.validation.gate import WRONG
 from store import StoreError
@@ -91,6 +92,7 @@ class CurrentModel:
         self._workers: dict[str, ThreadPoolExecutor] = {}
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
+        self._estimator: Estimator | None = None
         self._lent: list[ReferenceType[FrozenModel]] = []
 
     def frozen(self, ledger: Ledger) -> FrozenModel:
@@ -294,6 +296,13 @@ class CurrentModel:
         if self._composer is None or self._composer[:3] != state:
             self._composer = *state, Composer.of(model, ledger.memory)
         return self._composer[3]
+
+    def estimator(self, ledger: Ledger) -> Estimator:
+        """What estimates by the sampled touches of this memory; its heads stay while these are the same."""
+        memory = ledger.memory
+        least = max(1, memory.statistics.fifth_percentile_length)
+        self._estimator = Estimator.of(memory.plan, memory.sample, memory.quantities, least, self._estimator)
+        return self._estimator
 
 
 def _has_all_of(memory: Memory, model: Model) -> bool:

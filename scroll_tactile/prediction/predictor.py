@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, Protocol, Self, TypeVar
 
@@ -31,14 +32,15 @@ from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import Touch, answer
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.stored import NAME
+from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.recipe import Recipe, RecipeRequest
-from scroll_tactile.results import Composition, Constituent, Prediction
+from scroll_tactile.results import Composition, Constituent, Estimate, Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
 
-__all__ = ["LogitsReader", "Predictor", "nothing_known"]
+__all__ = ["LogitsReader", "Predictor", "estimates_of", "nothing_known"]
 
 logger = logging.getLogger(__name__)
 
@@ -177,6 +179,30 @@ class Predictor:
 
         return self._of_one_state(begin)
 
+    def estimate(
+        self, readings: Readings, wanted: Sequence[str] | None, risk: float, known: bool | None
+    ) -> dict[str, Estimate]:
+        """As `TactileLearner.estimate`."""
+        touch = self.extractor.stream(readings)
+
+        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], dict[str, Estimate]]:
+            estimator = self.current.estimator(self.ledger)
+            names = estimator.wanted(wanted)
+
+            def scales_for(steps: int) -> list[Scale]:
+                return sorted({*model.scales_for(model.names, steps), *estimator.scales_for(steps)})
+
+            def estimated() -> dict[str, Estimate]:
+                if not model.names:
+                    return estimates_of(estimator, names, None, extractor, nothing_known(touch.seconds), risk, known)
+                encoded = extractor.encode(touch, model.longest, scales_for)
+                prediction = self._answer(model, extractor, model.names, [(encoded, None)])
+                return estimates_of(estimator, names, encoded, extractor, prediction, risk, known)
+
+            return estimated
+
+        return self._of_one_state(begin)
+
     def _of_one_state(self, begin: Callable[[Model, FeatureExtractor], Callable[[], Answer]]) -> Answer:
         """An answer from one state of the memory, which others may change while a touch is embedded.
 
@@ -295,3 +321,29 @@ def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) ->
 def nothing_known(seconds: float) -> Prediction:
     """The prediction for so many seconds of touch without any candidate."""
     return Prediction(None, 0.0, (), float("inf"), False, seconds)
+
+
+def estimates_of(
+    estimator: Estimator,
+    wanted: Sequence[str],
+    encoded: Encoded | None,
+    extractor: FeatureExtractor,
+    prediction: Prediction,
+    risk: float,
+    known: bool | None,
+) -> dict[str, Estimate]:
+    """The estimates of a touch, of which nothing was encoded before any was observed, and its prediction.
+
+    known: which intervals are taken; None for those that the prediction says. Where it cannot tell they are those of a
+    new material.
+    """
+    as_known = prediction.known is True if known is None else known
+    inside = prediction.known is not False and not prediction.unusual
+    if encoded is None:
+        found = estimator.estimate(wanted, {}, 0, risk, known=as_known)
+    else:
+        length, means = estimator.length(encoded.steps), encoded.means
+        if length < encoded.steps:
+            means = extractor.means(encoded.image[:, :length], estimator.scales_for(encoded.steps))
+        found = estimator.estimate(wanted, means, encoded.steps, risk, known=as_known)
+    return {name: replace(own, inside=inside, seconds=prediction.seconds) for name, own in found.items()}

@@ -7,7 +7,7 @@ scikit-learn's ridge on the same features with the intervals of MAPIE (CV+) and 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,10 +26,12 @@ from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.libraries import optional
-from scroll_tactile.prediction.estimation import Estimator, Measured, ValuedTouch
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.quantities import Quantity
+from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.statistics.sample import CAPACITY, SampledTouch, TouchSample
 
 __all__ = ["MOMENTS", "Quantities", "quantities", "summary"]
@@ -43,7 +45,10 @@ MOMENTS = {"0.3 s": 11, "0.8 s": 28, "4 s": 144}
 
 SIZES = (64, 128, CAPACITY, 1024)  # of the sample; the last holds every touch
 RISK = 0.1
-QUANTITIES = {"force": Measured("publisher's unit", 100.0, 270.0), "speed": Measured("mm/s", 0.0, 160.0)}
+QUANTITIES = {
+    "force": Quantity(name="force", unit="publisher's unit", low=100, high=270, resolution=1),
+    "speed": Quantity(name="speed", unit="mm/s", low=0, high=160, resolution=1),
+}
 
 
 @dataclass(frozen=True)
@@ -97,16 +102,20 @@ class Quantities:
         plan = window_plan(CPM_FINGER, embedding)
         extractor = FeatureExtractor(CPM_FINGER, embedding, plan, None)
 
-        def encoded(material: str, slide: Stream) -> EncodedSlide:
+        def encoded(place: int, material: str, slide: Stream) -> EncodedSlide:
             stream = slide.first(CPM_FINGER.duration)
             steps, codes = extractor.learned(stream)
             parts = {name: extractor.image(stream)[:, :most] for name, most in MOMENTS.items()}
             means = {name: extractor.means(image, plan.scales) for name, image in parts.items()}
-            touch = SampledTouch.of(plan.scored_stages(steps), codes)
+            values = ((of, QUANTITIES[of].integer(own[place])) for of, own in sorted(self._targets.items()))
+            touch = replace(
+                SampledTouch.of(plan.scored_stages(steps), codes), annotations=((Annotation(tuple(values)), 1),)
+            )
             return EncodedSlide(material, stream.key, touch, {name: i.shape[1] for name, i in parts.items()}, means)
 
         recordings = self.slides.recordings
-        return [encoded(*pair) for pair in zip(recordings.materials, recordings.streams, strict=True)]
+        slides = zip(recordings.materials, recordings.streams, strict=True)
+        return [encoded(place, *slide) for place, slide in enumerate(slides)]
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
         tested = self._splits[cell.system]
@@ -130,15 +139,11 @@ class Quantities:
         return figures
 
     def _estimator(self, train: npt.NDArray[np.intp], size: int) -> Estimator:
-        sample, place = TouchSample(size), {(self._encoded[i].material, self._encoded[i].key): i for i in train}
+        sample = TouchSample(size)
         for i in train:
             sample.add(self._encoded[i].material, self._encoded[i].key, self._encoded[i].touch)
-        touches = [
-            ValuedTouch(name, touch, {of: float(own[place[name, key]]) for of, own in self._targets.items()})
-            for name, key, touch in sample
-        ]
         lengths = sorted(self._encoded[i].steps["4 s"] for i in train)
-        return Estimator(window_plan(CPM_FINGER, Kernels()), touches, QUANTITIES, lengths[len(lengths) // 20])
+        return Estimator.of(window_plan(CPM_FINGER, Kernels()), sample, QUANTITIES, lengths[len(lengths) // 20])
 
     def _ours(self, estimator: Estimator, test: npt.NDArray[np.intp], known: bool) -> Callable[[str, str], Intervals]:
         def asked(moment: str, of: str) -> Intervals:

@@ -1,4 +1,4 @@
-"""Estimates of a touch's quantities, such as its force, by heads over the sampled touches (see `readouts.regression`).
+"""Estimates of a touch's quantities, such as its force, by heads over the sampled touches (see `regression`).
 
 A touch is estimated by the heads of the length that it reached: before it is complete as it was at its last milestone,
 by the sampled touches as they were then; complete by complete ones, views among them. So a residual that calibrates an
@@ -9,42 +9,28 @@ the set of sampled touches and their values: no order and no earlier state has a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.errors import AnnotationError
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.readouts.regression import Head, Spectrum, fit_head
 from scroll_tactile.results import Estimate
 from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.statistics.annotations import Annotations
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Estimator", "Measured", "ValuedTouch"]
+__all__ = ["Estimator", "Heads"]
 
 FloatArray = npt.NDArray[np.float64]
+Sampled = tuple[str, bytes, SampledTouch]
 LEAST_TOUCHES = 3  # of which one is held out, and two have a slope
 LEAST_MATERIALS = 2
-
-
-@dataclass(frozen=True)
-class ValuedTouch:
-    """A sampled touch, and what was measured of it: quantity → value in its unit."""
-
-    material: str
-    touch: SampledTouch
-    values: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What is known of a quantity: its unit and its range."""
-
-    unit: str
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -64,15 +50,41 @@ class Heads:
 class Estimator:
     """Estimates the quantities of touches from sampled ones, in one state of a memory.
 
-    touches: those of the sample that carry a value, in the sample's order. least: the steps from which on a touch is
-    complete.
+    sample: the touches that carry a value, in the sample's order. least: the steps from which on a touch is complete.
+    Made by `Estimator.of`. Any number of threads may use it: one that comes second fits the same heads again.
     """
 
     plan: WindowPlan
-    touches: Sequence[ValuedTouch]
-    quantities: Mapping[str, Measured]
+    sample: list[Sampled]
+    quantities: Mapping[str, Quantity]
     least: int
     _fitted: dict[int, dict[str, Heads | str]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        plan: WindowPlan,
+        sample: Iterable[Sampled],
+        quantities: Mapping[str, Quantity],
+        least: int,
+        before: Estimator | None = None,
+    ) -> Estimator:
+        """The estimator of a sample. before: an earlier one, whose heads it takes where they last."""
+        carrying = [
+            (material, key, touch)
+            for material, key, touch in sample
+            if any(annotation.values for annotation, _ in touch.annotations)
+        ]
+        made = cls(plan, carrying, dict(quantities), least)
+        if before is None or made._state != before._state:
+            return made
+        return before if before.least == least else replace(made, _fitted=before._fitted)
+
+    @cached_property
+    def _state(self) -> tuple[object, ...]:
+        """What heads are a function of, beside the touches' content."""
+        touches = [(material, key, touch.annotations) for material, key, touch in self.sample]
+        return touches, self.quantities, self.last
 
     @cached_property
     def last(self) -> int:
@@ -99,16 +111,26 @@ class Estimator:
         """The scales that are read of a touch of so many steps, cut to its `length`."""
         return self.scales(self.stage(steps))
 
+    def wanted(self, names: Sequence[str] | None) -> list[str]:
+        """The quantities that are asked for, all where it is None. Raises AnnotationError for one not declared."""
+        if not self.quantities:
+            raise AnnotationError(
+                "no quantity was declared: declare one (learner.declare), and observe touches with it"
+            )
+        if strange := sorted(set(names or ()) - self.quantities.keys()):
+            raise AnnotationError(f"expected quantities out of {sorted(self.quantities)}; came {strange[:5]}")
+        return sorted(self.quantities) if names is None else list(dict.fromkeys(names))
+
     def estimate(
         self, wanted: Sequence[str], means: Mapping[Scale, FloatArray], steps: int, risk: float, *, known: bool
     ) -> dict[str, Estimate]:
         """The estimates of some quantities.
 
-        means: of a touch of so many steps cut to its `length`, at `scales_for`. known: whether its material is a
-        learned one.
+        means: mean features in grid units, (d,), of a touch of so many steps cut to its `length`, at `scales_for`.
+        known: whether its material is a learned one.
         """
         stage = self.stage(steps)
-        features = [means[scale] for scale in self.scales(stage)]
+        features = [means[scale] for scale in self.scales(stage) if scale in means]  # of an empty memory none
         found = {name: (self.heads(stage)[name], self.quantities[name]) for name in wanted}
         return {name: _estimate(heads, of, features, risk, known=known) for name, (heads, of) in found.items()}
 
@@ -121,12 +143,14 @@ class Estimator:
 
     def _fit(self, stage: int) -> dict[str, Heads | str]:
         scales, spectra = self.scales(stage), dict[tuple[int, ...], list[Spectrum]]()
-        rows = {i: rows for i, touch in enumerate(self.touches) if (rows := self._rows(touch, stage))}
+        rows = {i: rows for i, (*_, touch) in enumerate(self.sample) if (rows := self._rows(touch, stage))}
         fitted: dict[str, Heads | str] = {}
-        for name in self.quantities:
-            carrying = tuple(i for i in rows if name in self.touches[i].values)
-            targets = np.array([self.touches[i].values[name] for i in carrying])
-            materials = tuple(self.touches[i].material for i in carrying)
+        for name, quantity in self.quantities.items():
+            values = {
+                i: value for i in rows if (value := value_of(self.sample[i][2].annotations, quantity)) is not None
+            }
+            carrying, targets = tuple(values), np.array([*values.values()])
+            materials = tuple(self.sample[i][0] for i in carrying)
             if reason := _lacking(targets, materials):
                 fitted[name] = reason
                 continue
@@ -139,25 +163,29 @@ class Estimator:
 
     @cached_property
     def _of_complete(self) -> list[Scale]:
-        complete = [set(rows) for touch in self.touches if (rows := self._rows(touch, self.last))]
+        complete = [set(rows) for *_, touch in self.sample if (rows := self._rows(touch, self.last))]
         return sorted(set.intersection(*complete)) if complete else self._judging(self.last)
 
     def _judging(self, stage: int) -> list[Scale]:
         return self.plan.judging(self.plan.milestones()[stage])
 
-    def _rows(self, valued: ValuedTouch, stage: int) -> dict[Scale, npt.NDArray[np.int32]]:
+    def _rows(self, touch: SampledTouch, stage: int) -> dict[Scale, npt.NDArray[np.int32]]:
         """The rows of a sampled touch as it was at a stage, by scale; none where it was not there at that length."""
-        touch = valued.touch
         own = int(touch.pairs[:, 0].max())  # the touch's last stage, at which its length is its own
         if own < self.last or (own > self.last and self.plan.judged == "widest"):
             return {}
         at = own if stage == self.last else stage
         scales = sorted([*self._judging(at), *(self.plan.views if at == own else ())])
-        return {
-            scales[place]: row
-            for (number, place, _), row in zip(touch.pairs.tolist(), touch.rows, strict=True)
-            if number == at
-        }
+        places = zip(touch.pairs.tolist(), touch.rows, strict=True)
+        return {scales[place]: row for (number, place, _), row in places if number == at}
+
+
+def value_of(annotations: Annotations, quantity: Quantity) -> float | None:
+    """The value that a touch has of a quantity; the mean where it was observed several times, None without any."""
+    told = [(dict(annotation.values).get(quantity.name), copies) for annotation, copies in annotations]
+    found = [(quantity.value(steps), copies) for steps, copies in told if steps is not None]
+    count = sum(copies for _, copies in found)
+    return math.fsum(value * copies for value, copies in found) / count if found else None
 
 
 def _lacking(targets: FloatArray, materials: Sequence[str]) -> str:
@@ -172,7 +200,7 @@ def _lacking(targets: FloatArray, materials: Sequence[str]) -> str:
 
 
 def _estimate(
-    heads: Heads | str, quantity: Measured, features: Sequence[FloatArray], risk: float, *, known: bool
+    heads: Heads | str, quantity: Quantity, features: Sequence[FloatArray], risk: float, *, known: bool
 ) -> Estimate:
     if isinstance(heads, str):
         return Estimate(None, None, None, quantity.unit, risk, known, missing=heads)

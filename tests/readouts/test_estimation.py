@@ -1,13 +1,17 @@
 """Estimates by sampled touches: which heads answer at which length, what they cover, and what they say is missing."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Scene, Sensor
 from scroll_tactile.embeddings.protocol import window_plan
-from scroll_tactile.prediction.estimation import Estimator, Measured, ValuedTouch
 from scroll_tactile.prediction.features import FeatureExtractor
+from scroll_tactile.quantities import Quantity
+from scroll_tactile.readouts.estimation import Estimator, value_of
 from scroll_tactile.signals.windows import SHAPE
+from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.statistics.sample import SampledTouch
 
 PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1.0, unit="N", duration=2.0)
@@ -15,7 +19,7 @@ EMBEDDING = Kernels(dimension=128)
 PLAN = window_plan(PAD, EMBEDDING)
 EXTRACTOR = FeatureExtractor(PAD, EMBEDDING, PLAN, None)
 SCENE = Scene(sensor=PAD)
-FORCE = Measured("N", 0.0, 4.0)
+FORCE = Quantity(name="force", unit="N", low=0.0, high=4.0, resolution=0.001)
 NAMES = ["felt", "denim", "cork", "silk"]
 
 
@@ -24,17 +28,25 @@ def felt(name, repetition, seconds=2.0):
     return SCENE.touch(name, repetition, seconds, force=force), force
 
 
-def valued(name, repetition, seconds=2.0, **more):
+def valued(name, repetition, seconds=2.0, quantity=FORCE, value=None):
+    """A sampled touch that carries its force, or another value."""
     touch, force = felt(name, repetition, seconds)
     steps, codes = EXTRACTOR.learned(touch)
-    return ValuedTouch(name, SampledTouch.of(PLAN.scored_stages(steps), codes), {"force": force, **more})
+    sampled = SampledTouch.of(PLAN.scored_stages(steps), codes)
+    return with_value((name, touch.key, sampled), quantity, force if value is None else value)
+
+
+def with_value(sampled, quantity, value):
+    name, key, touch = sampled
+    annotation = Annotation(((quantity.name, quantity.integer(value)),))
+    return name, key, dataclasses.replace(touch, annotations=((annotation, 1),))
 
 
 LEARNED = [valued(name, repetition) for name in NAMES[:3] for repetition in range(20)]
 
 
 def estimator_of(touches=LEARNED, quantities=None, least=100):
-    return Estimator(PLAN, touches, quantities or {"force": FORCE}, least)
+    return Estimator.of(PLAN, touches, quantities or {"force": FORCE}, least)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +112,7 @@ def test_risks_too_small_for_the_touches_give_the_range(estimator):
         (LEARNED[:20], "all of 'felt'; it takes two materials"),
         ([], "0 sampled touches"),
         ([valued(name, 0) for name in NAMES[:2]], "2 sampled touches"),
-        ([valued(name, i, force=1.0) for name in NAMES[:2] for i in range(3)], "the same value, 1;"),
+        ([valued(name, i, value=1.0) for name in NAMES[:2] for i in range(3)], "the same value, 1;"),
     ],
 )
 def test_what_is_missing_is_said_and_no_number_given(touches, missing):
@@ -110,17 +122,32 @@ def test_what_is_missing_is_said_and_no_number_given(touches, missing):
 
 
 def test_touches_without_a_value_have_no_part_and_cost_nothing():
-    temperature = Measured("K", 0.0, 400.0)
-    mixed = [valued(t.material, 200 + i, hot=300.0 + i % 7) for i, t in enumerate(LEARNED[::4])]
-    both = estimator_of([*LEARNED, *mixed], {"force": FORCE, "hot": temperature})
-    alone = estimator_of(mixed, {"hot": temperature})
+    heat = Quantity(name="hot", unit="K", low=200.0, high=400.0, resolution=0.1)
+    mixed = [valued(name, 200 + i, quantity=heat, value=300.0 + i % 7) for i, (name, *_) in enumerate(LEARNED[::4])]
+    both = estimator_of([*LEARNED, *mixed], {"force": FORCE, "hot": heat})
+    alone = estimator_of(mixed, {"hot": heat})
     touch = felt("cork", 7)[0]
     assert asked(both, touch, wanted=["hot"]) == asked(alone, touch, wanted=["hot"])
     assert asked(both, touch, wanted=["hot"])["hot"].touches == len(mixed)
 
 
 def test_a_property_of_the_material_in_disguise_is_given_away_by_its_interval():
-    stiff = [ValuedTouch(t.material, t.touch, {"force": 1.0 + NAMES.index(t.material)}) for t in LEARNED]
+    stiff = [with_value(sampled, FORCE, 1.0 + NAMES.index(sampled[0])) for sampled in LEARNED]
     touch = felt("cork", 7)[0]
     known, new = (asked(estimator_of(stiff), touch, known=known)["force"] for known in (True, False))
     assert new.width > 2 * known.width
+
+
+def test_heads_last_as_long_as_their_touches(estimator):
+    estimator.heads(0)
+    same = Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 99, estimator)
+    assert same.heads(0) is estimator.heads(0) and same.least == 99
+    assert Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 100, estimator) is estimator
+    fewer = Estimator.of(PLAN, LEARNED[1:], {"force": FORCE}, 100, estimator)
+    assert fewer.heads(0)["force"].known.weights.tobytes() != estimator.heads(0)["force"].known.weights.tobytes()
+
+
+def test_a_touch_that_was_observed_twice_has_the_mean_of_its_values():
+    one, other = Annotation((("force", 1000),)), Annotation((("force", 2500),), (("slip", "north"),))
+    assert value_of(((one, 2), (other, 1)), FORCE) == 1.5
+    assert value_of(((Annotation((), (("slip", "north"),)), 1),), FORCE) is None

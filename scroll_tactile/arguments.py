@@ -40,6 +40,10 @@ def _is_probability(value: Any) -> bool:
     return isinstance(value, Real) and bool(0 <= float(value) <= 1)
 
 
+def _is_share(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < float(value) < 1)
+
+
 _PATH = "a path: a string, or what os.PathLike is, that the file system can have", _is_path
 
 _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
@@ -53,6 +57,8 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "embedding": ("an embedding, such as Kernels()", _is_embedding),
     "augmentation": ("an Augmented", lambda value: isinstance(value, Augmented)),
     "unfamiliar": ("a probability from 0 to 1", _is_probability),
+    "risk": ("a share between 0 and 1", _is_share),
+    "known": ("True, False, or None for what the prediction says", lambda value: isinstance(value, bool)),
     "progress": ("a function of (what is being done, steps done, steps in all)", callable),
 }
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from scroll_tactile.arguments import require_arguments
 from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import DescriptionError, InputError, RangeWarning
+from scroll_tactile.errors import AnnotationError, DescriptionError, InputError, RangeWarning
 from scroll_tactile.memory.tuned import TuneReport
 from scroll_tactile.persistence.keeper import MemoryKeeper
 from scroll_tactile.persistence.ledger import Ledger
@@ -21,7 +21,7 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.prediction.reembedding import embed_again
 from scroll_tactile.recipe import Recipe, RecipeRequest
-from scroll_tactile.results import Composition, Prediction, Receipt
+from scroll_tactile.results import Composition, Estimate, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.copies import Augmented
@@ -254,6 +254,24 @@ class TactileLearner(MemoryKeeper):
 
         return self._predictor.predict(streams, wanted, reader_of)
 
+    def estimate(
+        self, stream: Readings, *, of: Sequence[str] | None = None, risk: float = 0.1, known: bool | None = None
+    ) -> dict[str, Estimate]:
+        """Estimate quantities of a touch, such as its force, with intervals, by name; the memory stays as it is.
+
+        stream: as for `observe`. of: which quantities; None: all that were declared. risk: the share of touches whose
+        interval may miss the true value. known: whether the intervals are those for a material that was learned, or for
+        a new one, which are wider; None: as the prediction says.
+
+        It rests on the sampled touches that carry values, 256 at most, and a function of these gives the same bits
+        whatever the order they came in. Without what it takes it gives no number, and says what is missing.
+
+        Raises StreamError; AnnotationError where nothing was declared, and for a quantity that was not; InputError for
+        a risk that is no share between 0 and 1.
+        """
+        require_arguments({"risk": risk}, {"known": known})
+        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)
+
     def live(
         self,
         *,
@@ -262,12 +280,14 @@ class TactileLearner(MemoryKeeper):
         false_contacts: float = 1.0,
         scene: Sequence[str] | None = None,
         of: str | None = None,
+        widths: Mapping[str, float] | None = None,
     ) -> LiveSession:
         """Begin to take readings as they come; see `LiveSession.push`.
 
         risk: the share of wrong answers among those that are decided. contact: "auto" finds touches by the sensor's own
         noise at rest, which it learns first: for two seconds nothing may touch it. "manual" leaves that to
         `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene, of: as for `predict`.
+        widths: quantity → how narrow its interval is to be, in its unit, before `LiveState.settled` says so.
 
         Each touch is predicted by the memory as it was when it began, and by itself unless `LiveSession.again` says
         that it is of the same thing as the last.
@@ -278,7 +298,8 @@ class TactileLearner(MemoryKeeper):
         """
         from scroll_tactile.live.session import LiveSession
 
-        return LiveSession(self._by(of), risk=risk, contact=contact, false_contacts=false_contacts, scene=scene)
+        session: dict[str, Any] = {"risk": risk, "contact": contact, "false_contacts": false_contacts, "scene": scene}
+        return LiveSession(self._by(of), **session, widths=widths)
 
     def _by(self, axis: str | None) -> Predictor:
         """What answers by the labels on an axis; by materials where it is None."""

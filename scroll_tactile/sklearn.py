@@ -1,4 +1,4 @@
-"""A learner as an estimator of scikit-learn: for pipelines, cross-validation and grid searches."""
+"""A learner as estimators of scikit-learn: for pipelines, cross-validation and grid searches."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
-from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.base import BaseEstimator, ClassifierMixin, RegressorMixin
 from sklearn.exceptions import NotFittedError
 
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.quantities import Quantity
+from scroll_tactile.results import Estimate
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import validate
 
-__all__ = ["TactileClassifier"]
+__all__ = ["TactileClassifier", "TactileRegressor"]
 
 RATE = 100.0  # Hz, where nothing is known of the sensor
 MARGIN = 0.1  # of the range that was seen, beyond it at both ends
@@ -70,14 +72,7 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
             )
         learner: TactileLearner | None = getattr(self, "learner_", None)
         if learner is None:
-            sensor = _sensor_of(touches) if self.sensor is None else self.sensor
-            learner = TactileLearner(
-                sensor=sensor,
-                embedding=self.embedding,
-                readout=self.readout,
-                kept_touches=self.kept_touches,
-                exemplars=0,
-            )
+            learner = _learner_of(self, touches)
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):
             learner.observe(str(label), stream, again=True)  # a row that comes twice weighs twice
@@ -105,6 +100,85 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
         tags.input_tags.three_d_array = True
         tags.target_tags.required = True
         return tags
+
+
+class TactileRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # as above
+    """A quantity of touches, in memory only, behind fit, predict and score, with intervals by predict_interval.
+
+    Touches X: as of `TactileClassifier`. Numbers y, (N,), finite. materials: what each touch is of, (N,), passed to
+    `fit`, two or more: intervals for materials that were never felt come from those held out.
+
+    sensor, embedding, readout, kept_touches: as of `TactileClassifier`. It rests on 256 touches at most, drawn by their
+    content (see `TactileLearner.estimate`).
+
+    After fitting: n_features_in_, the channels; learner_, the learner, whose quantity is "y", from the least y to the
+    most and their difference beyond both.
+
+    Raises InputError for numbers or materials that do not fit the touches, and where they say too little for a head.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor | None = None,
+        embedding: Embedding | None = None,
+        readout: str = "lda",
+        kept_touches: int | None = None,
+    ) -> None:
+        self.sensor = sensor
+        self.embedding = embedding
+        self.readout = readout
+        self.kept_touches = kept_touches
+
+    def fit(self, X: Touches, y: npt.ArrayLike, materials: Labels | None = None) -> Self:
+        """Observe these touches and nothing else."""
+        touches, numbers, names = list(_arrays(X)), np.asarray(y, dtype=np.float64), np.asarray(materials)
+        if not touches or numbers.shape != (len(touches),) or not np.isfinite(numbers).all():
+            raise InputError(
+                f"expected touches, and a finite number for each; came {len(touches)} touches and numbers of shape "
+                f"{numbers.shape}"
+            )
+        if names.shape != numbers.shape or len(np.unique(names)) < 2:
+            raise InputError("expected materials=, what each touch is of, two or more: intervals are held out by them")
+        learner, low, high = _learner_of(self, touches), float(numbers.min()), float(numbers.max())
+        reach = (high - low) or 1.0
+        learner.declare(Quantity(name="y", unit="1", low=low - reach, high=high + reach, resolution=reach / 2**18))
+        for name, number, touch in zip(names, numbers.tolist(), touches, strict=True):
+            learner.observe(str(name), touch, values={"y": number}, again=True)
+        self.learner_, self.n_features_in_ = learner, learner.sensor.channels
+        return self
+
+    def predict(self, X: Touches) -> npt.NDArray[np.float64]:
+        """The number of each touch, (N,)."""
+        return np.array([estimate.value for estimate in self._estimates(X, 0.1, None)], dtype=np.float64)
+
+    def predict_interval(
+        self, X: Touches, confidence: float = 0.9, *, known: bool | None = None
+    ) -> npt.NDArray[np.float64]:
+        """(N, 2): the interval that holds each touch's number with this confidence. known: as of `estimate`."""
+        found = self._estimates(X, 1 - confidence, known)
+        return np.array([estimate.interval for estimate in found], dtype=np.float64).reshape(-1, 2)
+
+    def _estimates(self, touches: Touches, risk: float, known: bool | None) -> list[Estimate]:
+        learner: TactileLearner | None = getattr(self, "learner_", None)
+        if learner is None:
+            raise NotFittedError("this TactileRegressor knows no touches yet: call fit first")
+        found = [learner.estimate(touch, risk=risk, known=known)["y"] for touch in _arrays(touches)]
+        if lacking := next((each.missing for each in found if each.value is None), None):
+            raise InputError(f"these touches say too little: {lacking}")
+        return found
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.three_d_array = True
+        tags.target_tags.required = True
+        return tags
+
+
+def _learner_of(asked: TactileClassifier | TactileRegressor, touches: Sequence[npt.NDArray[Any]]) -> TactileLearner:
+    """An empty learner with the settings of an estimator, for touches like these."""
+    sensor = _sensor_of(touches) if asked.sensor is None else asked.sensor
+    how: dict[str, Any] = {"embedding": asked.embedding, "readout": asked.readout, "kept_touches": asked.kept_touches}
+    return TactileLearner(sensor=sensor, exemplars=0, **how)
 
 
 def _arrays(touches: Touches) -> Iterator[npt.NDArray[Any]]:

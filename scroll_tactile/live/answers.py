@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from scroll_tactile.results import Prediction
+from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["End", "LiveReport", "LiveState", "LiveTouch"]
@@ -24,7 +26,8 @@ class LiveTouch:
     as "time went back", as nothing moved for long ("still"), or because the session was "closed". earlier: the touches
     of the same thing before it that the prediction weighs with it, as `learner.predict(*earlier, stream)`; none unless
     `LiveSession.again` said so. revised: the prediction that was decided on before the touch ended, where the whole
-    touch says otherwise; None where it does not.
+    touch says otherwise; None where it does not. estimates: by quantity, those of all of it, equal to
+    `learner.estimate(stream, risk=…)`; none where no quantity was declared.
     """
 
     stream: Stream
@@ -34,6 +37,7 @@ class LiveTouch:
     end: End
     earlier: tuple[Stream, ...] = ()
     revised: Prediction | None = None
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
 
 
 class LiveState(NamedTuple):
@@ -43,10 +47,12 @@ class LiveState(NamedTuple):
     and of the touches of the same thing before it where `LiveSession.again` was called, made at the last of the moments
     at which it may change; None before the first. decided: whether it is safe to act on: then both stay until the touch
     ends. ended: whether a touch ended in this push. touches: all that ended in it, in order; a block of readings can
-    hold several.
+    hold several. estimates: by quantity, of the last milestone that the touch came to; see
+    `learner.estimate`. settled: whether every interval was as narrow as the session's `widths` ask: a robot need touch
+    no longer for their sake.
 
-    Where a touch ended and none began after it in the same push, seconds, prediction and decided are those of the touch
-    that ended. At rest they are 0, None and False.
+    Where a touch ended and none began after it in the same push, all of these but contact and touches are those of the
+    touch that ended. At rest they are 0, None, False and empty.
     """
 
     contact: bool = False
@@ -55,6 +61,8 @@ class LiveState(NamedTuple):
     decided: bool = False
     ended: bool = False
     touches: tuple[LiveTouch, ...] = ()
+    estimates: Mapping[str, Estimate] = MappingProxyType({})
+    settled: bool = False
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,9 +15,11 @@ from scroll_tactile.errors import StreamError
 from scroll_tactile.live.decision import DecisionRule
 from scroll_tactile.prediction.current import FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
-from scroll_tactile.prediction.predictor import Predictor, nothing_known
-from scroll_tactile.results import Prediction
+from scroll_tactile.prediction.predictor import Predictor, estimates_of, nothing_known
+from scroll_tactile.readouts.estimation import Estimator
+from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Scale
 
 __all__ = ["GrowingTouch", "Recent", "TouchRows"]
 
@@ -89,7 +91,9 @@ class GrowingTouch:
 
     rows: its readings, of a camera behind the resting image. at: when it began. moments: that are to come, in readings;
     the next is the last of them. before: readings that are no part of it, such as a camera's resting image. earlier:
-    the touches of the same thing before it; encoded: they, as its model reads them.
+    the touches of the same thing before it; encoded: they, as its model reads them. estimator: None where no quantity
+    was declared. widths: quantity → how narrow its interval is to be. estimates: by quantity, as of `stage`; settled:
+    whether every interval was as narrow as it is to be, False where none is asked to be.
     """
 
     predictor: Predictor
@@ -102,20 +106,29 @@ class GrowingTouch:
     moments: list[int]
     before: int
     earlier: tuple[Stream, ...] = ()
+    estimator: Estimator | None = None
+    widths: Mapping[str, float] = field(default_factory=dict)
     cache: WindowCache = field(default_factory=WindowCache)
     encoded: list[Encoded] = field(default_factory=list)
     prediction: Prediction | None = None
     decided: bool = False
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    stage: int | None = None
+    settled: bool = False
 
     def predict_in_time(self) -> None:
-        """Predict at the last moment that the touch has come to, if any is new."""
+        """Predict at the last moment that the touch has come to, if any is new, until both are what was asked for."""
         moment = 0
         while self.moments and self.moments[-1] <= self.rows.came:
             moment = self.moments.pop()
         if moment:
             with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
-                self.predict(self.stream(moment))
-        if self.decided:
+                stream = self.stream(moment)
+                if self.prediction is None or not self.decided:
+                    self.predict(stream)
+                else:  # the prediction stays; what is asked of intervals is not reached yet
+                    self._estimate(self._encoded(stream), self.prediction)
+        if self.decided and (self.settled or not self.widths):
             self.moments.clear()
 
     def stream(self, count: int) -> Stream:
@@ -124,23 +137,46 @@ class GrowingTouch:
 
     def predict(self, stream: Stream) -> Prediction:
         """The prediction for the beginning of it, as `learner.predict` gives it."""
-        model = self.frozen.model
-        candidates = model.names
-        if self.scene is not None:
-            candidates = sorted({name for name in self.scene if name in model.known})
+        model, candidates = self.frozen.model, self._candidates()
         if not candidates:
             seconds = math.fsum({each.key: each.seconds for each in (*self.earlier, stream)}.values())
             self.prediction = nothing_known(seconds)
             return self.prediction
-
-        def encoded(each: Stream, cache: WindowCache | None = None) -> Encoded:
-            return self.extractor.encode(
-                each, model.longest, lambda columns: model.scales_for(candidates, columns), cache
-            )
-
-        self.encoded = self.encoded or [encoded(each) for each in self.earlier]
-        current = encoded(stream, self.cache)
+        self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
+        current = self._encoded(stream)
         self.prediction = self.predictor.answer_of(model, self.extractor, candidates, [*self.encoded, current])
         several = bool(self.earlier)
         self.decided = self.decided or self.rule.decided(self.prediction, current.steps, several=several)
+        self._estimate(current, self.prediction)
         return self.prediction
+
+    def _candidates(self) -> list[str]:
+        model = self.frozen.model
+        if self.scene is None:
+            return model.names
+        return sorted({name for name in self.scene if name in model.known})
+
+    def _encoded(self, stream: Stream, cache: WindowCache | None = None) -> Encoded:
+        model, candidates, estimator = self.frozen.model, self._candidates(), self.estimator
+
+        def scales_for(steps: int) -> list[Scale]:
+            own = model.scales_for(candidates, steps)
+            return own if estimator is None else sorted({*own, *estimator.scales_for(steps)})
+
+        return self.extractor.encode(stream, model.longest, scales_for, self.cache if cache is None else cache)
+
+    def _estimate(self, encoded: Encoded, prediction: Prediction) -> None:
+        """Estimate where the touch has come to another of its milestones, or has ended complete."""
+        estimator = self.estimator
+        if estimator is None:
+            return
+        stage = estimator.stage(encoded.steps)
+        if stage != self.stage or stage == estimator.last:
+            names = estimator.wanted(None)
+            self.estimates = estimates_of(
+                estimator, names, encoded, self.extractor, prediction, self.rule.risk, known=None
+            )
+            self.stage = stage
+            found = [(self.estimates[name].width, width) for name, width in self.widths.items()]
+            narrow = [own is not None and own <= width for own, width in found]
+            self.settled = self.settled or (bool(narrow) and all(narrow))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from numbers import Real
 from types import TracebackType
 from typing import Any, Literal, Self
 from weakref import WeakKeyDictionary
@@ -52,6 +53,7 @@ class LiveSession:
         contact: Literal["auto", "manual"],
         false_contacts: float,
         scene: Sequence[str] | None,
+        widths: Mapping[str, float] | None = None,
     ) -> None:
         if contact not in ("auto", "manual"):
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
@@ -65,7 +67,7 @@ class LiveSession:
         frozen = predictor.frozen()  # until the rule is measured, which takes seconds
         model = frozen.model
         candidates_of(scene, model.names, model.known)
-        self._scene = scene
+        self._scene, self._widths = scene, _checked(predictor, widths)
         self._manual = contact == "manual"
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
@@ -81,7 +83,7 @@ class LiveSession:
         self._ended: list[LiveTouch] = []
         self._thing: tuple[Stream, ...] = ()  # the touches of what was touched last
         self._again = False  # whether the next touch is one more of them
-        self._closed = False
+        self._closed = self._settled = False
         self.touch: Stream | None = None
         first = model not in _RULES
         rule = self._rule(model)
@@ -252,7 +254,9 @@ class LiveSession:
         earlier, self._again = self._thing if self._again else (), False
         kept = TouchRows(rows, limit)
         self._under_way = GrowingTouch(
-            self._predictor, self._extractor, self._scene, kept, at, frozen, rule, moments, before, earlier
+            *(self._predictor, self._extractor, self._scene, kept, at, frozen, rule, moments, before, earlier),
+            estimator=self._predictor.estimator(),
+            widths=self._widths,
         )
         self._under_way.predict_in_time()
 
@@ -302,7 +306,9 @@ class LiveSession:
         self.report.undecided += not touch.decided
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
-        self._ended.append(LiveTouch(stream, prediction, touch.decided, touch.at, end, touch.earlier, revised))
+        said = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
+        self._ended.append(LiveTouch(stream, prediction, *said))
+        self._settled = touch.settled
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""
@@ -316,11 +322,29 @@ class LiveSession:
         touch, ended = self._under_way, tuple(self._ended)
         if touch is not None:
             seconds = max(0, touch.rows.came - touch.before) / self.sensor.rate
-            return LiveState(True, seconds, touch.prediction, touch.decided, bool(ended), ended)
+            said = touch.prediction, touch.decided, bool(ended), ended, touch.estimates, touch.settled
+            return LiveState(True, seconds, *said)
         if not ended:
             return _AT_REST
         last = ended[-1]
-        return LiveState(False, last.stream.seconds, last.prediction, last.decided, True, ended)
+        said = last.prediction, last.decided, True, ended, last.estimates, self._settled
+        return LiveState(False, last.stream.seconds, *said)
+
+
+def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:
+    """Widths that were asked for, of quantities that were declared; the heads that estimate them are fitted."""
+    estimator, asked = predictor.estimator(), dict(widths or {})
+    for name, width in asked.items():
+        if not (isinstance(width, Real) and 0 < float(width) < math.inf):
+            raise InputError(f"expected the width of {name!r} as a number above 0; came {width!r:.60}")
+    if estimator is None:
+        if asked:
+            raise InputError(f"expected widths of declared quantities; came {sorted(asked)}, and none was declared")
+        return {}
+    estimator.wanted(list(asked))
+    for stage in range(estimator.last + 1):
+        estimator.heads(stage)  # a touch under way should not wait for them
+    return asked
 
 
 def _says(prediction: Prediction) -> str | None:

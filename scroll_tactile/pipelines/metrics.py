@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 
-__all__ = ["accuracy", "calibration_error", "confusion_counts", "mean_and_spread"]
+__all__ = ["accuracy", "calibration_error", "confusion_counts", "interval_figures", "mean_and_spread"]
 
 
 def accuracy(truth: Sequence[str | None], predicted: Sequence[str | None]) -> float:
@@ -41,6 +41,29 @@ def calibration_error(probability: npt.ArrayLike, right: npt.ArrayLike, bins: in
     gaps = np.zeros(bins)
     np.add.at(gaps, place, hits - chances)  # n_b times the difference of the means
     return float(np.abs(gaps).sum() / len(chances))
+
+
+def interval_figures(
+    truth: npt.ArrayLike, said: npt.ArrayLike, low: npt.ArrayLike, high: npt.ArrayLike
+) -> dict[str, float | None]:
+    """How good N numbers with intervals are, all of shape (N,) and in one unit.
+
+    covered: the share of intervals that hold the truth, Σ_i [low_i ≤ t_i ≤ high_i] / N. width: their mean, in the unit.
+    mean_error: Σ_i |s_i − t_i| / N, in the unit. r2: 1 − Σ_i (s_i − t_i)² / Σ_i (t_i − mean t)²; None where all t are
+    equal.
+
+    Raises InputError where N differs or is 0.
+    """
+    true, value, below, above = (np.asarray(one, dtype=np.float64) for one in (truth, said, low, high))
+    for other in (value, below, above):
+        _require_pairs(len(true), len(other))
+    spread = float(np.square(true - true.mean()).sum())
+    return {
+        "covered": float(((below <= true) & (true <= above)).mean()),
+        "width": float((above - below).mean()),
+        "mean_error": float(np.abs(value - true).mean()),
+        "r2": 1 - float(np.square(value - true).sum()) / spread if spread else None,
+    }
 
 
 def mean_and_spread(values: Sequence[float]) -> tuple[float, float]:

@@ -248,6 +248,11 @@ class Predictor:
             self._discard_stored(reading, error)
             return self.extractor.verified()
 
+    def estimator(self) -> Estimator | None:
+        """What estimates quantities in the present memory; None where none was declared."""
+        with self.ledger.lock:
+            return self.current.estimator(self.ledger) if self.ledger.memory.quantities else None
+
     def frozen(self) -> FrozenModel:
         """The model of the present memory, unchanged for as long as the returned object lives."""
         with self.ledger.lock, enough_memory():
@@ -338,7 +343,10 @@ def estimates_of(
     new material.
     """
     as_known = prediction.known is True if known is None else known
-    inside = prediction.known is not False and not prediction.unusual
+    strange = set(prediction.unusual)
+    if encoded is not None and estimator.stage(encoded.steps) < estimator.last:
+        strange.discard("shorter")  # than complete touches: its heads are of touches as they were at its milestone
+    inside = prediction.known is not False and not strange
     if encoded is None:
         found = estimator.estimate(wanted, {}, 0, risk, known=as_known)
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -279,7 +279,19 @@ def _figures(done: Evaluation) -> dict[str, Any]:
         "never_learned": len(never_learned),
         "never_learned_called_unknown": sum(each.prediction.known is False for each in never_learned),
         "wrong": wrong,
+        **({"measured": done.measured} if done.measured else {}),
     }
+
+
+def _measured_text(figures: Mapping[str, Any]) -> str:
+    without = f"; {figures['without']} without a number" if figures["without"] else ""
+    if not figures["touches"]:
+        return f"no number{without}"
+    r2 = "" if figures["r2"] is None else f", R² {figures['r2']:.3f}"
+    return (
+        f"{percent(figures['covered'])} of {figures['touches']} in their interval, where {percent(1 - figures['risk'])} "
+        f"are asked; {figures['width']:.4g} wide; off by {figures['mean_error']:.4g}{r2}{without}"
+    )
 
 
 def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
@@ -299,6 +311,9 @@ def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
             f"[bold]touches of materials that it never learned:[/] {found['never_learned']}, of which it calls "
             f"{found['never_learned_called_unknown']} unknown"
         )
+    for name, found_of in done.measured.items():
+        for of, figures in found_of.items():
+            say(f"[bold]{shown(name)}[/], {of} materials: {_measured_text(figures)}")
     names = sorted({*answers.truth, *(name for name in answers.predicted if name)})
     if answers.confusions() and len(names) <= MOST_NAMES:
         tested = [answers.truth.count(name) for name in names]

@@ -21,6 +21,7 @@ from scroll_tactile.cli.options import (
 )
 from scroll_tactile.cli.terminal import (
     console,
+    estimate_text,
     opened,
     opened_for_upkeep,
     percent,
@@ -32,7 +33,6 @@ from scroll_tactile.cli.terminal import (
     verdict,
 )
 from scroll_tactile.errors import DescriptionError, InputError, printable
-from scroll_tactile.results import Prediction
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 
 if TYPE_CHECKING:
@@ -145,9 +145,10 @@ def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv:
         elif as_csv:
             say_csv(*answer_row(each))
         elif as_json:
-            say_json({"source": each.touch.source} | _answer(each.prediction))
+            say_json({"source": each.touch.source} | _answer(each))
         else:
             say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+            _say_estimates(each)
     return refused
 
 
@@ -159,15 +160,22 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
         raise InputError(found.why)
     prediction = found.prediction
     if as_json:
-        say_json(_answer(prediction))
+        say_json(_answer(found))
         return
     say(f"{verdict(prediction)}, from {prediction.seconds:g} s of touch")
     for name, probability in prediction.ranking[:5]:
         say(f"  {percent(probability):>8}  {shown(name)}")
+    _say_estimates(found)
 
 
-def _answer(prediction: Prediction) -> dict[str, Any]:
-    return prediction.as_json() | {"seconds": prediction.seconds, "ranking": prediction.ranking}
+def _say_estimates(answered: Answered) -> None:
+    for name, estimate in answered.estimates.items():
+        say(f"  {shown(name)}: {estimate_text(estimate)}")
+
+
+def _answer(answered: Answered) -> dict[str, Any]:
+    of, found = answered.prediction, {name: own.as_json() for name, own in answered.estimates.items()}
+    return of.as_json() | {"seconds": of.seconds, "ranking": of.ranking} | ({"estimates": found} if found else {})
 
 
 def answer_row(answered: Answered) -> list[Any]:

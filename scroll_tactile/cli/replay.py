@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 
 from scroll_tactile.cli.options import Columns, MemoryFolder
-from scroll_tactile.cli.terminal import console, opened, percent, say, say_json, shown, verdict
+from scroll_tactile.cli.terminal import console, estimate_text, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
+    from scroll_tactile.results import Estimate
 
 __all__ = ["live"]
 
@@ -106,9 +107,12 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
                 revised=ended.revised is not None,
                 end=ended.end,
                 **ended.prediction.as_json(),
+                **_measured(ended.estimates),
             )
         else:
             say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {_judged(ended)}")
+            for name, estimate in ended.estimates.items():
+                say(f"            {shown(name)}: {estimate_text(estimate)}")
             growing.update("", refresh=growing.is_started)
     old = before if before is not None and before.contact else None
     if not now.contact:
@@ -117,13 +121,24 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
         if old is None:
             _line("began", at - now.seconds)
         if now.prediction is not None and (old is None or now.prediction is not old.prediction):
-            _line("prediction", at, seconds=now.seconds, decided=now.decided, **now.prediction.as_json())
+            _line(
+                "prediction",
+                at,
+                seconds=now.seconds,
+                decided=now.decided,
+                **now.prediction.as_json(),
+                **_measured(now.estimates),
+            )
         return now
     if growing.is_started:
         growing.update(_table(now), refresh=True)
     elif now.decided and (old is None or not old.decided) and now.prediction is not None:
         say(f"{at:8.2f} s  after {now.seconds:.2f} s: {verdict(now.prediction)}, decided")
     return now
+
+
+def _measured(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
 
 
 def _judged(ended: LiveTouch) -> str:
@@ -142,6 +157,8 @@ def _table(now: LiveState) -> Table:
     if now.prediction is not None:
         for name, probability in now.prediction.ranking[:SHOWN]:
             table.add_row(shown(name), percent(probability), "█" * round(BAR * probability))
+    for name, estimate in now.estimates.items():
+        table.add_row(shown(name), "", estimate_text(estimate))
     return table
 
 

@@ -22,7 +22,7 @@ from typer.core import TyperGroup
 from scroll_tactile.cli import INTERRUPTED
 from scroll_tactile.cli.wording import has_option, in_options, typed
 from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, plain_cell, printable
-from scroll_tactile.results import Prediction
+from scroll_tactile.results import Estimate, Prediction
 from store import NotAStoreError, Store, StoreError
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ __all__ = [
     "Commands",
     "confusion_text",
     "console",
+    "estimate_text",
     "opened",
     "opened_for_upkeep",
     "percent",
@@ -189,6 +190,17 @@ def verdict(prediction: Prediction) -> str:
         return f"[bold yellow]never felt this[/]; nearest is {name}{felt}"
     doubt = "" if prediction.known else ", if it was ever felt: nothing learned so far can tell"
     return f"[bold green]{name}[/] with {percent(prediction.probability)}{felt}{doubt}"
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """An estimate in words."""
+    if estimate.value is None:
+        return f"[yellow]no number[/]: {shown(estimate.missing)}"
+    ends = f"{estimate.low:.4g} to {estimate.high:.4g}"
+    whose = "a learned material" if estimate.known else "a new material"
+    more = f"; {shown(estimate.missing)}" if estimate.missing else f" with {percent(1 - estimate.risk)}, of {whose}"
+    doubt = "" if estimate.inside else ", [yellow]unlike what was learned[/]"
+    return f"[bold]{estimate.value:.4g}[/] {shown(estimate.unit)} ({ends}{more}){doubt}"
 
 
 @contextmanager

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
+from typing import Any
+
+import numpy as np
 
 from scroll_tactile.errors import InputError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.pipelines.classification import Answers
-from scroll_tactile.pipelines.metrics import calibration_error
+from scroll_tactile.pipelines.metrics import calibration_error, interval_figures
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.ranges import all_clipped, range_problem
@@ -136,10 +139,11 @@ class _Batch:
 
 @dataclass(frozen=True)
 class Answered:
-    """A touch out of a source, and what it feels like."""
+    """A touch out of a source, what it feels like, and the estimates of its quantities, if any was declared."""
 
     touch: SourceTouch
     prediction: Prediction
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
 
 
 def answers(
@@ -153,7 +157,12 @@ def answers(
 ) -> Iterator[Answered | Refused]:
     """What each touch in sources feels like; the memory stays as it is. named: as of `source_touches`."""
     for touch in _touches(learner, sources, options, progress, named=named):
-        yield touch if isinstance(touch, Refused) else Answered(touch, learner.predict(touch.stream, scene=scene))
+        yield touch if isinstance(touch, Refused) else _answered(learner, touch, scene)
+
+
+def _answered(learner: TactileLearner, touch: SourceTouch, scene: Sequence[str] | None = None) -> Answered:
+    estimates = learner.estimate(touch.stream) if learner.quantities else {}
+    return Answered(touch, learner.predict(touch.stream, scene=scene), estimates)
 
 
 def _touches(
@@ -207,6 +216,37 @@ class Evaluation:
         right = [name == predicted for name, predicted in zip(truth.truth, truth.predicted, strict=True)]
         return calibration_error([each.prediction.probability for each in learned], right) if learned else None
 
+    @property
+    def measured(self) -> dict[str, dict[str, Any]]:
+        """Quantity → figures of its estimates of touches whose value is known, see `interval_figures`.
+
+        For those of learned materials by name, and for "new" materials behind it, with the number of touches; what no
+        number was given for is left out of them and counted as "without".
+        """
+        names = sorted({name for each in self.answered for name in each.touch.values})
+        return {
+            name: {
+                of: figures
+                for of, among in (("learned", self.of_learned), ("new", self.of_others))
+                if (figures := _measured(name, among)) is not None
+            }
+            for name in names
+        }
+
+
+def _measured(name: str, answered: Sequence[Answered]) -> dict[str, Any] | None:
+    """The figures of a quantity over touches with a value of it; None where there are none."""
+    pairs = [
+        (each.touch.values[name], each.estimates[name])
+        for each in answered
+        if name in each.touch.values and name in each.estimates
+    ]
+    said = [(true, own.value, own.low, own.high) for true, own in pairs if own.value is not None]
+    if not pairs:
+        return None
+    figures = interval_figures(*np.array(said, dtype=np.float64).T) if said else {}
+    return {"touches": len(said), "without": len(pairs) - len(said), "risk": pairs[0][1].risk, **figures}
+
 
 def evaluate_sources(
     learner: TactileLearner,
@@ -231,5 +271,5 @@ def evaluate_sources(
         known = bool(learner.names_of(touch.stream))
         seen += known
         if with_learned or not known:
-            answered.append(Answered(touch, learner.predict(touch.stream)))
+            answered.append(_answered(learner, touch))
     return Evaluation(tuple(answered), tuple(refused), frozenset(learner.materials), seen)

@@ -44,7 +44,7 @@ from store import StoreError
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["CurrentModel", "FrozenModel"]
+__all__ = ["CurrentModel", "FrozenModel", "estimator_of"]
 
 BEGIN, ADOPT = 2, 3  # growth in sixteenths of the touches fitted to: a fit begins, and its model is adopted
 LEAST = 2  # touches of growth at which a model is adopted at the earliest
@@ -299,10 +299,14 @@ class CurrentModel:
 
     def estimator(self, ledger: Ledger) -> Estimator:
         """What estimates by the sampled touches of this memory; its heads stay while these are the same."""
-        memory = ledger.memory
-        least = max(1, memory.statistics.fifth_percentile_length)
-        self._estimator = Estimator.of(memory.plan, memory.sample, memory.quantities, least, self._estimator)
+        self._estimator = estimator_of(ledger.memory, self._estimator)
         return self._estimator
+
+
+def estimator_of(memory: Memory, before: Estimator | None = None) -> Estimator:
+    """What estimates by the sampled touches of a memory. before: see `Estimator.of`."""
+    least = max(1, memory.statistics.fifth_percentile_length)
+    return Estimator.of(memory.plan, memory.sample, memory.quantities, least, before)
 
 
 def _has_all_of(memory: Memory, model: Model) -> bool:

@@ -14,6 +14,7 @@ from scroll_tactile.report.drawing import LEFT, WIDTH, Axis, Drawing, clipped_na
 
 __all__ = [
     "Bin",
+    "against_truth",
     "answers",
     "confusions",
     "dated",
@@ -152,6 +153,23 @@ def reliability(bins: Sequence[Bin], confidences: Sequence[float]) -> str:
             drawing.box(axis(i / 20), down(0) - tall, axis(0.05) - axis(0) - 0.8, tall, "fill", 0.6, f"{count} answers")
     drawing.across(axis, 262, 262, "probability that was given", "{:.0%}")
     drawing.text(46, 221, "how many answers (root scale)", "tiny")
+    return drawing.svg()
+
+
+def against_truth(truth: Sequence[float], said: Sequence[float], half: float, names: Sequence[str], unit: str) -> str:
+    """Numbers that were said of touches held out, by the true ones. half: an interval's, drawn about the ideal."""
+    low, high = min(*truth, *said), max(*truth, *said)
+    drawing = Drawing(300, "The number that was said, by the true one")
+    axis, up = Axis(low, high, 46, RIGHT), Axis(low, high, 262, 8)
+    drawing.up(up, 46, RIGHT)
+    drawing.line([(axis(low), up(low)), (axis(high), up(high))], "ideal")
+    reach = min(half, high - low)
+    drawing.line([(axis(low), up(low + reach)), (axis(high - reach), up(high))], "grid")
+    drawing.line([(axis(low + reach), up(low)), (axis(high), up(high - reach))], "grid")
+    for true, value, name in zip(truth, said, names, strict=True):
+        kind = "point" if abs(true - value) <= half else "wrong"
+        drawing.dot(axis(true), up(value), 2.5, kind, f"{name}: {value:.4g} said, {true:.4g} true")
+    drawing.across(axis, 262, 262, f"true, {unit}")
     return drawing.svg()
 
 

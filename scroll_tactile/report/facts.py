@@ -20,10 +20,12 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.prediction.current import estimator_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
 from scroll_tactile.prediction.model import Model, enough_memory
+from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.report.drawing import as_counted
 from scroll_tactile.report.growing import Growing, Soon, chosen, growing, soon
 from scroll_tactile.report.knowledge import MOST_NEAR, Mistake, Trust, mistakes, separations, trust_in
@@ -135,6 +137,11 @@ class MemoryFacts:
         if self.model is None or not self.held_out or self.unread:
             return None
         return decision_rule(self.model, self.risk)
+
+    @cached_property
+    def estimator(self) -> Estimator | None:
+        """What estimates quantities; None where none was declared."""
+        return estimator_of(self.learner.memory) if self.learner.memory.quantities else None
 
     @cached_property
     def soon(self) -> Soon | None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.report.charts import answers, confusions, over_time, reliability, shares, tree
+from scroll_tactile.readouts.estimation import Heads
+from scroll_tactile.readouts.regression import Head
+from scroll_tactile.report.charts import against_truth, answers, confusions, over_time, reliability, shares, tree
+from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.report.growing import Growing
 from scroll_tactile.report.knowledge import MOST_NEAR, bins_of, unknown_by
 from scroll_tactile.report.page import figure, note, side_by_side, table
 
-__all__ = ["ROWS", "alike", "calibration_plots", "growing_answers", "mixed_up"]
+__all__ = ["ROWS", "alike", "calibration_plots", "estimated", "growing_answers", "mixed_up"]
 
 ROWS = 40  # materials, of which each has a row in a figure; of more there are tables
 SQUARE = 30  # materials, of which all pairs have a cell in a figure
@@ -135,6 +138,45 @@ def growing_answers(facts: MemoryFacts) -> str:
         f"{facts.risk:.0%}. The first two are the hardest touches there are."
     )
     return _soon(facts) + note(words) + side_by_side(*(_grown(touch) for touch in found))
+
+
+def estimated(facts: MemoryFacts) -> str:
+    """Quantities of complete touches: what was said of them held out, and how many lie in their intervals."""
+    estimator = facts.estimator
+    assert estimator is not None
+    parts = []
+    for name, heads in sorted(estimator.heads(estimator.last).items()):
+        unit = estimator.quantities[name].unit
+        parts.append(f"<h3>{shown(name)}</h3>")
+        if isinstance(heads, str):
+            parts.append(facts.lacks(f"How {name} is estimated", f"{heads}."))
+            continue
+        for head, of in (
+            (heads.known, "each touch held out"),
+            (heads.new, "each material held out, as if it were new"),
+        ):
+            parts.append(_against_truth(head, heads, facts.risk, unit, of))
+    return "".join(parts)
+
+
+def _against_truth(head: Head, heads: Heads, risk: float, unit: str, of: str) -> str:
+    half, off = head.half_width(risk), np.abs(head.residuals)
+    rows = [
+        (name, float((off[mine] <= half).mean()), f"{int((off[mine] <= half).sum())} of {mine.sum()} touches")
+        for name in sorted(set(heads.materials))
+        if (mine := np.array(heads.materials) == name).any()
+    ]
+    width = "unbounded: there are too few touches" if np.isinf(half) else f"{2 * half:.3g} {shown(unit)} wide"
+    caption = (
+        f"{len(off)} sampled touches, {of}: off by {off.mean():.3g} {shown(unit)} on average. Intervals that "
+        f"are to hold {1 - risk:.0%} are {width}."
+    )
+    said = heads.targets - head.residuals
+    drawn = against_truth(heads.targets.tolist(), said.tolist(), float(half), heads.materials, unit)
+    covered = shares(rows[:ROWS], 1 - risk, "held by their interval")
+    return side_by_side(
+        figure(drawn, caption), figure(covered, "By material. A material far below is unlike the others.")
+    )
 
 
 def _soon(facts: MemoryFacts) -> str:

@@ -14,7 +14,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.report.judgement import ROWS, alike, calibration_plots, growing_answers, mixed_up
+from scroll_tactile.report.judgement import ROWS, alike, calibration_plots, estimated, growing_answers, mixed_up
 from scroll_tactile.report.page import Card, State, cards, figure, page, table
 from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
 
@@ -60,6 +60,7 @@ def memory_page(
         ("mixed", "What it mixes up", mixed),
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
+        *([("estimated", "What it measures", estimated(facts))] if facts.estimator is not None else []),
         ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
         ("pictures", "What touches look like", exemplar_pictures(sensor, facts.kept, facts.exemplars)),
     ]

@@ -15,7 +15,7 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
-from scroll_tactile.results import Prediction
+from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.ranges import all_clipped
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
@@ -50,7 +50,8 @@ class Bridge:
     stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
     probability, known, novelty (None where nothing was ever observed), unusual, candidates and ranking (the five
     likeliest); "ended" also has end, why it did, and touches, of how many of the same thing the answer is. All but
-    event, stamp and contact may be missing where nothing was predicted yet.
+    event, stamp and contact may be missing where nothing was predicted yet. estimates, by quantity, is there where any
+    was declared: of each what an `Estimate` has.
 
     A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
     the clock of the stamps before it.
@@ -197,19 +198,24 @@ class Bridge:
             self._answer(self._now("brief", now))
 
     def _now(self, event: str, now: LiveState) -> Answer:
-        answer = {} if now.prediction is None else _answer_of(now.prediction)
+        answer = {} if now.prediction is None else _answer_of(now.prediction, now.estimates)
         here = {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
         return {"event": event, "stamp": self.stamp, **here, **answer}
 
     def _ended(self, touch: LiveTouch) -> Answer:
         over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
         over |= {"touches": 1 + len(touch.earlier)}
-        return {"event": "ended", "stamp": self.stamp, **over, **_answer_of(touch.prediction)}
+        return {"event": "ended", "stamp": self.stamp, **over, **_answer_of(touch.prediction, touch.estimates)}
 
 
-def _answer_of(prediction: Prediction) -> dict[str, Any]:
-    return prediction.as_json() | {
-        "unusual": prediction.unusual,
-        "candidates": prediction.candidates(),
-        "ranking": prediction.ranking[:RANKED],
-    }
+def _answer_of(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    measured = {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
+    return (
+        prediction.as_json()
+        | measured
+        | {
+            "unusual": prediction.unusual,
+            "candidates": prediction.candidates(),
+            "ranking": prediction.ranking[:RANKED],
+        }
+    )

@@ -289,8 +289,9 @@ def _measured_text(figures: Mapping[str, Any]) -> str:
         return f"no number{without}"
     r2 = "" if figures["r2"] is None else f", R² {figures['r2']:.3f}"
     return (
-        f"{percent(figures['covered'])} of {figures['touches']} in their interval, where {percent(1 - figures['risk'])} "
-        f"are asked; {figures['width']:.4g} wide; off by {figures['mean_error']:.4g}{r2}{without}"
+        f"{percent(figures['covered'])} of {figures['touches']} in their interval, where "
+        f"{percent(1 - figures['risk'])} are asked; {figures['width']:.4g} wide; "
+        f"off by {figures['mean_error']:.4g}{r2}{without}"
     )
 
 

@@ -322,8 +322,8 @@ class LiveSession:
         touch, ended = self._under_way, tuple(self._ended)
         if touch is not None:
             seconds = max(0, touch.rows.came - touch.before) / self.sensor.rate
-            said = touch.prediction, touch.decided, bool(ended), ended, touch.estimates, touch.settled
-            return LiveState(True, seconds, *said)
+            growing = touch.prediction, touch.decided, bool(ended), ended, touch.estimates, touch.settled
+            return LiveState(True, seconds, *growing)
         if not ended:
             return _AT_REST
         last = ended[-1]

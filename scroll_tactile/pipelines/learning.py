@@ -17,7 +17,7 @@ from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.pipelines.classification import Answers
 from scroll_tactile.pipelines.metrics import calibration_error, interval_figures
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
-from scroll_tactile.results import Prediction
+from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.ranges import all_clipped, range_problem
 
 __all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources", "store_model"]

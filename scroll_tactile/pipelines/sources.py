@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -157,11 +157,12 @@ class Refused:
 
 @dataclass(frozen=True)
 class SourceTouch:
-    """A touch out of a source: where it comes from, what names it (None where nothing does), and its stream."""
+    """A touch out of a source: where it comes from, what names it (None where nothing does), its stream and values."""
 
     source: str
     material: str | None
     stream: Stream
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 def find_sources(paths: Sequence[str]) -> tuple[list[str], list[Refused]]:

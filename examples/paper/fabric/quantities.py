@@ -197,7 +197,7 @@ def mapie(
     rows: FloatArray, targets: FloatArray, groups: npt.NDArray[np.intp] | None, asked: FloatArray, seed: int
 ) -> Intervals:
     """Ridge with MAPIE's CV+ intervals (Barber et al. 2021): five folds of touches, or each material a fold."""
-    with optional("mapie", "bench", "the comparison with MAPIE's intervals"):
+    with optional("mapie", "peers", "the comparison with MAPIE's intervals"):
         from mapie.regression import CrossConformalRegressor
     from sklearn.model_selection import KFold, LeaveOneGroupOut
 
@@ -211,7 +211,7 @@ def crepes(
     rows: FloatArray, targets: FloatArray, groups: npt.NDArray[np.intp] | None, asked: FloatArray, seed: int
 ) -> Intervals:
     """Ridge with crepes' split conformal intervals: a fifth of the touches, or one material, is kept to calibrate."""
-    with optional("crepes", "bench", "the comparison with crepes' intervals"):
+    with optional("crepes", "peers", "the comparison with crepes' intervals"):
         from crepes import WrapRegressor
     drawn = np.random.default_rng(seed).permutation(len(rows)) % 5 == 0
     held = drawn if groups is None else groups == groups.max()

@@ -12,7 +12,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError, MaterialError, StreamError
-from scroll_tactile.sklearn import TactileClassifier
+from scroll_tactile.sklearn import TactileClassifier, TactileRegressor
 
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 SMALL = Kernels(seed=0, dimension=64)
@@ -110,3 +110,42 @@ def test_what_does_not_fit_is_said():
     with pytest.raises(StreamError):
         fitted.partial_fit([*X, X[0][:, :1]], [*y, "felt"])
     assert fitted.learner_.digest() == make().fit(X, y).learner_.digest()
+
+
+def numbers(X):
+    """How far the readings of each touch swing."""
+    return X.std(axis=(1, 2)) * 10
+
+
+class TestRegressor:
+    def test_it_answers_as_its_learner_does_and_intervals_hold(self):
+        X, materials = touches(count=30)
+        y, part = numbers(X), np.random.default_rng(1).permutation(len(X)) % 2 == 0
+        fitted = TactileRegressor(sensor=PAD, embedding=SMALL, kept_touches=0).fit(X[part], y[part], materials[part])
+        said, ends = fitted.predict(X[~part]), fitted.predict_interval(X[~part], 0.8, known=True)
+        assert said[3] == fitted.learner_.estimate(X[~part][3])["y"].value
+        assert ((ends[:, 0] <= said) & (said <= ends[:, 1])).all()
+        assert ((ends[:, 0] <= y[~part]) & (y[~part] <= ends[:, 1])).mean() > 0.6
+        assert fitted.score(X[part], y[part]) > 0.5 and clone(fitted).get_params() == fitted.get_params()
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"materials": None}, "materials="),
+            ({"materials": np.repeat("felt", 24)}, "materials="),
+            ({"y": np.full(24, np.nan)}, "finite number"),
+            ({"y": np.zeros(3)}, "finite number"),
+        ],
+    )
+    def test_what_it_cannot_be_fitted_to_is_refused(self, wrong, message):
+        X, materials = touches()
+        with pytest.raises(InputError, match=message):
+            TactileRegressor(sensor=PAD, embedding=SMALL).fit(X, **{"y": numbers(X), "materials": materials, **wrong})
+
+    def test_numbers_that_are_all_the_same_say_too_little(self):
+        X, materials = touches()
+        fitted = TactileRegressor(sensor=PAD, embedding=SMALL, kept_touches=0).fit(X, np.ones(len(X)), materials)
+        with pytest.raises(InputError, match="the same value"):
+            fitted.predict(X[:1])
+        with pytest.raises(NotFittedError):
+            TactileRegressor().predict(X)

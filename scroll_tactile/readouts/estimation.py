@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import AnnotationError
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.readouts.regression import Head, Spectrum, fit_head
+from scroll_tactile.readouts.regression import RegressionHead, Spectrum, fit_head
 from scroll_tactile.results import Estimate
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.annotations import Annotations
@@ -40,8 +40,8 @@ class Heads:
     materials: of the touches that they rest on, in the order of the heads' residuals. targets: their values, (n,).
     """
 
-    known: Head
-    new: Head
+    known: RegressionHead
+    new: RegressionHead
     materials: tuple[str, ...]
     targets: FloatArray
 

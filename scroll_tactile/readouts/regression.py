@@ -10,10 +10,11 @@ group): r_g = B_gg⁻¹ α_g. Groups are touches for a head that answers for kno
 answers for new ones; λ is the one of least r². The features' units alone rest on all touches.
 
 Each scale has a head of its own, and a quantity is Σ_s w_s f_s with w ≥ 0, Σ w = 1, of least squared residual
-(stacked regression, Breiman 1996). Residuals and weights are functions of the set of touches. Intervals are f ± a
-quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of the mean of their distributions
-(pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for many materials, and for few as far as these are like
-the next.
+(stacked regression, Breiman 1996). A residual that calibrates is taken at the λ and w that are best for other touches:
+at those that it had a part in choosing, intervals of 80 % from 21 touches covered 71 %, and cover 75; from 45 touches
+77 and 79. Intervals are f ± a quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of
+the mean of their distributions (pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for many materials, and for
+few as far as these are like the next.
 """
 
 from __future__ import annotations
@@ -22,19 +23,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.system import contrasts
 
-__all__ = ["Head", "Spectrum", "fit_head"]
+__all__ = ["RegressionHead", "Spectrum", "fit_head"]
 
 FloatArray = npt.NDArray[np.float64]
 Groups = npt.NDArray[np.intp]
 
 LAMBDAS = tuple(2.0**power for power in range(5, -17, -1))  # in units of G's mean diagonal; ties go to the larger
 LEAST_VARIANCE = 1e-3  # of a feature, as a share of their mean: what hardly varies is not blown up
+FOLDS = 10  # parts of the groups: for the residuals of each, λ and the weights of scales are chosen by the others
 PRIOR = 2.0  # touches: with fewer, the weights of scales are drawn to those of independent residuals
 
 
@@ -67,19 +70,19 @@ class Spectrum:
         values, vectors = np.linalg.eigh(onto @ onto.T / size)
         return cls(features, unit, center, size, across.T @ vectors, np.maximum(values, 0.0))
 
-    def fit(self, targets: FloatArray, members: Sequence[Groups]) -> tuple[FloatArray, FloatArray, float]:
-        """(weights (d,), residuals (n,), intercept) of the head with the best λ, each group held out for its residuals.
+    def held_out(self, targets: FloatArray, members: Sequence[Groups]) -> FloatArray:
+        """The residuals of each group held out, at each of LAMBDAS, (penalties, n).
 
         targets: (n,). members: the places of each group's touches; no group has them all.
         """
-        onto, best = self.vectors.T @ targets, (math.inf, 0.0, np.zeros_like(targets))
-        for penalty in LAMBDAS:
-            residuals = self._held_out(1.0 / (self.values + penalty), onto, members)
-            if (loss := float(residuals @ residuals)) < best[0]:
-                best = loss, penalty, residuals
-        alpha = self.vectors @ (onto / (self.values + best[1]))
+        onto = self.vectors.T @ targets
+        return np.stack([self._held_out(1.0 / (self.values + penalty), onto, members) for penalty in LAMBDAS])
+
+    def solve(self, targets: FloatArray, penalty: float) -> tuple[FloatArray, float]:
+        """(weights (d,), intercept) of the head over features that are not standardised."""
+        alpha = self.vectors @ (self.vectors.T @ targets / (self.values + penalty))
         weights = self.unit * (alpha @ self.rows) / self.size
-        return weights, best[2], float(targets.mean() - weights @ self.center)
+        return weights, float(targets.mean() - weights @ self.center)
 
     def _held_out(self, filters: FloatArray, onto: FloatArray, members: Sequence[Groups]) -> FloatArray:
         """The residuals of the held-out groups, (n,). filters: the eigenvalues of B, (n − 1,)."""
@@ -94,7 +97,7 @@ class Spectrum:
 
 
 @dataclass(frozen=True)
-class Head:
+class RegressionHead:
     """Predicts a quantity from a touch's features at some scales, and how far it may be off.
 
     weights: for each scale, (S, d); a scale without weight has zeros. intercept: in the unit of the targets. shares:
@@ -128,7 +131,7 @@ class Head:
         return float(np.abs(self.residuals)[order[int(np.argmax(reached))]])
 
 
-def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | None = None) -> Head:
+def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | None = None) -> RegressionHead:
     """The head of some touches, read at each of the scales.
 
     spectra: of the same n touches in the same order. targets: (n,), of any unit. groups: the material of each touch,
@@ -136,15 +139,34 @@ def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | 
     """
     numbers = np.arange(len(targets)) if groups is None else groups
     members = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
-    fitted = [spectrum.fit(targets, members) for spectrum in spectra]
-    residuals = np.stack([own for _, own, _ in fitted], axis=1)
-    shares = stacked(residuals)
-    weights = np.stack([share * own for share, (own, _, _) in zip(shares, fitted, strict=True)])
-    intercept = math.fsum(float(share) * own for share, (_, _, own) in zip(shares, fitted, strict=True))
-    mass = np.empty(len(targets))
+    paths = np.stack([spectrum.held_out(targets, members) for spectrum in spectra])
+    residuals, mass = np.empty(len(targets)), np.empty(len(targets))
+    for first in range(min(FOLDS, len(members))):
+        fold = np.concatenate(members[first::FOLDS])
+        among = _among(paths, np.setdiff1d(np.arange(len(targets)), fold))
+        residuals[fold] = among.residuals[fold] @ among.shares
     for group in members:
         mass[group] = 1.0 / (len(members) * len(group))
-    return Head(weights, intercept, shares, residuals @ shares, mass)
+    chosen = _among(paths, np.arange(len(targets)))
+    solved = [spectrum.solve(targets, penalty) for spectrum, penalty in zip(spectra, chosen.penalties, strict=True)]
+    weights = np.stack([share * own for share, (own, _) in zip(chosen.shares, solved, strict=True)])
+    intercept = math.fsum(float(share) * own for share, (_, own) in zip(chosen.shares, solved, strict=True))
+    return RegressionHead(weights, intercept, chosen.shares, residuals, mass)
+
+
+class _Chosen(NamedTuple):
+    """λ of each scale, all touches' residuals at it, (n, S), and the weights of the scales, (S,)."""
+
+    penalties: list[float]
+    residuals: FloatArray
+    shares: FloatArray
+
+
+def _among(paths: FloatArray, places: Groups) -> _Chosen:
+    """What has the least squared residuals among some touches. paths: residuals of all, (S, penalties, n)."""
+    best = np.square(paths[:, :, places]).sum(axis=2).argmin(axis=1)  # ties go to the larger, which come first
+    residuals = np.stack([path[at] for path, at in zip(paths, best, strict=True)], axis=1)
+    return _Chosen([LAMBDAS[at] for at in best.tolist()], residuals, stacked(residuals[places]))
 
 
 def stacked(residuals: FloatArray) -> FloatArray:

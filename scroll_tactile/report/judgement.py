@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.estimation import Heads
-from scroll_tactile.readouts.regression import Head
+from scroll_tactile.readouts.regression import RegressionHead
 from scroll_tactile.report.charts import against_truth, answers, confusions, over_time, reliability, shares, tree
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
@@ -159,7 +159,7 @@ def estimated(facts: MemoryFacts) -> str:
     return "".join(parts)
 
 
-def _against_truth(head: Head, heads: Heads, risk: float, unit: str, of: str) -> str:
+def _against_truth(head: RegressionHead, heads: Heads, risk: float, unit: str, of: str) -> str:
     half, off = head.half_width(risk), np.abs(head.residuals)
     rows = [
         (name, float((off[mine] <= half).mean()), f"{int((off[mine] <= half).sum())} of {mine.sum()} touches")

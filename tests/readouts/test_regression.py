@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.regression import LAMBDAS, Head, Spectrum, fit_head, stacked
+from scroll_tactile.readouts.regression import LAMBDAS, RegressionHead, Spectrum, fit_head, stacked
 
 RNG = np.random.default_rng(0)
 TOUCHES, FEATURES = 40, 12
@@ -28,13 +28,11 @@ def fitted_without(spectrum: Spectrum, targets: np.ndarray, group: np.ndarray, p
 def test_residuals_are_those_of_a_head_fitted_without_the_group(groups: np.ndarray) -> None:
     spectrum = Spectrum.of(ROWS[0])
     members = [np.flatnonzero(groups == number) for number in np.unique(groups)]
-    weights, residuals, intercept = spectrum.fit(TRUTH, members)
-    candidates = {
-        penalty: np.concatenate([fitted_without(spectrum, TRUTH, group, penalty) for group in members])
-        for penalty in LAMBDAS
-    }
-    penalty = min(LAMBDAS, key=lambda one: float(np.square(candidates[one]).sum()))
-    np.testing.assert_allclose(residuals, candidates[penalty], rtol=1e-7)
+    for penalty, residuals in zip(LAMBDAS, spectrum.held_out(TRUTH, members), strict=True):
+        expected = np.concatenate([fitted_without(spectrum, TRUTH, group, penalty) for group in members])
+        np.testing.assert_allclose(residuals, expected, rtol=1e-6, atol=1e-9)
+    penalty = LAMBDAS[10]
+    weights, intercept = spectrum.solve(TRUTH, penalty)
     # The head itself is one without a touch that came to it with a row of its own.
     rows = (np.vstack([ROWS[0], ROWS[0][:1]]) - spectrum.center) * spectrum.unit
     more = Spectrum(rows, spectrum.unit, spectrum.center, spectrum.size, np.empty(0), np.empty(0))
@@ -42,11 +40,23 @@ def test_residuals_are_those_of_a_head_fitted_without_the_group(groups: np.ndarr
     assert ROWS[0][0] @ weights + intercept == pytest.approx(said, rel=1e-9)
 
 
+def test_a_residual_is_taken_at_what_is_best_for_other_touches() -> None:
+    spectra = [Spectrum.of(rows) for rows in ROWS]
+    head = fit_head(spectra, TRUTH, MATERIALS)
+    members = [np.flatnonzero(number == MATERIALS) for number in range(4)]
+    paths = np.stack([spectrum.held_out(TRUTH, members) for spectrum in spectra])
+    for group in members:
+        others = np.setdiff1d(np.arange(TOUCHES), group)
+        best = [int(np.square(path[:, others]).sum(axis=1).argmin()) for path in paths]
+        own = np.stack([path[at] for path, at in zip(paths, best, strict=True)], axis=1)
+        assert head.residuals[group].tobytes() == (own[group] @ stacked(own[others])).tobytes()
+
+
 def test_scales_are_weighed_by_what_they_say() -> None:
     head = fit_head([Spectrum.of(rows) for rows in ROWS], TRUTH)
     assert head.shares[0] > 0.02 and head.shares[1] > head.shares[0] and head.shares.sum() == pytest.approx(1)
     best = min(float(np.square(fit_head([Spectrum.of(rows)], TRUTH).residuals).sum()) for rows in ROWS)
-    assert float(np.square(head.residuals).sum()) <= best
+    assert float(np.square(head.residuals).sum()) < best
     said = [head([rows[i] for rows in ROWS]) for i in range(TOUCHES)]
     assert np.square(said - TRUTH).sum() < best
 
@@ -61,8 +71,8 @@ def test_the_best_weights_of_all_that_are_not_negative() -> None:
     assert stacked(np.zeros((5, 2))).tolist() == [0.5, 0.5]
 
 
-def head_of(residuals: np.ndarray, mass: np.ndarray) -> Head:
-    return Head(np.zeros((1, 1)), 0.0, np.ones(1), residuals, mass)
+def head_of(residuals: np.ndarray, mass: np.ndarray) -> RegressionHead:
+    return RegressionHead(np.zeros((1, 1)), 0.0, np.ones(1), residuals, mass)
 
 
 @pytest.mark.parametrize(("touches", "risk", "rank"), [(19, 0.05, 19), (18, 0.05, None), (9, 0.1, 9), (100, 0.1, 91)])

@@ -8,7 +8,7 @@ import pytest
 from browser import Browser
 from commands import refused, run
 
-from scroll_tactile import Frames, Kernels, Sensor, TactileLearner
+from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
 from scroll_tactile.report import memory_page, recording_page, save
 from scroll_tactile.simulation.scene import Scene
@@ -346,3 +346,20 @@ def test_odd_readings_leave_a_page(tmp_path, readings, rate):
     text = words(recording_page(tmp_path / "odd.npy", rate=rate))
     assert f"{len(readings)} readings" in text
     assert "nan" not in text.split()
+
+
+def test_what_it_measures_is_shown_held_out():
+    scene, learner = Scene(sensor=PAD), TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
+    learner.declare(Quantity(name="force <b>", unit="N", low=0.0, high=4.0, resolution=0.01))
+    learner.declare(Quantity(name="heat", unit="K", low=0.0, high=400.0, resolution=1.0))
+    for i in range(10):
+        for name in scene.materials[:3]:
+            learner.observe(name, scene.touch(name, i, force=0.5 + 0.1 * i), values={"force <b>": 0.5 + 0.1 * i})
+    html = memory_page(learner, risk=0.2)
+    Checked(html)
+    text = words(html)
+    assert "What it measures" in text and "each material held out, as if it were new" in text
+    assert "0.5 true" in html and "How heat is estimated: 0 sampled touches" in text
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
+    learner.observe("felt", scene.touch("felt", 0))
+    assert "What it measures" not in words(memory_page(learner))

@@ -1,6 +1,7 @@
 """From messages to answers; nothing of ROS is needed for it."""
 
 import array
+import copy
 import itertools
 import json
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from live_touches import GEL, frames, gel_learner, learner, shift
 from robot import Bare, stamped, taught
 from touches import PAD, SMALL
 
-from scroll_tactile import TactileLearner, errors
+from scroll_tactile import Quantity, TactileLearner, errors
 from scroll_tactile.ros2 import Bridge
 
 ROWS, PLACES = shift("ab")
@@ -183,3 +184,16 @@ def test_pictures_are_readings_of_a_camera():
         height, width, _ = pixels.shape
         made.receive(Image(height, width, 3 * width, "bgr8", array.array("B", pixels.tobytes())), i / sensor.rate)
     assert [answer["material"] for answer in answers if answer["event"] == "ended"] == [GEL.materials[1]]
+
+
+def test_answers_carry_estimates_where_a_quantity_was_declared():
+    source = copy.deepcopy(learner())
+    source.declare(Quantity(name="force", unit="N", low=0.0, high=2.0, resolution=0.01))
+    made, answers, _ = bridge(source=source)
+    run(made)
+    [first, *_] = [answer for answer in answers if answer["event"] == "ended"]
+    assert first["estimates"]["force"]["value"] is None and "0 sampled" in first["estimates"]["force"]["missing"]
+    json.dumps(answers, allow_nan=False)
+    made, answers, _ = bridge()
+    run(made)
+    assert not any("estimates" in answer for answer in answers)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import EmptyStreamError, LearnerError, NotFiniteError, StreamError
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.simulation.gel import Gel
@@ -79,6 +80,7 @@ def check_learner(make_learner: Make, *, touches: Sequence[tuple[str, npt.ArrayL
         _a_new_material_needs_no_announcement,
         _what_cannot_be_read_is_refused,
         _read_only_arrays_are_read,
+        _estimates_know_no_order,
     ]
     held = []
     with tempfile.TemporaryDirectory(prefix="check-learner-") as folder:
@@ -203,6 +205,27 @@ def _read_only_arrays_are_read(bench: _Bench) -> None:
         learner.predict(readings)
     if readings.tobytes() != before:
         raise LearnerError("an array that was observed was written into")
+
+
+def _estimates_know_no_order(bench: _Bench) -> None:
+    """values of touches give the same estimates in any order, and after opening again."""
+    quantity = Quantity(name="number", unit="1", low=0.0, high=float(len(bench.touches)), resolution=1.0)
+
+    def told(learner: TactileLearner) -> str:
+        learner.settle()
+        return repr([learner.estimate(readings, risk=0.5) for _, readings in bench.touches[:3]])
+
+    numbered, answers = list(enumerate(bench.touches)), []
+    for name, order in (("a", numbered), ("b", numbered[::-1])):
+        with bench.learner(name) as learner:
+            learner.declare(quantity)
+            for number, (material, readings) in order:
+                learner.observe(material, readings, values={"number": number})
+            answers.append(told(learner))
+        with bench.learner(name) as again:
+            answers.append(told(again))
+    if len(set(answers)) > 1:
+        raise LearnerError(f"estimates: expected the same; came {answers[0]:.200} and {answers[-1]:.200}")
 
 
 def _require(what: str, answer: Prediction, material: str | None, *, known: bool | None = None) -> None:

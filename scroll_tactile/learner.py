@@ -257,17 +257,14 @@ class TactileLearner(MemoryKeeper):
     def estimate(
         self, stream: Readings, *, of: Sequence[str] | None = None, risk: float = 0.1, known: bool | None = None
     ) -> dict[str, Estimate]:
-        """Estimate quantities of a touch, such as its force, with intervals, by name; the memory stays as it is.
+        """Estimate quantities of a touch, such as its force, by name, with intervals; the memory stays as it is.
 
         stream: as for `observe`. of: which quantities; None: all that were declared. risk: the share of touches whose
-        interval may miss the true value. known: whether the intervals are those for a material that was learned, or for
-        a new one, which are wider; None: as the prediction says.
+        interval may miss the true value. known: whether the intervals are those for a learned material, or the wider
+        ones for a new one; None: as the prediction says. It rests on the sampled touches that carry values, 256 at
+        most, whatever the order they came in; where they are too few it gives no number, and says what is missing.
 
-        It rests on the sampled touches that carry values, 256 at most, and a function of these gives the same bits
-        whatever the order they came in. Without what it takes it gives no number, and says what is missing.
-
-        Raises StreamError; AnnotationError where nothing was declared, and for a quantity that was not; InputError for
-        a risk that is no share between 0 and 1.
+        Raises StreamError; AnnotationError where nothing, or one of these, was not declared; InputError for a risk.
         """
         require_arguments({"risk": risk}, {"known": known})
         return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)

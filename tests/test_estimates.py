@@ -8,6 +8,9 @@ import pytest
 
 from scroll_tactile import Kernels, Quantity, Scene, Sensor, TactileLearner
 from scroll_tactile.errors import AnnotationError, InputError
+from scroll_tactile.pipelines.learning import Answered, Evaluation
+from scroll_tactile.pipelines.metrics import interval_figures
+from scroll_tactile.pipelines.sources import SourceTouch
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 SETTINGS = {"sensor": PAD, "embedding": Kernels(dimension=64), "exemplars": 0}
@@ -139,6 +142,31 @@ def test_a_live_session_shows_estimates_as_they_settle(learner):
     assert ended.estimates == ended.touches[0].estimates == learner.estimate(touch, risk=0.2)
     states, ended = lived(learner, touch, 3.9)
     assert [state.settled for state in states].index(True) < 25 and ended.settled
+
+
+def test_an_evaluation_says_how_intervals_hold_on_materials_learned_and_new(learner):
+    def answered(name, repetition, value=None):
+        touch, force = felt(name, repetition)
+        values = {"force": force if value is None else value}
+        return Answered(
+            SourceTouch("somewhere", name, touch, values), learner.predict(touch), learner.estimate(touch, risk=0.2)
+        )
+
+    touches = [answered(name, 70 + i) for i in range(5) for name in ("felt", "cork", "oak")]
+    measured = Evaluation(tuple(touches), (), frozenset(learner.materials)).measured["force"]
+    assert measured["learned"]["touches"] == 10 and measured["new"]["touches"] == 5
+    assert measured["learned"]["covered"] >= 0.5 and measured["learned"]["mean_error"] < 0.5
+    assert measured["learned"]["risk"] == 0.2 and measured["learned"]["without"] == 0
+    far = Evaluation((answered("felt", 70, 3.9), answered("felt", 71, 3.9)), (), frozenset(learner.materials))
+    assert far.measured["force"]["learned"]["covered"] == 0 and far.measured["force"]["learned"]["r2"] is None
+    assert Evaluation((), (), frozenset()).measured == {}
+
+
+def test_figures_of_intervals():
+    figures = interval_figures([1.0, 2.0, 3.0, 4.0], [1.0, 2.0, 3.0, 6.0], [0.0, 2.0, 3.5, 5.0], [2.0, 3.0, 4.0, 7.0])
+    assert figures == {"covered": 0.5, "width": 1.375, "mean_error": 0.5, "r2": pytest.approx(0.2)}
+    with pytest.raises(InputError):
+        interval_figures([1.0], [1.0, 2.0], [0.0], [1.0])
 
 
 @pytest.mark.parametrize(

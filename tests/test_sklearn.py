@@ -126,7 +126,7 @@ class TestRegressor:
         assert said[3] == fitted.learner_.estimate(X[~part][3])["y"].value
         assert ((ends[:, 0] <= said) & (said <= ends[:, 1])).all()
         assert ((ends[:, 0] <= y[~part]) & (y[~part] <= ends[:, 1])).mean() > 0.6
-        assert fitted.score(X[part], y[part]) > 0.5 and clone(fitted).get_params() == fitted.get_params()
+        assert fitted.score(X[part], y[part]) > 0.5 and clone(fitted).get_params().keys() == fitted.get_params().keys()
 
     @pytest.mark.parametrize(
         ("wrong", "message"),

@@ -10,6 +10,7 @@ A value is kept as a whole number of steps from the low end of its range, so tha
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from fractions import Fraction
 from numbers import Real
@@ -17,16 +18,22 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
-from scroll_tactile.errors import AnnotationError
+from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.settings import LONGEST_NAME, ValidatedFields
 
-__all__ = ["MOST_QUANTITIES", "MOST_STEPS", "Quantity", "require_declarable"]
+__all__ = ["MOST_QUANTITIES", "MOST_STEPS", "WRITTEN", "Quantity", "require_declarable"]
 
 # Of a range: as many as the features' grid has, so that the squares of 2²³ values add up in int64.
 MOST_STEPS = 2**20
 MOST_QUANTITIES = 64  # of a memory
 LONGEST_UNIT = 40  # characters
 
+_NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
+# Its name and unit in brackets; a range and a resolution, which a table's heading may leave out.
+WRITTEN = re.compile(
+    rf"(?P<name>\S.*?)\s*\[(?P<unit>[^\[\]]+)\]"
+    rf"(?:\s*(?P<low>{_NUMBER})\s*\.\.\s*(?P<high>{_NUMBER})\s+step\s+(?P<resolution>{_NUMBER}))?"
+)
 _Number = Annotated[FiniteFloat, Field(strict=False)]
 
 
@@ -69,6 +76,14 @@ class Quantity(ValidatedFields):
             )
         return self
 
+    @classmethod
+    def parsed(cls, text: str) -> Quantity:
+        """The quantity that `str` wrote: "force [N] 0..10 step 0.01". Raises InputError for anything else."""
+        if (found := WRITTEN.fullmatch(text.strip())) is None or found["low"] is None:
+            raise InputError(f"expected a quantity such as 'force [N] 0..10 step 0.01'; came {text!r:.80}")
+        low, high, resolution = (float(found[name]) for name in ("low", "high", "resolution"))
+        return cls(name=found["name"], unit=found["unit"].strip(), low=low, high=high, resolution=resolution)
+
     @property
     def steps(self) -> int:
         """The largest integer of a value."""
@@ -98,7 +113,12 @@ class Quantity(ValidatedFields):
         return f"from {self.low:g} to {self.high:g} {self.unit}"
 
     def __str__(self) -> str:
-        return f"{self.name} [{self.unit}] {self.low:g}..{self.high:g} step {self.resolution:g}"
+        return f"{self.name} [{self.unit}] {_short(self.low)}..{_short(self.high)} step {_short(self.resolution)}"
+
+
+def _short(number: float) -> str:
+    """A number so that it can be read again."""
+    return repr(number).removesuffix(".0")
 
 
 def _decimal(number: float) -> Fraction:

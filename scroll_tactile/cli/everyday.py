@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
 
 from scroll_tactile.cli.options import (
+    Axis,
     Clock,
     Columns,
     Field,
@@ -62,6 +63,13 @@ def observe(
     field: Field = None,
     clock: Clock = None,
     columns: Columns = None,
+    value: Annotated[
+        list[str] | None,
+        typer.Option(help="What was measured of it, such as force=1.4, of a declared quantity; several times."),
+    ] = None,
+    axis: Annotated[
+        list[str] | None, typer.Option(help="What else it is, as axis=label, such as slip=north; several times.")
+    ] = None,
     again: Annotated[
         bool, typer.Option("--again", help="Learn it also where the memory has this very touch already.")
     ] = False,
@@ -71,6 +79,11 @@ def observe(
     from scroll_tactile.recordings import read
 
     require_name(material)
+    labels = _noted("axis", axis)
+    try:
+        values = {name: float(number) for name, number in _noted("value", value).items()}
+    except ValueError as error:
+        raise InputError(f"expected --value as a name and a number, such as force=1.4: {error}") from None
     recording = read(file, topic=topic, field=field, clock=clock, columns=columns, preset=preset)
     chosen = sensor_for(memory, sensor, preset)
     if chosen is not None and not memory.exists():
@@ -79,7 +92,7 @@ def observe(
         source = printable(str(file))[-LONGEST_SOURCE:]
         stream = learner.stream(recording.stream(learner.sensor))
         others = [name for name in learner.names_of(stream) if name != material]
-        receipt = learner.observe(material, stream, source=source, again=again)
+        receipt = learner.observe(material, stream, values=values, labels=labels, source=source, again=again)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     if receipt.repeated:
@@ -91,12 +104,23 @@ def observe(
     say(f"it has now been observed {count} time{'s' * (count > 1)}")
 
 
+def _noted(option: str, given: Sequence[str] | None) -> dict[str, str]:
+    """What an option says several times, by name."""
+    pairs = [each.partition("=") for each in given or ()]
+    if wrong := [each for each, pair in zip(given or (), pairs, strict=True) if not (pair[0] and pair[2])]:
+        raise InputError(f"expected --{option} as name=what, such as force=1.4 or slip=north; came {wrong[0]!r:.60}")
+    if len({name for name, *_ in pairs}) < len(pairs):
+        raise InputError(f"expected each name once; came --{option} {' '.join(given or ())!r:.80}")
+    return {name: told for name, _, told in pairs}
+
+
 def predict(
     memory: MemoryFolder,
     sources: Sources,
     scene: Annotated[
         str | None, typer.Option(help="The materials that can be here, separated by commas; all of them otherwise.")
     ] = None,
+    of: Axis = None,
     preset: Preset = None,
     topic: Topic = None,
     field: Field = None,
@@ -119,7 +143,7 @@ def predict(
     options = SourceOptions(topic=topic, field=field, clock=clock, columns=columns, preset=preset)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
-        answered = answers(learner, found, options, scene=candidates)
+        answered = answers(learner, found, options, scene=candidates, of=of)
         if alone:
             several = [*refused, *answered]
             if len(several) == 1:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AsJson",
+    "Axis",
     "Clock",
     "Columns",
     "CutBy",
@@ -80,7 +81,11 @@ Preset = Annotated[
 Label = Annotated[str | None, typer.Option(help="What all of them are touches of.")]
 LabelBy = Annotated[LabelSource | None, typer.Option(help="What names each touch.")]
 Labels = Annotated[
-    Path | None, typer.Option(help="A .csv of touches, with columns file, begin, end (in seconds) and material.")
+    Path | None,
+    typer.Option(
+        help="A .csv of touches, with columns file, begin, end (in seconds) and material; what is under 'force [N] "
+        "0..10 step 0.01' (or 'force [N]', once declared) and 'slip [label]' is learned as values and labels."
+    ),
 ]
 LabelTopic = Annotated[
     str | None, typer.Option(help="A topic with texts, or a column, that says what is touched from then on.")
@@ -88,6 +93,7 @@ LabelTopic = Annotated[
 CutBy = Annotated[
     Cut | None, typer.Option(help="Where touches begin and end; without it by intervals or episodes if there are any.")
 ]
+Axis = Annotated[str | None, typer.Option(help="An axis of labels, such as slip, to answer by in place of materials.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -116,7 +122,7 @@ def source_options(
 ) -> SourceOptions:
     """How these recordings are cut and named, by the options of a command."""
     from scroll_tactile.pipelines.sources import SourceOptions
-    from scroll_tactile.recordings import read_intervals
+    from scroll_tactile.recordings import declared_quantities, read_intervals
 
     if labels is not None and label_topic is not None:
         raise InputError("give intervals= or labels=: both say where touches begin")
@@ -134,4 +140,5 @@ def source_options(
         material=label,
         by=None if label_by is None else label_by.value,
         intervals=intervals,
+        quantities=() if labels is None else tuple(declared_quantities(labels)),
     )

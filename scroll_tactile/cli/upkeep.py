@@ -178,6 +178,22 @@ def _export_c(folder: Path, target: Path, scene: str | None) -> str:
 
 
 @memory.command()
+def declare(
+    folder: MemoryFolder,
+    quantity: Annotated[
+        str, typer.Argument(help="Name, unit, range, resolution: 'force [N] 0..10 step 0.01'.", show_default=False)
+    ],
+) -> None:
+    """Have touches carry values of a quantity from now on; its unit and range stay as they are."""
+    from scroll_tactile.quantities import Quantity
+
+    declared = Quantity.parsed(quantity)
+    with opened_for_upkeep(folder) as learner:
+        learner.declare(declared)
+    say(f"declared: {shown(str(declared))}, {declared.steps} steps")
+
+
+@memory.command()
 def retract(
     folder: MemoryFolder,
     observation: Annotated[int, typer.Argument(help="Its number, as observe and export give it.", show_default=False)],
@@ -206,7 +222,9 @@ def list_observations(
     folder: MemoryFolder,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each.")] = False,
 ) -> None:
-    """List the observations: number, material, time, what became of it (kept, compacted, retracted), and source."""
+    """List the observations: number, material, time, what became of it (kept, compacted, retracted), what was noted of
+    it, and source.
+    """
     from scroll_tactile.persistence.observations import observations
     from scroll_tactile.pipelines.plain_export import date_of
     from scroll_tactile.validation.gate import MemoryStore
@@ -223,11 +241,16 @@ def list_observations(
                     "state": row.state,
                     "source": row.source,
                     "key": row.key.hex(),
+                    **({"values": row.values, "labels": row.labels} if row.values or row.labels else {}),
                 }
             )
         else:
             state = "" if row.state == "kept" else f"  [yellow]{row.state}[/]"
-            say(f"{row.sequence:>6}  {date_of(row.time)}  {shown(row.material)}{state}  {shown(row.source or '')}")
+            noted = "".join(
+                f"  {shown(name)}={shown(str(told))}" for name, told in {**row.values, **row.labels}.items()
+            )
+            where = shown(row.source or "")
+            say(f"{row.sequence:>6}  {date_of(row.time)}  {shown(row.material)}{state}{noted}  {where}")
 
 
 @memory.command()

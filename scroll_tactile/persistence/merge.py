@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Literal, Self, cast
 
@@ -30,6 +30,7 @@ from scroll_tactile.persistence.contents import ListedContents, StoredContents, 
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import apply_description, replay
 from scroll_tactile.quantities import Quantity, require_declarable
+from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.validation.gate import (
     MemoryStore,
     quantities_of,
@@ -113,8 +114,11 @@ class MergePlan:
         refused, again = (
             _by_first_names(incoming, contents, compacted, rules.clipped) if rules.one_name else ([], set())
         )
-        if rules.once:
-            _require_same_annotations(ours, theirs, [head for head in incoming if head.sequence in both], contents)
+        for head in (head for head in incoming if head.sequence in both and rules.once):
+            why = _annotated_otherwise(head, contents.rows(head.label, head.key).items(), ours.path)
+            if why is not None and not rules.one_name:
+                raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {why}")
+            refused += [] if why is None else [(head, why)]
         out = {*(both if rules.once else ()), *again, *(head.sequence for head, _ in refused)}
         if fixed := [
             head for head in incoming if head.sequence in out and (head.sequence <= compacted or head.kind == MEMBER)
@@ -135,7 +139,7 @@ class MergePlan:
                 sequence = _row(contents, head) or 0
                 if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
                     ours.record(sequence)
-        shared = len(both) + len(again)
+        shared = len(both - {head.sequence for head, _ in refused}) + len(again)
         summed = newest if theirs.is_packed else None
         source = rules.default_source
         return cls(theirs, found, rows, shared, left_out, refused, described, quantities, source, summed)
@@ -227,18 +231,17 @@ def _quantities(
     return [quantity for name, quantity in both.items() if name not in memory.quantities]
 
 
-def _require_same_annotations(
-    ours: Store, theirs: MemoryStore, shared: Sequence[Head], contents: ListedContents | StoredContents
-) -> None:
-    """Raise MismatchError for a touch that both observed, with values or labels there that ours has not."""
-    for head in shared:
-        there = annotation_of(head.attributes)
-        if there and there not in (here := contents.rows(head.label, head.key)).values():
-            raise MismatchError(
-                f"{ours.path} and {theirs.path} both have a touch of {head.label!r}, here row {min(here)} with "
-                f"{annotated(here[min(here)]) or 'no values or labels'}, there row {head.sequence} with "
-                f"{annotated(there)}: retract one of them, or count both with shared='twice'"
-            )
+def _annotated_otherwise(head: Head, rows: Iterable[tuple[int, Annotation]], where: object) -> str | None:
+    """Why their touch, which is in these rows as well, cannot be left out: its values or labels are in none of them."""
+    came, there = annotation_of(head.attributes), dict(rows)
+    if not came or not there or came in there.values():
+        return None
+    first = min(there)
+    return (
+        f"row {first} of {where} has this touch of {head.label!r} with "
+        f"{annotated(there[first]) or 'no values or labels'}; row {head.sequence} comes with {annotated(came)}: "
+        "retract one of them, or count both with shared='twice'"
+    )
 
 
 def _by_first_names(
@@ -246,9 +249,11 @@ def _by_first_names(
 ) -> tuple[list[tuple[Head, str]], set[int]]:
     """The touches that our memory, or an earlier row of theirs, has under another name, each with the reason.
 
-    Also the sequences of repeats: rows of theirs that an earlier one has under the same name, unless compacted.
+    Also those that an earlier row of theirs has with other values or labels; and the sequences of repeats: rows of
+    theirs that an earlier one has under the same name, unless compacted.
     """
     came: dict[bytes, str] = {}
+    noted: dict[bytes, list[tuple[int, Annotation]]] = {}
     refused: list[tuple[Head, str]] = []
     again: set[int] = set()
     for head in incoming:
@@ -256,7 +261,11 @@ def _by_first_names(
             continue
         known, before = contents.names(head.key), head.key in came
         names = known or [came.setdefault(head.key, head.label)]
-        if (why := refusal(names, head.label, head.key in clipped)) is not None:
+        why = refusal(names, head.label, head.key in clipped)
+        if why is None and not known:
+            why = _annotated_otherwise(head, noted.get(head.key, ()), "the same memory")
+            noted.setdefault(head.key, []).append((head.sequence, annotation_of(head.attributes)))
+        if why is not None:
             refused.append((head, why))
         elif before and head.kind == OBSERVE and head.sequence > compacted:
             again.add(head.sequence)

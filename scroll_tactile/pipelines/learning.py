@@ -17,7 +17,7 @@ from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.pipelines.classification import Answers
 from scroll_tactile.pipelines.metrics import calibration_error, interval_figures
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, SourceTouch, source_touches
-from scroll_tactile.results import Estimate, Prediction
+from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.signals.ranges import all_clipped, range_problem
 
 __all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources", "store_model"]
@@ -63,9 +63,12 @@ def learn_sources(
     has under another name is refused. every: learn also what came before, under any name: whoever merges it decides.
     progress: called with (what is being done, files done, files in all).
 
-    Raises StoreError and CapacityError; what was learned until then is kept.
+    Raises AnnotationError for a quantity that the memory has with another unit or range (nothing was learned);
+    StoreError and CapacityError; what was learned until then is kept.
     """
     done, batch = Learned(), _Batch(learner, every)
+    for quantity in options.quantities:
+        learner.declare(quantity)
     for number, address in enumerate(sources):
         progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))
         for touch in source_touches(learner, address, options):
@@ -114,27 +117,29 @@ class _Batch:
             for touch, address in touches:
                 material, clipped = str(touch.material), all_clipped(touch.stream)
                 names = [] if self._every else self._learner.names_of(touch.stream)
-                if material in names:
+                if material in names and not (touch.values or touch.labels):
                     done.skipped += 1
                     continue
-                if (why := refusal(names, material, clipped)) is None:
-                    why = self._refused(material, touch)
-                if why is not None:
-                    done.refused.append(Refused(touch.source, why))
+                found = refusal(names, material, clipped) or self._observed(material, touch)
+                if isinstance(found, str):
+                    done.refused.append(Refused(touch.source, found))
                     done.failed.add(address)
+                    continue
+                if found.repeated:
+                    done.skipped += 1
                     continue
                 done.learned[material] += 1
                 done.rows[address] += 1
                 done.clipped |= {touch.stream.key} if clipped else set()
                 done.range_problem = done.range_problem or range_problem(touch.stream)
 
-    def _refused(self, material: str, touch: SourceTouch) -> str | None:
-        """Observe a touch; why it cannot be, such as one that is too long."""
+    def _observed(self, material: str, touch: SourceTouch) -> Receipt | str:
+        """The receipt of a touch; or why it cannot be observed, such as one that is too long."""
+        noted: dict[str, Any] = {"values": touch.values, "labels": touch.labels}
         try:
-            self._learner.observe(material, touch.stream, source=touch.source, again=self._every)
+            return self._learner.observe(material, touch.stream, **noted, source=touch.source, again=self._every)
         except InputError as error:
             return str(error)
-        return None
 
 
 @dataclass(frozen=True)
@@ -152,17 +157,23 @@ def answers(
     options: SourceOptions,
     *,
     scene: Sequence[str] | None = None,
+    of: str | None = None,
     named: bool = False,
     progress: Progress = lambda what, done, of: None,
 ) -> Iterator[Answered | Refused]:
-    """What each touch in sources feels like; the memory stays as it is. named: as of `source_touches`."""
+    """What each touch in sources feels like; the memory stays as it is.
+
+    scene, of: as of `TactileLearner.predict`. named: as of `source_touches`.
+    """
     for touch in _touches(learner, sources, options, progress, named=named):
-        yield touch if isinstance(touch, Refused) else _answered(learner, touch, scene)
+        yield touch if isinstance(touch, Refused) else _answered(learner, touch, scene, of)
 
 
-def _answered(learner: TactileLearner, touch: SourceTouch, scene: Sequence[str] | None = None) -> Answered:
+def _answered(
+    learner: TactileLearner, touch: SourceTouch, scene: Sequence[str] | None = None, of: str | None = None
+) -> Answered:
     estimates = learner.estimate(touch.stream) if learner.quantities else {}
-    return Answered(touch, learner.predict(touch.stream, scene=scene), estimates)
+    return Answered(touch, learner.predict(touch.stream, of=of, scene=scene), estimates)
 
 
 def _touches(

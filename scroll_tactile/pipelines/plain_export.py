@@ -6,7 +6,7 @@ import copy
 import csv
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError, plain_cell
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Observation
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.statistics import Statistics
@@ -34,7 +35,8 @@ def export_plain(
     """Write a memory into a new or empty folder; a file that is there is whole.
 
     - `observations.csv`: sequence, material, key (hash of the stream), time, and what became of it: kept, compacted
-      (learned from, features given up), retracted; and its source, where it has one. A time out of the calendar's
+      (learned from, features given up), retracted; its source, where it has one; and a column for each quantity, such
+      as "force [N] 0..10 step 0.01", and axis, such as "slip [label]". A time out of the calendar's
       years 1 to 9999 is written as seconds since 1970. Only where the memory has a path.
     - `statistics.npz`: `materials`; for each scale (a width of windows; 1048576 the whole touch and 1048577 its shape,
       see `signals.image`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
@@ -71,11 +73,7 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
     held, journal = _one_state(learner)
     if learner.path is not None:
         progress("observations", 0, 1)
-        header = ["sequence", "material", "key", "time", "state", "source"]
-        rows = [
-            [row.sequence, row.material, row.key.hex(), date_of(row.time), row.state, row.source or ""]
-            for row in journal
-        ]
+        header, rows = _observed(held.quantities, journal)
         _rows(target / "observations.csv", header, rows)
     if held.descriptions:
         header = ["material", "constituent", "present", "share"]
@@ -120,6 +118,21 @@ def date_of(seconds: float) -> str | float:
         return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
     except (OSError, OverflowError, ValueError):
         return seconds
+
+
+def _observed(quantities: Mapping[str, Quantity], journal: Sequence[Observation]) -> tuple[list[str], list[list[Any]]]:
+    """The heading and the rows of the table of observations."""
+    axes = sorted({axis for row in journal for axis in row.labels})
+    header = ["sequence", "material", "key", "time", "state", "source"]
+    header += [*map(str, quantities.values()), *(f"{axis} [label]" for axis in axes)]
+    return header, [
+        [
+            *(row.sequence, row.material, row.key.hex(), date_of(row.time), row.state, row.source or ""),
+            *(row.values.get(name, "") for name in quantities),
+            *(row.labels.get(axis, "") for axis in axes),
+        ]
+        for row in journal
+    ]
 
 
 def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:

@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
-from scroll_tactile.errors import InputError, RecordingError, SensorMismatchError, printable
+from scroll_tactile.errors import AnnotationError, InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import ContactDetector
 from scroll_tactile.live.pressing import REST_FOLLOWED, PressDetector
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
 from scroll_tactile.recordings.locations import is_remote
 from scroll_tactile.recordings.recording import require_columns
@@ -48,7 +49,8 @@ class SourceOptions:
     topic, field, clock, columns, preset, labels: as of `recordings.read`. cut: None cuts by the intervals where there
     are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
-    At most one of the three names them; without any, episodes name themselves.
+    At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
+    anything is learned, as the table's headings do (`recordings.declared_quantities`).
 
     Raises InputError for what does not fit together, MaterialError for a material that is none.
     """
@@ -63,6 +65,7 @@ class SourceOptions:
     material: str | None = None
     by: Literal["topic", "file", "folder", "task"] | None = None
     intervals: Sequence[Interval] | None = None
+    quantities: Sequence[Quantity] = ()
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
@@ -157,12 +160,16 @@ class Refused:
 
 @dataclass(frozen=True)
 class SourceTouch:
-    """A touch out of a source: where it comes from, what names it (None where nothing does), its stream and values."""
+    """A touch out of a source: where it comes from, what names it (None where nothing does), its stream, and its notes.
+
+    values, labels: as of `TactileLearner.observe`.
+    """
 
     source: str
     material: str | None
     stream: Stream
     values: Mapping[str, float] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
 
 
 def find_sources(paths: Sequence[str]) -> tuple[list[str], list[Refused]]:
@@ -205,9 +212,20 @@ def source_touches(
                 raise InputError("nothing names it: give material= for all, by='folder', by='file' or intervals=")
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
             stream = learner.stream(part.stream(learner.sensor))
-            yield SourceTouch(source, material if material is None else require_name(material), stream)
+            values, name = _values(touch, learner.quantities), material if material is None else require_name(material)
+            yield SourceTouch(source, name, stream, values, dict(touch.labels))
         except (InputError, SensorMismatchError) as error:
             yield Refused(source, str(error))
+
+
+def _values(touch: Touch, quantities: Mapping[str, Quantity]) -> dict[str, float]:
+    """What was measured of a touch. Raises AnnotationError for another unit than a quantity's."""
+    for name, unit, value in touch.values:
+        if name in quantities and quantities[name].unit != unit:
+            raise AnnotationError(
+                f"expected {name!r} in {quantities[name].unit}, as it was declared; came {value:g} {unit}"
+            )
+    return {name: value for name, _, value in touch.values}
 
 
 def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:

@@ -10,7 +10,7 @@ from scroll_tactile.recordings.blocks import Contents, Entry
 from scroll_tactile.recordings.presets import PRESETS, Preset
 from scroll_tactile.recordings.reader import describe, find, iterate, read
 from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, resampled
-from scroll_tactile.recordings.touches import Interval, Touch, read_intervals, touches
+from scroll_tactile.recordings.touches import Interval, Touch, declared_quantities, read_intervals, touches
 
 __all__ = [
     "PRESETS",
@@ -23,6 +23,7 @@ __all__ = [
     "Recording",
     "Report",
     "Touch",
+    "declared_quantities",
     "describe",
     "find",
     "iterate",

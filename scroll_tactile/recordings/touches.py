@@ -14,10 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile.quantities import WRITTEN, Quantity
 from scroll_tactile.recordings.paths import nearest
 from scroll_tactile.recordings.recording import Episode, Recording
 
-__all__ = ["Interval", "Touch", "read_intervals", "touches"]
+__all__ = ["Interval", "Touch", "declared_quantities", "read_intervals", "touches"]
+
+LABEL = "label"  # in brackets behind the name of an axis, in place of a unit
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Interval:
     """A touch of `material` in a file, from `begin` to before `end` in seconds of the recording's clock.
 
     Where a recording's times are times of day, those below a million count from its first reading. `row` is where it
-    stands.
+    stands. values: (quantity, unit, value) of each that was measured; labels: (axis, label).
     """
 
     file: str
@@ -33,13 +36,15 @@ class Interval:
     end: float
     material: str
     row: int = 0
+    values: tuple[tuple[str, str, float], ...] = ()
+    labels: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Touch:
     """Some readings of a recording in one piece, with their times; material is None where nothing names it.
 
-    source: the recording's address. begin, end: which of its readings.
+    source: the recording's address. begin, end: which of its readings. values, labels: as of its interval.
     """
 
     source: str
@@ -48,6 +53,8 @@ class Touch:
     readings: npt.NDArray[Any]
     times: npt.NDArray[np.float64]
     material: str | None
+    values: tuple[tuple[str, str, float], ...] = ()
+    labels: tuple[tuple[str, str], ...] = ()
 
     @property
     def name(self) -> str:
@@ -71,6 +78,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
     Raises InputError for a recording without episodes, without the requested label or with an empty one, for intervals
     of which none is of this file or which lie outside it, and for spans that a function gives outside the recording.
     """
+    told: Sequence[Interval] = ()
     if isinstance(cut, str):
         if cut not in ("whole", "episodes"):
             raise InputError(f"expected cut 'whole', 'episodes', intervals or a function; came {cut!r}")
@@ -83,7 +91,8 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
             if not 0 <= span.begin < span.end <= len(recording):
                 raise InputError(f"a cut gave readings {span.begin} to {span.end} of {len(recording)}")
     else:
-        spans = _of_intervals(recording, cut)
+        told = [interval for interval in cut if _same(interval.file, recording.source)]
+        spans = _of_intervals(recording, told, cut)
     return tuple(
         Touch(
             recording.source,
@@ -92,8 +101,9 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
             recording.readings[span.begin : span.end],
             recording.times[span.begin : span.end],
             _label(recording, span, label),
+            *((told[i].values, told[i].labels) if told else ()),
         )
-        for span in spans
+        for i, span in enumerate(spans)
     )
 
 
@@ -132,8 +142,8 @@ def _during(recording: Recording, begin: int, end: int) -> str | None:
     return next((e.name for e in recording.episodes if e.begin <= middle < e.end), None)
 
 
-def _of_intervals(recording: Recording, intervals: Sequence[Interval]) -> tuple[Episode, ...]:
-    mine = [interval for interval in intervals if _same(interval.file, recording.source)]
+def _of_intervals(recording: Recording, mine: Sequence[Interval], intervals: Sequence[Interval]) -> tuple[Episode, ...]:
+    """The spans of the intervals that are of a recording, out of some."""
     if not mine:
         files = list(dict.fromkeys(interval.file for interval in intervals))
         raise InputError(f"no interval is of {recording.source}{nearest(_place(recording.source).name, files)}")
@@ -168,25 +178,45 @@ def _same(file: str, source: str) -> bool:
 def read_intervals(path: str | PathLike[str], files: Iterable[str | PathLike[str]] | None = None) -> list[Interval]:
     """The intervals in a table with the columns file, begin, end and material (or label), in any order.
 
+    A column with brackets is noted of each touch that has something there: values under "force [N]", of a quantity that
+    the memory has in this unit, or under "force [N] 0..10 step 0.01", which `declared_quantities` has; labels on the
+    axis slip under "slip [label]". Other columns are passed over.
+
     files: the recordings they are meant for; with them, a row of a file that is not among these is refused.
 
-    Raises FieldError for a column that is missing; RecordingError for a table that cannot be read; InputError for a row
-    whose times are no numbers or end before they begin, whose material is empty, or whose file is not there.
+    Raises FieldError for a column that is missing, or there twice; RecordingError for a table that cannot be read;
+    InputError for a row whose times are no numbers or end before they begin, whose material is empty, whose file is not
+    there, or that has a value which is no number.
     """
+    names, table = _table(path)
+    sources = None if files is None else [fspath(file) for file in files]
+    return [_interval(path, row, dict(zip(names, cells, strict=False)), sources) for row, cells in table]
+
+
+def declared_quantities(path: str | PathLike[str]) -> list[Quantity]:
+    """The quantities whose range the headings of a table of intervals say. Raises as `read_intervals`."""
+    return [Quantity.parsed(name) for name in _table(path)[0] if (found := WRITTEN.fullmatch(name)) and found["low"]]
+
+
+def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The names of a table's columns, in lower case but for those with brackets, and its rows with their numbers."""
     try:
         with Path(fspath(path)).open(encoding="utf-8-sig", newline="") as file:
             first = file.readline(1 << 16)
             delimiter = next((mark for mark in ";\t," if mark in first), ",")
-            names = [cell.strip().lower() for cell in next(csv.reader([first], delimiter=delimiter), [])]
+            cells = [cell.strip() for cell in next(csv.reader([first], delimiter=delimiter), [])]
             table = [(i + 2, row) for i, row in enumerate(csv.reader(file, delimiter=delimiter)) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path} cannot be read as a table of intervals: {error}") from error
+    names = [cell if WRITTEN.fullmatch(cell) else cell.lower() for cell in cells]
     names = ["material" if name == "label" else name for name in names]
     for name in ("file", "begin", "end", "material"):
         if name not in names:
             raise FieldError(f"{path} has no column {name!r}; expected file, begin, end, material; there are {names}")
-    sources = None if files is None else [fspath(file) for file in files]
-    return [_interval(path, row, dict(zip(names, cells, strict=False)), sources) for row, cells in table]
+    noted = [found["name"] for name in names if (found := WRITTEN.fullmatch(name))]
+    if twice := sorted({name for name in noted if noted.count(name) > 1}):
+        raise FieldError(f"{path} has several columns {twice[0]!r} with a unit; expected one")
+    return names, table
 
 
 def _interval(path: Any, row: int, cells: dict[str, str], files: list[str] | None) -> Interval:
@@ -202,4 +232,20 @@ def _interval(path: Any, row: int, cells: dict[str, str], files: list[str] | Non
         raise InputError(f"{where}: expected begin before end; came {begin:g} and {end:g}")
     if files is not None and not any(_same(file, source) for source in files):
         raise InputError(f"{where}: {file!r} is none of the recordings{nearest(file, files)}")
-    return Interval(file, begin, end, material, row)
+    return Interval(file, begin, end, material, row, *_noted(where, cells))
+
+
+def _noted(where: str, cells: dict[str, str]) -> tuple[tuple[tuple[str, str, float], ...], tuple[tuple[str, str], ...]]:
+    """The values and labels in the columns of a row that have brackets."""
+    values, labels = [], []
+    for heading, cell in cells.items():
+        if (found := WRITTEN.fullmatch(heading)) is None or not cell.strip():
+            continue
+        if found["unit"].strip() == LABEL:
+            labels.append((found["name"], cell.strip()))
+            continue
+        try:
+            values.append((found["name"], found["unit"].strip(), float(cell)))
+        except ValueError as error:
+            raise InputError(f"{where}: expected {heading!r} as a number: {error}") from error
+    return tuple(values), tuple(labels)

@@ -227,7 +227,7 @@ def test_a_merge_of_another_unit_or_value_changes_nothing(tmp_path):
         before = told(ours), ours._ledger.store.last
         with pytest.raises(MismatchError, match=r"declared as force \[N\] -1..10 step 0.01; came force \[mN\]"):
             ours.merge(theirs, shared="once")
-        with pytest.raises(MismatchError, match=r"both have a touch of 'b', here row 4 with .* there row 3 with"):
+        with pytest.raises(MismatchError, match=r"row 4 of .* has this touch of 'b' with .*; row 3 comes with"):
             ours.merge(third, shared="once")
         assert (told(ours), ours._ledger.store.last) == before
         ours.merge(third, shared="twice")

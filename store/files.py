@@ -29,6 +29,7 @@ __all__ = [
     "new_file",
     "open_regular",
     "read_regular",
+    "regular_file",
     "remove_tree",
     "replacing",
     "same_folder",
@@ -154,7 +155,20 @@ def is_real_folder(path: Path) -> bool:
 
 
 def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes:
-    """Return the bytes of a regular file of at most `limit` bytes.
+    """Return the bytes of a regular file of at most `limit` bytes; raises as `regular_file`."""
+    with regular_file(path, limit, within=within) as (file, size):
+        return file.read(size)
+
+
+def copy_regular(path: Path, target: Path, limit: int) -> None:
+    """Copy a regular file of at most `limit` bytes, a part at a time. Raises DamageError, OSError."""
+    with regular_file(path, limit) as (file, _), target.open("xb") as copy:
+        shutil.copyfileobj(file, copy, PART)
+
+
+@contextmanager
+def regular_file(path: Path, limit: int, *, within: Path | None = None) -> Iterator[tuple[BinaryIO, int]]:
+    """In the block a regular file of at most `limit` bytes is open; gives it and its size.
 
     within: a folder above it; those between the two are no links either. Raises DamageError for a link, for anything
     that is no file, and for a larger one, without reading from it; and OSError.
@@ -164,18 +178,6 @@ def read_regular(path: Path, limit: int, *, within: Path | None = None) -> bytes
             break
         if folder.is_symlink():
             raise DamageError(f"{folder} is a symbolic link, where a store has a folder of its own", path=folder)
-    with _regular(path, limit) as (file, size):
-        return file.read(size)
-
-
-def copy_regular(path: Path, target: Path, limit: int) -> None:
-    """Copy a regular file of at most `limit` bytes, a part at a time. Raises DamageError, OSError."""
-    with _regular(path, limit) as (file, _), target.open("xb") as copy:
-        shutil.copyfileobj(file, copy, PART)
-
-
-@contextmanager
-def _regular(path: Path, limit: int) -> Iterator[tuple[BinaryIO, int]]:
     with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:

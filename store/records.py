@@ -209,6 +209,9 @@ def json_digest(known: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(known, sort_keys=True, separators=(",", ":")).encode("ascii")).hexdigest()
 
 
-def payload_digest(payload: bytes) -> bytes:
-    """Return the 16-byte BLAKE2b over the bytes of a payload."""
-    return hashlib.blake2b(payload, digest_size=16).digest()
+def payload_digest(*parts: bytes | memoryview) -> bytes:
+    """Return the 16-byte BLAKE2b over the bytes of a payload, which may come in parts."""
+    digest = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        digest.update(part)
+    return digest.digest()

@@ -6,7 +6,7 @@ import ctypes
 import logging
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -20,14 +20,14 @@ from scroll_tactile.persistence.contents import ListedContents, StoredContents
 from scroll_tactile.persistence.replaying import apply_appended
 from store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
 
-__all__ = ["OpenMemory", "give_back_scratch"]
+__all__ = ["Derived", "OpenMemory", "give_back_scratch"]
 
 logger = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer")
 
-Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
-"""Arrays and attributes."""
+Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any], Collection[str]]
+"""Arrays, attributes, and the names of arrays that readers map."""
 
 MOST_ADDED = 1024  # touches: a model is fitted again long before
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
@@ -262,7 +262,9 @@ class OpenMemory:
         """Store what is derived from the memory; a failure is logged only, as the next user derives it again."""
         try:
             if (made := derived()) is not None:
-                store.keep_derived(name, made[0], last_sequence=self._memory.sequence, attributes=made[1])
+                arrays, attributes, mapped = made
+                last = self._memory.sequence
+                store.keep_derived(name, arrays, last_sequence=last, attributes=attributes, mapped=mapped)
         except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
             logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)
 

@@ -22,16 +22,13 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
 from weakref import ReferenceType, ref
-
-import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.persistence.open_memory import give_back_scratch
+from scroll_tactile.persistence.open_memory import Derived, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, Renewal
@@ -165,9 +162,8 @@ class CurrentModel:
             self._behind = [] if kept.last_sequence == memory.sequence else None
         give_back_scratch()
 
-    def arrays_to_store(self, ledger: Ledger) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
-        """Arrays and attributes of the present model, to be stored by `prediction.stored`; None if there is none to
-        store.
+    def arrays_to_store(self, ledger: Ledger) -> Derived | None:
+        """The present model as `prediction.stored` has it, with the banks; None if there is none to store.
 
         That is: no model was made, the stored one is still current, or a small memory's model is out of date.
         """
@@ -180,7 +176,7 @@ class CurrentModel:
             return None
         if (made := model_to_arrays(self._present(ledger))) is None:
             return None
-        return made[0] | banks_to_arrays(self._reading.embedding), made[1]
+        return made[0] | banks_to_arrays(self._reading.embedding), *made[1:]
 
     def prepare(self, ledger: Ledger) -> None:
         """Start a fit or a renewal if enough touches came since the last. Raises nothing: the observation is stored."""

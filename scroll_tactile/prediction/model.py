@@ -28,7 +28,7 @@ from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
 from scroll_tactile.statistics.sample import SampledTouch
 from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
-__all__ = ["Hypothesis", "Judgement", "Model", "enough_memory"]
+__all__ = ["Hypothesis", "Judgement", "Model", "enough_memory", "too_many_to_hold"]
 
 FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["prefix", "complete", "paced"]
@@ -37,6 +37,11 @@ Hypothesis = Literal["prefix", "complete", "paced"]
 # Logits behind the best material, to which the logarithm of the number of materials is added. Materials further behind
 # have less than 2e-8 of the probability together, and are not read from the memory.
 NEGLIGIBLE = 18.0
+
+
+def too_many_to_hold(names: Sequence[str]) -> bool:
+    """Whether a model of so many materials reads the requested ones from the memory."""
+    return len(names) > EAGER
 
 
 @contextmanager
@@ -118,7 +123,7 @@ class Model:
     @property
     def reads_memory(self) -> bool:
         """Whether it has too many materials to hold, so that it reads the requested ones from the memory."""
-        return len(self.names) > EAGER
+        return too_many_to_hold(self.names)
 
     def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:
         """A copy that follows independently; both share the parts that `follow` never changes.

@@ -1,8 +1,8 @@
 """The fitted model as arrays beside its checkpoint, so that the next opening needs no fit.
 
-It has all that predictions read, with the banks of kernels, but not K, the sample or the held-out touches: a stored
-model cannot follow, and is renewed when touches come or go (see `prediction.current`). The levels of kept touches
-are the memory's.
+It has all that predictions read, with the banks of kernels, but not the sample or the held-out touches, and K only
+where there are too many materials to hold: a stored model cannot follow, and is renewed when touches come or go (see
+`prediction.current`). The levels of kept touches are the memory's, and so are the means of materials that are not held.
 
 A file may come from elsewhere. Types, shapes and bounds of its arrays are checked against the memory, so that no
 prediction fails or takes more memory because of it. Whether its numbers are the fitted ones cannot be checked. Models
@@ -28,15 +28,17 @@ from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.model import Model, too_many_to_hold
 from scroll_tactile.prediction.moment_table import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.pruning import PruningTable
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.task import readout_from_arrays, readout_to_arrays
+from scroll_tactile.readouts.task import readout_to_arrays
 from scroll_tactile.signals.windows import Scale, measuring
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.validation.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
+from scroll_tactile.validation.stored_readouts import ArrayReader, stored_readout
 from store import Checkpoint
 
 __all__ = ["NAME", "banks_to_arrays", "model_from", "model_to_arrays", "with_banks"]
@@ -59,13 +61,15 @@ OF_MOMENT = (
     "mean_excess_loss",
     "loss_spread",
 )
+# Of many materials. No array of places: those are checked once, and whoever has the file could change what is mapped.
+MAPPED = ("rows", "triangle", *(f"table-{name}" for name in PruningTable.parts(0, 0)))
 OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties", "novelties_if_new")
 
 
-def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]] | None:
-    """Arrays and attributes of a model; None if nothing was fitted, or the model reads the memory."""
+def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any], list[str]] | None:
+    """Arrays and attributes of a model, and the arrays to be mapped; None if nothing was fitted."""
     fusion = model.fusion
-    if fusion is None or model.reads_memory:
+    if fusion is None:
         return None
     places = {name: place for place, name in enumerate(model.names)}
     rows = [*fusion.moments, *fusion.paced]
@@ -79,9 +83,12 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "targets": fusion.trajectories.targets.astype(np.int64),
     }
     arrays |= {name: np.concatenate([getattr(each, name) for each in calibrations]) for name in OF_CALIBRATION}
+    mapped: list[str] = []
     for scale, readout in model.readouts.items():
         arrays[f"names-{scale}"] = np.array([places[name] for name in readout.names], dtype=np.int64)
-        arrays |= {f"{name}-{scale}": part for name, part in readout_to_arrays(readout).items()}
+        parts = readout_to_arrays(readout, whole=model.reads_memory)
+        arrays |= {f"{name}-{scale}": part for name, part in parts.items()}
+        mapped += [f"{name}-{scale}" for name in parts if name in MAPPED and model.reads_memory]
     if model.matcher is not None and model.conformal is not None:
         arrays |= _kept_to_arrays(model.matcher, model.conformal, places)
     attributes = {
@@ -95,7 +102,7 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "longest": model.longest,
         "fitted_to": model.fitted_to,
     }
-    return {name: np.ascontiguousarray(part) for name, part in arrays.items()}, attributes
+    return {name: np.ascontiguousarray(part) for name, part in arrays.items()}, attributes, mapped
 
 
 def banks_to_arrays(embedding: Embedding) -> dict[str, npt.NDArray[Any]]:
@@ -191,7 +198,7 @@ def model_from(kept: Checkpoint, memory: Memory, kind: ReadoutName) -> Model:
     )
 
 
-class _ModelReader:
+class _ModelReader(ArrayReader):
     """Reads the parts of a model from arrays; raises Unexpected for invalid ones.
 
     same: whether the memory has not changed since the model was stored.
@@ -200,28 +207,8 @@ class _ModelReader:
     def __init__(
         self, arrays: Arrays, about: Mapping[str, Any], memory: Memory, names: Sequence[str], same: bool
     ) -> None:
-        self._arrays, self._about, self._memory, self._names, self._same = arrays, about, memory, names, same
-
-    def floats(
-        self, field: str, shape: tuple[int | None, ...], least: float = -np.inf, most: float = np.inf
-    ) -> FloatArray:
-        """Numbers within bounds; infinity only where `most` is infinite."""
-        found = array(self._arrays, field, ("float64",), shape)
-        ends = np.isposinf(found) & (most == np.inf) & (least >= 0)
-        expect(bool((np.isfinite(found) | ends).all()), field, "finite numbers", "others")
-        expect(bool(((found >= least) & (found <= most)).all()), field, f"from {least} to {most}", "others")
-        return found
-
-    def _places(self, field: str, count: int, among: int) -> npt.NDArray[np.intp]:
-        """Different places, so many of them."""
-        found = counts(field, array(self._arrays, field, ("int64",), (count,)), 0, among - 1)
-        expect(len(set(found.tolist())) == count, field, "different places", found)
-        return found.astype(np.intp, copy=False)
-
-    def _length(self, field: str, most: int) -> int:
-        found = self._arrays.get(field)
-        length = -1 if found is None or found.ndim != 1 else len(found)
-        return whole(field, length, 1, most)
+        super().__init__(arrays)
+        self._about, self._memory, self._names, self._same = about, memory, names, same
 
     def readouts(self) -> dict[Scale, Readout]:
         """The readout of each scale at which touches have rows."""
@@ -232,26 +219,12 @@ class _ModelReader:
         return {able[scale]: self._readout(able[scale]) for scale in sorted(scales)}
 
     def _readout(self, scale: Scale) -> Readout:
-        dimension, statistics = self._memory.statistics.dimension, self._memory.statistics
-        count = self._length(f"names-{scale}", len(self._names))
-        names = [self._names[place] for place in self._places(f"names-{scale}", count, len(self._names))]
+        count = self.length(f"names-{scale}", len(self._names))
+        names = [self._names[place] for place in self.places(f"names-{scale}", count, len(self._names))]
+        statistics = self._memory.statistics
         if self._same:
             expect(sorted(names) == statistics.names(scale), f"names-{scale}", "the materials there", names)
-        references = self._length(f"reference-{scale}", count)
-        parts: dict[str, npt.NDArray[Any]] = {
-            "reference": self._places(f"reference-{scale}", references, count),
-            "held": self._places(f"held-{scale}", count, count),
-            "rows": self.floats(f"rows-{scale}", (count, 2, dimension)),
-            "sizes": self.floats(f"sizes-{scale}", (count,), -1e300, 1e300),
-            "origin": self.floats(f"origin-{scale}", (dimension,)),
-            "precision": self.floats(f"precision-{scale}", (dimension,), 0.0, 1e300),
-            "counts": self.floats(f"counts-{scale}", (count,), 1.0, MOST_ROWS),
-            "shape": self.floats(f"shape-{scale}", (2,), 0.0, 1e300),
-        }
-        expect(parts["shape"][0] < 1, f"shape-{scale}", "a share below 1", parts["shape"])
-        own = parts["held"][:references]
-        expect(bool((own == parts["reference"]).all()), f"held-{scale}", "the reference first", own)
-        return readout_from_arrays(scale, names, parts, statistics)
+        return stored_readout(self, scale, names, statistics, whole=too_many_to_hold(self._names))
 
     def kept(self) -> tuple[TouchMatcher, Conformal]:
         """Matcher and conformal sets of the kept touches that the memory still has."""
@@ -259,9 +232,9 @@ class _ModelReader:
         if memory is None:
             raise Unexpected("kept-keys: expected none; there are some")
         levels, channels = {(touch.material, touch.key): touch.levels for touch in memory.touches()}, 0
-        count = self._length("kept-materials", memory.capacity)
-        keys = array(self._arrays, "kept-keys", ("uint8",), (count, KEY_BYTES))
-        materials = counts("kept-materials", self._arrays["kept-materials"], 0, len(self._names) - 1)
+        count = self.length("kept-materials", memory.capacity)
+        keys = array(self.arrays, "kept-keys", ("uint8",), (count, KEY_BYTES))
+        materials = counts("kept-materials", self.arrays["kept-materials"], 0, len(self._names) - 1)
         touches = [(self._names[place], key.tobytes()) for place, key in zip(materials.tolist(), keys, strict=True)]
         expect(len(set(touches)) == count, "kept-keys", "different touches", count)
         there = [row for row, touch in enumerate(touches) if touch in levels]
@@ -269,7 +242,7 @@ class _ModelReader:
         expect(len(there) == count or not self._same, "kept-keys", "no others than are kept", count)
         kept = {row: KeptTouch(*touches[row], levels[touches[row]]) for row in there}
         channels, most = memory.sensor.channels, memory.most_columns
-        longest = int(counts("kept-longest", array(self._arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
+        longest = int(counts("kept-longest", array(self.arrays, "kept-longest", ("int64",), (1,)), 1, most)[0])
         lengths = {row: touch.levels.shape[1] for row, touch in kept.items()}
         expect(max(lengths.values()) <= longest, "kept-longest", "the longest", longest)
         parts = self._parts("matcher", KeptArrays.parts(count, channels, longest))
@@ -282,7 +255,7 @@ class _ModelReader:
         deviation = NaturalDeviation(Likelihood.of(spread, read), coherence, energy, most_energy)
         own = {name: part[there] for name, part in parts.items()}
         matcher = TouchMatcher(KeptArrays.from_arrays(list(kept.values()), own, longest), deviation)
-        order = self._places("kept-order", count, count).tolist()
+        order = self.places("kept-order", count, count).tolist()
         standing = [place for place, row in enumerate(order) if row in kept]
         parts = self._parts("conformal", Conformal.parts(count, channels, longest))
         for name in ("own", "other"):
@@ -294,14 +267,14 @@ class _ModelReader:
 
     def _parts(self, what: str, expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> dict[str, npt.NDArray[Any]]:
         return {
-            name: array(self._arrays, f"{what}-{name}", (dtype,), shape) for name, (dtype, shape) in expected.items()
+            name: array(self.arrays, f"{what}-{name}", (dtype,), shape) for name, (dtype, shape) in expected.items()
         }
 
     def table(
         self, stages: Sequence[Sequence[Scale]], views: Sequence[Scale], matcher: TouchMatcher | None
     ) -> tuple[list[Calibration], Fusion]:
         """The calibration of each stage that touches reached, and the table of moments."""
-        rows = array(self._arrays, "moments", ("float64",), (None, len(OF_MOMENT)))
+        rows = array(self.arrays, "moments", ("float64",), (None, len(OF_MOMENT)))
         least = np.array([1, 0, 0, 1e-300, 1e-300, 0, 0, 0, -1e300, 1e-300])
         most = np.array([2**53, len(stages) - 1, 1e300, 1, 1, 1, 1, np.inf, 1e300, 1e300])
         expect(bool(((rows >= least) & (rows <= most)).all()), "moments", "rows of a table", "others")
@@ -327,7 +300,7 @@ class _ModelReader:
         sizes = [(len(own), len(measuring(own))) for own in scales]
         edges = np.cumsum([(0, 0), *sizes], axis=0).tolist()
         total, novel = edges[-1]
-        lengths = array(self._arrays, "novelty-counts", ("int64",), (len(scales),))
+        lengths = array(self.arrays, "novelty-counts", ("int64",), (len(scales),))
         counts("novelty-counts", lengths, 0, MOST_ROWS)
         weights, medians = self.floats("weights", (total,), 0.0, 1e300), self.floats("median_distances", (total,), 0.0)
         shapes = self.floats("scale_novelty", (novel, 2))
@@ -342,8 +315,8 @@ class _ModelReader:
             yield Calibration(weights[own], shapes[measured], medians[own], known, if_new)
 
     def _trajectories(self, moments: int) -> Trajectories:
-        chances = array(self._arrays, "chances", ("float64",), (None, moments, None))
+        chances = array(self.arrays, "chances", ("float64",), (None, moments, None))
         touches, _, materials = chances.shape
-        novelty = array(self._arrays, "novelty", ("float64",), (touches, moments))
-        targets = counts("targets", array(self._arrays, "targets", ("int64",), (touches,)), 0, max(materials - 1, 0))
+        novelty = array(self.arrays, "novelty", ("float64",), (touches, moments))
+        targets = counts("targets", array(self.arrays, "targets", ("int64",), (touches,)), 0, max(materials - 1, 0))
         return Trajectories(chances, novelty, targets.astype(np.intp, copy=False))

@@ -14,9 +14,9 @@ most. Only the copies of materials that changed are made again.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scroll_tactile.readouts.system import System
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["ManyMaterials", "likeliest"]
+__all__ = ["ManyMaterials", "PruningTable", "likeliest"]
 
 FloatArray = npt.NDArray[np.float64]
 Places = npt.NDArray[np.intp]
@@ -33,7 +33,7 @@ DIRECTIONS = 192  # of 1008: they hold four fifths of how ten thousand materials
 STEPS = 127  # of a byte
 UNIT = 2.0**-24  # of a rounding in single precision
 FIRST = 4  # materials, of the highest guesses: the best of them excludes others
-AT_ONCE = 256  # materials whose bytes are floats at once: they stay in the processor's cache
+AT_ONCE = 64  # materials whose bytes are floats at once: they stay in the processor's cache
 TABLED_AT_ONCE = 1024  # materials whose coarse copies are made at once
 READ_AT_ONCE = 64  # materials whose means are read at once: they stay in the processor's cache
 
@@ -55,6 +55,27 @@ class PruningTable:
         for block in whitened:
             self._put(slice(first, first + len(block)), block)
             first += len(block)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> PruningTable:
+        """The table of which `to_arrays` gave the arrays, which are taken over."""
+        table = cls.__new__(cls)
+        for name in cls.parts(0, 0):
+            setattr(table, name, arrays[name])
+        return table
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays by name."""
+        return {name: getattr(self, name) for name in self.parts(0, 0)}
+
+    @staticmethod
+    def parts(count: int, dimension: int, directions: int = 0) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """The dtypes and shapes of the arrays of so many materials."""
+        near, numbers = (count, directions), ("float64", (count,))
+        found = {"directions": ("float64", (directions, dimension)), "near": ("float32", near)}
+        return (
+            found | {"bytes": ("int8", (count, dimension))} | dict.fromkeys(("sizes", "far", "steps", "lost"), numbers)
+        )
 
     def _put(self, places: slice | Places, whitened: FloatArray) -> None:
         near = whitened @ self.directions.T
@@ -114,6 +135,7 @@ class Compared:
 
     def __post_init__(self) -> None:
         self.known, self._fine = np.zeros((2, len(self.guess)), dtype=np.bool_)
+        self.nearest: tuple[Places, int, float] | None = None  # of some materials, which novelty asks for again
 
     def take(self, places: Places, scores: FloatArray) -> None:
         """Replace the estimates of some materials by their exact scores."""
@@ -123,13 +145,15 @@ class Compared:
     def refine(self, places: Places) -> None:
         """Bound the scores of some materials by their bytes as well."""
         places, table = places[~self._fine[places]], self.table
-        rest = self.rest.astype(np.float32)
+        rest, products = self.rest.astype(np.float32), np.empty(len(places), np.float32)
+        floats = np.empty((min(AT_ONCE, len(places)), len(rest)), np.float32)
         for first in range(0, len(places), AT_ONCE):
             some = places[first : first + AT_ONCE]
-            beyond = table.steps[some] * (table.bytes[some].astype(np.float32) @ rest)
-            slack = table.lost[some] + (len(rest) + 16) * UNIT * table.far[some]
-            self.guess[some] += self.gamma * beyond
-            self.most[some] = self.guess[some] + self.gamma * (slack * self.length + self.rounded[some])
+            np.copyto(floats[: len(some)], table.bytes.take(some, axis=0))
+            np.matmul(floats[: len(some)], rest, out=products[first : first + AT_ONCE])
+        slack = table.lost[places] + (len(rest) + 16) * UNIT * table.far[places]
+        self.guess[places] += self.gamma * (table.steps[places] * products)
+        self.most[places] = self.guess[places] + self.gamma * (slack * self.length + self.rounded[places])
         self._fine[places] = True
 
 
@@ -179,6 +203,19 @@ class ManyMaterials:
             compared.refine(places)
         return compared.guess[places], compared.most[places]
 
+    def nearest(self, features: FloatArray, places: Places) -> tuple[int, float]:
+        """Of some materials the one of the highest score "lda", by its place, and that score."""
+        compared = self._beside(features)
+        if compared.nearest is None or compared.nearest[0] is not places:
+            chosen, scores = likeliest(
+                places,
+                lambda some, fine: self.bounds(features, some, fine=fine > 0),
+                lambda some: self.exact(features, some),
+            )
+            best = int(scores.argmax())
+            compared.nearest = places, int(chosen[best]), float(scores[best])
+        return compared.nearest[1:]
+
     def exact(self, features: FloatArray, places: Places) -> FloatArray:
         """The scores "lda" of any materials for features (d,), shape (k,), without holding these materials."""
         compared, readout = self._beside(features), self._readout
@@ -197,16 +234,23 @@ class ManyMaterials:
         readout = self._readout
         if self._compared is None or self._compared[0] is not features:
             with one_thread():
-                if self._table is None:
-                    self._table = self._tabled()
+                table = self.table
                 if self._most_lost is None:
                     self._most_lost = readout.system.most_lost
                 white = readout.system.towards((features - readout.origin)[None])
                 solved = readout.system.solve_whitened(white)[0]
-                compared = self._table.compared(white[0], self._most_lost, readout.gamma, solved)
+                compared = table.compared(white[0], self._most_lost, readout.gamma, solved)
             compared.take(readout.reference, readout.scores(features, readout.reference, "lda"))  # they are held
             self._compared = features, compared
         return self._compared[1]
+
+    @property
+    def table(self) -> PruningTable:
+        """The coarse copies, made when they are first needed."""
+        if self._table is None:
+            with one_thread():
+                self._table = self._tabled()
+        return self._table
 
     def _tabled(self) -> PruningTable:
         readout, whiten = self._readout, self._readout.system.whiten
@@ -235,11 +279,12 @@ def likeliest(
     exact: places → their scores.
     """
     guess, most = bounds(places, 0)
-    first = places[np.argpartition(-guess, min(FIRST, len(guess)) - 1)[:FIRST]]
-    least = exact(first).max() - margin
-    places = places[most >= least]
+    first = np.argpartition(-guess, min(FIRST, len(guess)) - 1)[:FIRST]
+    least = exact(places[first]).max() - margin
+    most[first] = np.inf  # the table of another's memory may say what is false: then something is left all the same
+    places = places[~(most < least)]
     for fine in range(1, finest + 1):
-        places = places[bounds(places, fine)[1] >= least]
+        places = places[~(bounds(places, fine)[1] < least)]
     return places, exact(places)
 
 

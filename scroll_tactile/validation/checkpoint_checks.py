@@ -38,6 +38,7 @@ __all__ = ["CheckpointChecks"]
 MOST_STAGES = 2**10  # and scales that judge at one
 MODES = ("head", "adapters", "network")
 NO_MOMENT = "a second moment of rows with these sums", "one that no rows have"
+AT_ONCE = 1024  # materials
 JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as much
 IntArray = npt.NDArray[np.int64]
 
@@ -133,12 +134,13 @@ class CheckpointChecks:
         codes(field, sums, rows[:, None])
         if total:
             known = rows > 0
-            self._check_second(arrays, scale, rows[known], sums[known], thorough)
+            own = (rows, sums) if known.all() else (rows[known], sums[known])  # a copy of many materials takes long
+            self._check_second(arrays, scale, *own, thorough)
         return rows
 
     def _check_second(self, arrays: Arrays, scale: Scale, rows: IntArray, sums: IntArray, thorough: bool) -> None:
         """The triangle of a scale, or the rows that it is of; all materials have rows."""
-        total, between = int(rows.sum()), (sums.astype(np.float64) ** 2 / rows[:, None]).sum(axis=0)
+        total, between = int(rows.sum()), _between(rows, sums)
         field = f"second-{scale}"
         if field in arrays:
             packed = array(arrays, field, ("int64",), (self._dimension * (self._dimension + 1) // 2,))
@@ -288,3 +290,12 @@ def _check_descriptions(descriptions: Any) -> None:
     for material, constituents in descriptions.items():
         expect(constituents is not None, "descriptions", "a description", constituents)
         check_description("descriptions", name("descriptions", material), constituents)
+
+
+def _between(rows: IntArray, sums: IntArray) -> npt.NDArray[np.float64]:
+    """The sum over materials of the squares of their sums over their rows, (d,): part by part, in the cache."""
+    between = np.zeros(sums.shape[1])
+    for first in range(0, len(sums), AT_ONCE):
+        part = sums[first : first + AT_ONCE].astype(np.float64)
+        between += (np.square(part, out=part) / rows[first : first + AT_ONCE, None]).sum(axis=0)
+    return between

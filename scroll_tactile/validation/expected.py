@@ -142,10 +142,11 @@ def check_values(values: npt.NDArray[Any] | LateArray, check: Callable[[npt.NDAr
 def codes(field: str, values: npt.NDArray[Any], most: int | npt.NDArray[np.int64] = 1) -> None:
     """Raise Unexpected for codes, or sums of so many of them, beyond the grid; most: against the values' shape."""
     limit = np.asarray(most, dtype=np.int64) << BITS
-    if limit.ndim == 0 and values.size:
-        outside = values.min() < -limit or values.max() > limit
+    if values.size and limit.ndim:  # the same of all along the last axis
+        low, high = (end(axis=-1, keepdims=True) for end in (values.min, values.max))
+        outside = bool(((low < -limit) | (high > limit)).any())
     else:
-        outside = bool(((values < -limit) | (values > limit)).any())
+        outside = bool(values.size) and (values.min() < -limit or values.max() > limit)
     expect(not outside, field, f"codes of magnitude at most 2**{BITS} a row", "larger ones")
 
 

@@ -18,6 +18,7 @@ are whole numbers, and sums of their squares are exact: any order gives the same
 from __future__ import annotations
 
 import copy
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, NamedTuple
@@ -133,6 +134,7 @@ class Conformal:
         self._materials = sorted({material for material, _ in self._touches})
         place = {material: i for i, material in enumerate(self._materials)}
         self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
+        self._asked: tuple[Sequence[str], npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
 
     def copy(self) -> Conformal:
         """Another of the same touches: what comes to it does not come to this one."""
@@ -146,8 +148,26 @@ class Conformal:
         """The materials of what is kept, in alphabetical order."""
         return self._materials
 
+    def places(self, candidates: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+        """The materials among some, in alphabetical order, that are kept: their places in `p_rows`, and among those.
+
+        Those of the last list are cached: it may be of all that a memory has.
+        """
+        asked = self._asked  # any thread may replace it
+        if asked is None or asked[0] is not candidates:
+            swap = len(candidates) < len(self._materials)
+            found = _common(candidates, self._materials) if swap else _common(self._materials, candidates)
+            rows, among = found[::-1] if swap else found
+            self._asked = asked = candidates, rows, among
+        return asked[1:]
+
     def p_values(self, levels: LevelArray) -> dict[str, Typicality]:
         """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
+        values = (Typicality(*row) for row in self.p_rows(levels).tolist())
+        return dict(zip(self._materials, values, strict=True))
+
+    def p_rows(self, levels: LevelArray) -> FloatArray:
+        """The same as rows of the materials in alphabetical order, (materials, 4)."""
         places, own_alpha, other_alpha, own = self.scores(levels)
 
         def by_material(those: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
@@ -161,8 +181,7 @@ class Conformal:
         )
         every = len(places) + 1
         columns = (at_least / count, 1 / count, (others + at_least) / every, np.full(len(own), 1 / every))
-        values = (Typicality(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
-        return dict(zip(self._materials, values, strict=True))
+        return np.stack(columns, axis=1)
 
     def scores(self, levels: LevelArray) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
         """Of each kept touch that is as long its material's place, and α if x is of that material, and if of another.
@@ -266,3 +285,14 @@ def _nonconformity(own: FloatArray, other: FloatArray) -> FloatArray:
     """α of distances from a material and from all others."""
     others = np.where(np.isfinite(other), other, 0.0)
     return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(others))
+
+
+def _common(few: Sequence[str], many: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """The places of what is in both of two ascending lists, in each of them."""
+    found = []
+    for place, name in enumerate(few):
+        other = bisect_left(many, name)
+        if other < len(many) and many[other] == name:
+            found.append((place, other))
+    one, two = np.array(found, dtype=np.intp).reshape(-1, 2).T
+    return one, two

@@ -14,7 +14,6 @@ that is noise (`Match.noise_share`):
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -144,10 +143,8 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
     if model.conformal is None:
         return np.asarray(shares[0])
     for own, touch in zip(shares, touches, strict=True):
-        for name, value in model.conformal.p_values(_levels_of(touch.stream)).items():
-            place = bisect_left(candidates, name)  # they come in alphabetical order, and may be many
-            if place < len(candidates) and candidates[place] == name:
-                own[place] = value
+        rows, among = model.conformal.places(candidates)
+        own[among] = model.conformal.p_rows(_levels_of(touch.stream))[rows]
     if len(shares) == 1:
         return np.asarray(shares[0])
     sums = [[math.fsum(column) for column in of.T] for of in shares.transpose(1, 0, 2)]

@@ -1,25 +1,31 @@
 """Each call is timed in a process of its own, by the public names alone, and every case of the table is there.
 
-The default learner needs no torch: where a worker's import of it is not what is tested, an empty module stands for it.
+The table is filled by workers of this process: that they are processes, and end like killed ones, has a test alone. The
+default learner needs no torch: an empty module stands for the one that a worker imports.
 """
 
 import json
+import time
 from dataclasses import replace
 from itertools import count
 
 import pytest
 from commands import refused, run
 
+import scroll_tactile
+from examples.benchmarks import checkouts as sides_of
 from examples.benchmarks import speed
 from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
 from examples.benchmarks.speed import Sizes, run_speed
 from examples.benchmarks.speed_touches import SKIN
 from examples.benchmarks.timing import CLOCKS, Timing, take_turns
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
+from examples.benchmarks.worker import _Calls, _resident
+from scroll_tactile import Kernels
 from scroll_tactile.errors import InputError
 
-FEW = {"touches": 40, "asked": 1, "pairs": 2, "starts": 1, "materials": 6, "before_materials": 0, "each": 2}
-TINY = Sizes(**FEW, opening=(100,), before_opening=0)  # an older checkout beside the everyday memory alone
+FEW = {"touches": 20, "asked": 1, "pairs": 2, "starts": 1, "materials": 6, "before_materials": 0, "each": 2}
+TINY = Sizes(**FEW, opening=(20,), before_opening=0)  # an older checkout beside the everyday memory alone
 
 
 def test_a_timing_is_the_median_and_the_99th_percentile_of_its_calls():
@@ -53,21 +59,41 @@ def without_torch(tmp_path_factory):
     return folder
 
 
+class Beside(Worker):
+    """A worker's calls in this process."""
+
+    def __init__(self, checkout, touches):
+        self.calls, self.started = _Calls(touches, scroll_tactile), {"torch": 0.1} | _resident()
+
+    def __exit__(self, *_):
+        self.calls.learner._ledger.store.close()  # no checkpoint is written, as in a process that was killed
+
+    def call(self, name, **take):
+        if name == "memory":
+            return _resident()
+        call, begun = self.calls.make(name, take), time.perf_counter()
+        said = call()
+        return {"wall": time.perf_counter() - begun, "said": said}
+
+
 @pytest.fixture(scope="module")
-def measured(without_torch):
+def measured(tmp_path_factory):
     """Every case, tiny, with this checkout beside itself."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(speed, "checkouts", lambda before: {"now": without_torch, "before": before})
+        patch.setattr(speed, "checkouts", lambda before: {"now": before, "before": before})
+        patch.setattr(speed, "Worker", Beside)
+        patch.setattr(sides_of, "Worker", Beside)
+        patch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 64)
         patch.setattr(speed, "REPLAYED", 6)
         patch.setattr(speed, "REFRESHES", 2)
-        return run_speed(sizes=TINY, before=without_torch)
+        return run_speed(sizes=TINY, before=tmp_path_factory.mktemp("checkout"))
 
 
 def test_every_case_is_measured_on_both_sides(measured):
     found = {(record["memory"].split(" (")[0], record["case"]): record for record in measured["records"]}
-    everyday = "40 touches of 20 materials, BioTac"
+    everyday = "20 touches of 20 materials, BioTac"
     for case, calls in (
-        ("observe, durable", 40),
+        ("observe, durable", 20),
         ("import torch", 1),
         ("first predict after opening", 1),
         ("predict again", 20),
@@ -83,7 +109,7 @@ def test_every_case_is_measured_on_both_sides(measured):
     assert found[everyday, "predict again"]["wrong"] < 0.5
     assert (
         found[everyday, "disk after closing"]["median"]
-        > 40 * found[everyday, "journal, a touch with its readings"]["median"] / 1e3
+        > 20 * found[everyday, "journal, a touch with its readings"]["median"] / 1e3
     )
     assert (
         found[everyday, "memory beyond torch, after them"]["median"]
@@ -92,15 +118,15 @@ def test_every_case_is_measured_on_both_sides(measured):
     many = "6 materials × 2 touches"
     assert found[many, "predict, scene of 3"]["calls"] == found[many, "… a memory of these 3 alone"]["calls"] == 6
     assert found[many, "predict, scene of 3"]["of_alone"] > 0
-    assert found["100 touches of 20 materials", "open after a close"]["median"] > 0
+    assert found["20 touches of 20 materials", "open after a close"]["median"] > 0
 
 
-def test_a_process_that_ended_without_a_close_left_what_it_acknowledged(tmp_path):
+def test_a_process_that_ended_without_a_close_left_what_it_acknowledged(without_torch, tmp_path):
     rng = speed.np.random.default_rng(0)
     made = [(f"m{i}", rng.uniform(-1, 1, (100, 8)).astype("float32")) for i in range(3)]
     touches = write_touches(tmp_path / "touches", SKIN, made, 100)
     for expected in (None, "m0"):
-        with Worker(HERE.parents[1], touches) as worker:
+        with Worker(without_torch, touches) as worker:
             worker.call("open", path=str(tmp_path / "memory"))
             assert worker.call("predict", touch=0)["said"] == expected
             for i in range(3):

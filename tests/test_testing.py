@@ -25,7 +25,7 @@ TOUCHES = [("ab"[i % 2], RNG.random((60, 3))) for i in range(6)]  # as few as it
 def test_a_learner_keeps_its_promises(way):
     touches = None if way == "camera" else TOUCHES  # the usual learner is that of the docstring
     held = check_learner(lambda path: TactileLearner.open(path, **WAYS[way]), touches=touches)
-    assert len(held) == 12
+    assert len(held) == 13
 
 
 class Forgetful(TactileLearner):
@@ -45,8 +45,8 @@ class Ordered(TactileLearner):
 
 
 class Careless(TactileLearner):
-    def observe(self, material, stream):
-        return super().observe(material, np.nan_to_num(np.asarray(stream)))
+    def observe(self, material, stream, **noted):
+        return super().observe(material, np.nan_to_num(np.asarray(stream)), **noted)
 
 
 @pytest.mark.parametrize(

@@ -45,8 +45,8 @@ class Ordered(TactileLearner):
 
 
 class Careless(TactileLearner):
-    def observe(self, material, stream):
-        return super().observe(material, np.nan_to_num(np.asarray(stream)))
+    def observe(self, material, stream, **noted):
+        return super().observe(material, np.nan_to_num(np.asarray(stream)), **noted)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,7 @@ class _Bench:
             ("digest", lambda learner: learner.digest()),
             ("materials", lambda learner: learner.materials),
             ("exemplars", lambda learner: learner.exemplars),
+            ("axes", lambda learner: learner.axes),
             ("answers", lambda learner: [repr(learner.predict(readings)) for _, readings in self.touches[:3]]),
         ):
             if (here := of(ours)) != (there := of(theirs)):
@@ -72,6 +74,7 @@ def check_learner(make_learner: Make, *, touches: Sequence[tuple[str, npt.ArrayL
         _any_split,
         _merging_is_union,
         _retracting_undoes,
+        _what_is_noted_is_exact,
         _predicting_changes_nothing,
         _opening_gives_back,
         _a_snapshot_knows_the_same,
@@ -126,6 +129,28 @@ def _retracting_undoes(bench: _Bench) -> None:
             theirs.observe(name, touch)
         theirs.retract(receipt)
         bench.require_same("retract", theirs, ours)
+
+
+def _what_is_noted_is_exact(bench: _Bench) -> None:
+    """values and labels of touches come in any order, merged or not, and leave with their touch."""
+    noted = [({"check": number / 8}, {"check": "ab"[number % 2]}) for number in range(len(bench.touches))]
+    everything = list(zip(bench.touches, noted, strict=True))
+
+    def learned(name: str, chosen: Sequence[tuple[Labelled, Any]]) -> TactileLearner:
+        learner = bench.learner(name)
+        learner.declare(Quantity(name="check", unit="1", low=0, high=len(everything), resolution=1 / 8))
+        for (material, readings), (values, labels) in chosen:
+            learner.observe(material, readings.copy(), values=values, labels=labels)
+        return learner
+
+    (material, readings), _ = everything[0]
+    with learned("a", everything) as ours, learned("b", everything[:0:-1]) as theirs:
+        learned("c", everything[:1]).close()
+        theirs.retract(theirs.observe(material, readings.copy(), values={"check": 0.5}, labels={"check": "c"}))
+        theirs.merge(bench.root / "c", shared="once")
+        bench.require_same("values and labels", ours, theirs)
+        if ours.digest() == bench.learner("d", bench.touches).digest():
+            raise LearnerError("values and labels: expected another digest with them than without; it is the same")
 
 
 def _predicting_changes_nothing(bench: _Bench) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import store.layout
-from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
@@ -26,17 +26,26 @@ from store.layout import read_current, write_current
 GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
 EXPECTED = GOLDEN.with_suffix(".json")
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+FORCE = Quantity(name="force", unit="N", low=0, high=4, resolution=0.125)
 NAMES = ("felt", "Samt ü/√", "cork")
 STANDING = [0, 1, 2, 3, 4, 6, 7, 8, 9]  # seeds of the touches in it, of 60 readings each; "cork" has one of 40 beside
 ASKED = [(100 + seed, readings) for seed in range(3) for readings in (9, 30, 60)]
 # What the memory says, but for f* and probabilities: machines solve with other last bits.
-EXACT = ("digest", "materials", "exemplars", "descriptions", "kept")
+EXACT = ("digest", "materials", "exemplars", "descriptions", "kept", "axes", "quantities", "noted")
 
 
 def stream(seed, readings=60):
     """A random walk whose step is the seed's: materials of their own."""
     rng = np.random.default_rng([seed, readings])
     return 0.5 + 0.4 * np.sin(np.cumsum(rng.normal(0, 0.1 + seed % 3 / 3, (readings, 2)), axis=0))
+
+
+def noted(seed):
+    """What is noted of a touch: of every second a value, of most a label."""
+    return {
+        "values": {} if seed % 2 else {"force": seed / 8},
+        "labels": {"slip": ("north", "süd")[seed // 3 % 2]} if seed % 5 else {},
+    }
 
 
 def opened(path, mode="write"):
@@ -48,12 +57,17 @@ def write(target):
     with tempfile.TemporaryDirectory() as home:
         path, other_path = Path(home, "memory"), Path(home, "other")
         with opened(other_path) as other:
+            other.declare(FORCE)
             for seed in range(4):
-                other.observe(NAMES[seed % 3], stream(seed))
+                other.observe(NAMES[seed % 3], stream(seed), **noted(seed))
             other.compact(keep=2)
         learner = opened(path)
+        learner.declare(FORCE)
         with learner.batch():
-            receipts = [learner.observe(NAMES[seed % 3], stream(seed), source=f"{seed}.csv") for seed in range(4, 10)]
+            receipts = [
+                learner.observe(NAMES[seed % 3], stream(seed), **noted(seed), source=f"{seed}.csv")
+                for seed in range(4, 10)
+            ]
         learner.retract(receipts[1])
         learner.describe("felt", {"wool": 0.75, "viscose": 0.25})
         learner.describe("cork", {"soft": False, "natural": True})
@@ -62,7 +76,7 @@ def write(target):
         learner.compact(keep=3)
         learner.merge(other_path, shared="once")
         learner.fine_tune(epochs=1)
-        learner.observe("cork", stream(20, 40))
+        learner.observe("cork", stream(20, 40), **noted(20))
         learner.describe("cork", {"soft": False, "natural": None})
         learner.retract(learner.observe("felt", stream(21)))
         with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -87,6 +101,9 @@ def content(learner, asked=ASKED):
         "descriptions": learner.descriptions,
         "answers": [[answer.material, round(answer.probability, 6)] for answer in answers],
         "kept": kept(learner),
+        "axes": learner.axes,
+        "quantities": [str(quantity) for quantity in learner.quantities.values()],
+        "noted": [[row.values, row.labels] for row in learner.observations() if row.state != "retracted"],
     }
 
 
@@ -127,9 +144,10 @@ def test_it_is_sound(golden):
 
 def test_every_kind_of_row_and_checkpoint_is_in_it(golden):
     with Store.open(golden, mode="read") as held:
-        assert {head.kind for head in held.heads()} == {"observe", "retract", "merge", "member", "describe"}
+        kinds = {"observe", "retract", "merge", "member", "describe", "declare"}
+        assert {head.kind for head in held.heads()} == kinds
         assert 0 < held.compacted < held.latest().last_sequence < held.last
-        assert {"sample", "kept", "exemplars", "descriptions", "tuned"} <= set(held.latest().attributes)
+        assert {"sample", "kept", "exemplars", "descriptions", "tuned", "targets"} <= set(held.latest().attributes)
         assert len(held.compaction().arrays["exemplar-readings"])
 
 
@@ -138,9 +156,10 @@ def test_it_says_what_was_recorded(golden, how):
     with how(golden, mode="read") as learner:
         require(learner, ASKED if how is opened else ())
         now = TactileLearner(sensor=PAD, embedding=Kernels(seed=0, dimension=64), exemplars=4)
+        now.declare(FORCE)
         for seed in STANDING:
-            now.observe(NAMES[seed % 3], stream(seed))
-        now.observe("cork", stream(20, 40))
+            now.observe(NAMES[seed % 3], stream(seed), **noted(seed))
+        now.observe("cork", stream(20, 40), **noted(20))
         assert learner.digest() == now.digest()
         assert kept(learner) == kept(now)
 

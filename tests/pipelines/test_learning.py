@@ -285,7 +285,7 @@ class TestEvaluate:
         by_key = {learner.stream(stream((i, 60))).key: answer for i, answer in said.items()}
         assert len(by_key) == len(given) == 6
 
-        def predict(self, touch, scene=None):
+        def predict(self, touch, of=None, scene=None):
             material, probability, known = by_key[touch.key]
             return Prediction(material, probability, ((material, probability),), 0.0, known, touch.seconds)
 

@@ -93,8 +93,9 @@ class Task:
         places = held_at_first(self.reference, len(self.names))
         means = class_means(self.counts[places], self.sums[places], origin)
         # Single rows have no scatter: the readout then is the nearest mean.
-        spread = trace / dimension * share / (1 - share)
-        penalty = spread if trace > 0 else max(float(np.mean(np.square(means))), 1.0)
+        penalty = trace / dimension * share / (1 - share)
+        if not penalty > 0:  # an earlier one had no share of a scatter either: its penalty stays, as where it follows
+            penalty = max(float(np.mean(np.square(means))), 1.0) if like is None or trace == 0 else like.penalty
         matrix[np.diag_indices(dimension)] += penalty
         counts = self.counts.astype(np.float64)
         precision: FloatArray = counts.sum() / np.diagonal(matrix) if like is None else like.precision

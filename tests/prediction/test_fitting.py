@@ -188,3 +188,15 @@ def test_a_touch_at_another_pace_is_blended_from_its_neighbours():
     assert slow[0].tolist() == [0, 5, 10, 15, 20, 25, 30]
     assert slow[1].tolist() == [MISSING, MISSING, MISSING, MISSING, 7, 8, 8]
     assert at_pace(levels[:1], 1.0).tolist() == levels[:1].tolist()
+
+
+def test_what_was_fitted_to_single_touches_takes_in_second_ones_after_opening(tmp_path):
+    """It had no scatter to shrink: its penalty is no share of one, and without any, K would be singular."""
+    names, settings = SCENE.materials[:18], {"sensor": SKIN, "embedding": Kernels(dimension=84)}
+    with TactileLearner.open(tmp_path, **settings) as writer:
+        for name in names:
+            writer.observe(name, SCENE.touch(name, 0))
+        writer.settle()
+    with TactileLearner.open(tmp_path) as writer:
+        writer.observe(names[0], SCENE.touch(names[0], 1))
+        assert writer.predict(SCENE.touch(names[0], 2)).material == names[0]

@@ -21,7 +21,7 @@ from pydantic import Field, FiniteFloat, field_validator, model_validator
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.settings import LONGEST_NAME, ValidatedFields
 
-__all__ = ["MOST_QUANTITIES", "MOST_STEPS", "WRITTEN", "Quantity", "require_declarable"]
+__all__ = ["LONGEST_UNIT", "MOST_QUANTITIES", "MOST_STEPS", "WRITTEN", "Quantity", "require_declarable"]
 
 # Of a range: as many as the features' grid has, so that the squares of 2²³ values add up in int64.
 MOST_STEPS = 2**20

@@ -232,7 +232,20 @@ QUANTITIES: list[tuple[str, Any]] = [
     *(("force", QUANTITY | change) for change in ({"resolution": 0.0}, {"resolution": "x"}, {"resolution": True})),
     ("force", {}),
 ]
-CONSTITUENTS = ["x", 3, [], {}, {"wool": "x"}, {"wool": 1}, {"wool": 2.0}, {"": 1.0}, {"wool": [1.0]}, {"wool": 0.1}]
+CONSTITUENTS = [
+    "x",
+    3,
+    [],
+    {},
+    {"wool": "x"},
+    {"wool": 1},
+    {"wool": 2.0},
+    {"": 1.0},
+    {"wool": [1.0]},
+    {"wool": 0.1},
+    {"x": [1, "N"]},
+    {"x": [1.0, ""]},
+]
 
 
 def row(**changes: Any) -> Attack:

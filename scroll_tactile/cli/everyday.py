@@ -251,8 +251,8 @@ def describe(
     constituents: Annotated[
         list[str] | None,
         typer.Argument(
-            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown. None: its "
-            "description is removed.",
+            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown; a property as "
+            "'hardness=62 Shore A'. None: its description is removed.",
             show_default=False,
         ),
     ] = None,
@@ -269,16 +269,19 @@ def describe(
     say(f"{shown(material)}: {now}; observed {count} time{'s' * (count != 1)}")
 
 
-def _constituent(text: str) -> tuple[str, float | bool | None]:
+def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | None]:
     name, sign, value = text.rpartition("=")
     if value in WORDS and sign:
         return name.strip(), WORDS[value]
+    number, _, unit = value.strip().partition(" ")
     try:
-        return name.strip(), float(value if sign else "")
+        share = float(number if sign else "")
     except ValueError:
         raise DescriptionError(
-            f"expected a constituent as NAME=SHARE, such as wool=0.65, or NAME=yes, no or unknown; came {text!r}"
+            "expected a constituent as NAME=SHARE, such as wool=0.65, or NAME=yes, no or unknown, or a property as "
+            f"'hardness=62 Shore A'; came {text!r}"
         ) from None
+    return name.strip(), (share, unit.strip()) if unit else share
 
 
 def compose(

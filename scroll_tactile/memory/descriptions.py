@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Annotated, Any, Self
@@ -12,12 +12,29 @@ import numpy as np
 from pydantic import BeforeValidator, RootModel, ValidationError, model_validator
 
 from scroll_tactile.errors import DescriptionError
+from scroll_tactile.quantities import LONGEST_UNIT
 from scroll_tactile.settings import LONGEST_NAME
 
-__all__ = ["Description", "Target", "checked", "describe", "require_constituents", "targets_of"]
+__all__ = [
+    "Description",
+    "Property",
+    "Target",
+    "checked",
+    "constituents_of",
+    "describe",
+    "require_constituents",
+    "require_units",
+    "targets_of",
+]
 
-Description = dict[str, float | bool | None]
-"""Constituent → its share by mass; or whether it is there, where it is no mass; or None where that is unknown."""
+Property = list[float | str]
+"""What was measured of a material, such as its hardness: [value, unit], as JSON has it."""
+
+Description = dict[str, float | bool | Property | None]
+"""Constituent → its share by mass; or whether it is there, where it is no mass; or None where that is unknown.
+
+Or a property of the material → its value and unit.
+"""
 
 SLACK = 1e-6  # of shares that are to sum to one: thirds of six digits pass, a forgotten percent does not
 
@@ -28,16 +45,28 @@ def _name(name: Any) -> str:
     return name
 
 
-def _value(value: Any) -> float | bool | None:
+def _value(value: Any) -> float | bool | Property | None:
+    if isinstance(value, tuple | list):
+        return _property(value)
     if value is None or isinstance(value, bool | np.bool_):
         return None if value is None else bool(value)
     if not isinstance(value, Real):
-        raise ValueError(f"expected a share from 0 to 1, True, False or None; came {value!r:.60}")
+        raise ValueError(f"expected a share from 0 to 1, True, False, None or (value, unit); came {value!r:.60}")
     share = float(value)
     if not math.isfinite(share) or share < 0 or share > 1 + SLACK:
         hint = ". Shares are parts of one, not percent" if 1 < share <= 100 else ""
         raise ValueError(f"expected a share from 0 to 1; came {share:g}{hint}")
     return share + 0.0  # −0 becomes 0: equal descriptions must be equal on the disk
+
+
+def _property(pair: Sequence[Any]) -> Property:
+    said = f"expected a property as (value, unit), such as (62, 'Shore A'); came {pair!r:.60}"
+    if len(pair) != 2 or isinstance(pair[0], bool) or not isinstance(pair[0], Real) or not isinstance(pair[1], str):
+        raise ValueError(said)
+    value, unit = float(pair[0]), str(pair[1])
+    if not (math.isfinite(value) and 0 < len(unit) <= LONGEST_UNIT and unit.isprintable()):
+        raise ValueError(f"{said}; the value finite, the unit of 1 to {LONGEST_UNIT} printable characters")
+    return [value + 0.0, unit]
 
 
 class _Constituents(RootModel[dict[Annotated[Any, BeforeValidator(_name)], Annotated[Any, BeforeValidator(_value)]]]):
@@ -87,12 +116,29 @@ def describe(descriptions: dict[str, Description], material: str, constituents: 
         descriptions[material] = dict(constituents)
 
 
+def constituents_of(description: Description) -> dict[str, float | bool | None]:
+    """A description without the material's properties."""
+    return {name: value for name, value in description.items() if not isinstance(value, list)}
+
+
+def require_units(descriptions: Mapping[str, Description], material: str, description: Description) -> None:
+    """Raise DescriptionError where a property has another unit than that of another material."""
+    for name, value in description.items():
+        for other, there in descriptions.items():
+            before = there.get(name)
+            if other != material and isinstance(value, list) and isinstance(before, list) and before[1] != value[1]:
+                raise DescriptionError(
+                    f"the description of {material!r}, {name!r}: expected it in {before[1]}, as of {other!r}; came "
+                    f"{value[0]:g} {value[1]}"
+                )
+
+
 def require_constituents(descriptions: Mapping[str, Description], wanted: Collection[str] | None) -> list[str]:
     """The constituents that are asked for, in alphabetical order; all that the descriptions name where it is None.
 
     Raises DescriptionError where nothing was described, for one that no description names, or none.
     """
-    known = {name for description in descriptions.values() for name in description}
+    known = {name for description in descriptions.values() for name in constituents_of(description)}
     if not known:
         raise DescriptionError("nothing was described yet: say with describe() what some material is made of")
     if wanted is None:
@@ -121,12 +167,13 @@ def targets_of(descriptions: Mapping[str, Description]) -> dict[str, Target]:
     A material whose shares sum to one has nothing else that is a mass: a constituent of which any material has a share
     is absent from it, with a share of 0, where it is not named.
     """
-    names = sorted({name for description in descriptions.values() for name in description})
+    made_of = {material: constituents_of(description) for material, description in sorted(descriptions.items())}
+    names = sorted({name for description in made_of.values() for name in description})
     masses = {
-        name for description in descriptions.values() for name, value in description.items() if isinstance(value, float)
+        name for description in made_of.values() for name, value in description.items() if isinstance(value, float)
     }
     targets = {name: Target({}, {}) for name in names}
-    for material, description in sorted(descriptions.items()):
+    for material, description in made_of.items():
         whole = any(isinstance(value, float) for value in description.values()) and None not in description.values()
         for name in names:
             value = description.get(name, 0.0 if whole and name in masses else None)

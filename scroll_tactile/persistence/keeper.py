@@ -59,18 +59,21 @@ class MemoryKeeper(ABC):
         described = self._ledger.read(lambda memory, _: sorted(memory.descriptions.items()))
         return {name: dict(description) for name, description in described}
 
-    def describe(self, material: str, constituents: Mapping[str, float | bool | None] | None) -> None:
+    def describe(
+        self, material: str, constituents: Mapping[str, float | bool | tuple[float, str] | None] | None
+    ) -> None:
         """Say what a material is made of, before or after it is touched; durable when this returns.
 
         constituents: name → share by mass, from 0 to 1, summing to one; a mass that is not named is absent. For
         attributes that are no masses: True or False; one that is not named is unknown. None for a name: unknown, and
-        nothing is learned of that constituent from this material. None for all: removes the description.
+        nothing is learned of that constituent from this material. For a property of the material, such as its hardness:
+        its value and unit, (62, "Shore A"), the same unit for all materials. None for all: removes the description.
 
         A later description replaces an earlier one as a whole; the same one again changes nothing. Statistics and
         `digest` stay as they are. `forget` removes the description too, `retract` does not.
 
-        Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, or names
-        that cannot be used (nothing was changed); StoreError.
+        Raises MaterialError, DescriptionError for shares that are negative, not finite or do not sum to one, names
+        that cannot be used, or a property in another unit (nothing was changed); StoreError.
         """
         material = require_name(material)
         self._ledger.describe(material, None if constituents is None else checked(material, constituents))

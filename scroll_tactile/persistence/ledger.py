@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
-from scroll_tactile.memory.descriptions import Description, describe
+from scroll_tactile.memory.descriptions import Description, describe, require_units
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -142,6 +142,7 @@ class Ledger(OpenMemory):
             memory = self.memory
             if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but means another thing
                 return
+            require_units(memory.descriptions, material, constituents or {})
             before = dict(memory.descriptions)
 
             def undo() -> None:

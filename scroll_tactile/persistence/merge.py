@@ -8,8 +8,8 @@ from typing import Any, Literal, Self, cast
 
 from pydantic import BaseModel
 
-from scroll_tactile.errors import AnnotationError, MismatchError, ObservationError
-from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.errors import AnnotationError, DescriptionError, MismatchError, ObservationError
+from scroll_tactile.memory.descriptions import Description, require_units
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -302,7 +302,13 @@ def _descriptions(
             f"{len(differing)} materials are described differently in {ours.path} and {theirs.path}, such as {name!r}: "
             f"here it is {ours_now[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
         )
-    return {name: new[name] for name in new if choice != "ours" or name not in ours_now}
+    taken = {name: new[name] for name in new if choice != "ours" or name not in ours_now}
+    for name, description in taken.items():
+        try:
+            require_units({**ours_now, **taken}, name, description)
+        except DescriptionError as error:
+            raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {error}") from None
+    return taken
 
 
 def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, plain_cell
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.descriptions import Description
+from scroll_tactile.memory.descriptions import Description, constituents_of
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Observation
 from scroll_tactile.statistics.grid import BITS
@@ -43,8 +43,8 @@ def export_plain(
       one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d) and `second-<scale>` Σ x xᵀ, int64 (d, d),
       of features x in units of bound · 2⁻²⁰.
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.
-    - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given. Only
-      where anything was described.
+    - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given; and
+      `properties.csv`: material, property, value, unit. Only where anything was described.
     - In the tables a name or source that a spreadsheet would compute, for it begins with = + - @, has an apostrophe in
       front, also behind a semicolon within (see `errors.plain_cell`).
     - `memory.json`: format 2, sensor, embedding, digest, date, and the number of touches. It is written last.
@@ -78,6 +78,9 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
     if held.descriptions:
         header = ["material", "constituent", "present", "share"]
         _rows(target / "descriptions.csv", header, _described(held.descriptions))
+        of = [(name, *pair) for name, told in held.descriptions.items() for pair in told.items()]
+        properties = [[material, name, *value] for material, name, value in of if isinstance(value, list)]
+        _rows(target / "properties.csv", ["material", "property", "value", "unit"], properties)
     progress("statistics", 0, 1)
     with (target / "statistics.npz").open("wb") as file:
         np.savez(file, allow_pickle=False, **_arrays(held.memory.statistics))
@@ -142,7 +145,7 @@ def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:
     return [
         [material, name, present(value), value if isinstance(value, float) else ""]
         for material, description in descriptions.items()
-        for name, value in description.items()
+        for name, value in constituents_of(description).items()
     ]
 
 

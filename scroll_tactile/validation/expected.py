@@ -277,7 +277,10 @@ def check_description(field: str, material: str, constituents: Any) -> None:
         kept = checked(material, constituents)
     except DescriptionError as error:
         raise Unexpected(f"{field}: {error}") from None
-    same = all(type(value) is type(kept[constituent]) for constituent, value in constituents.items())
+    same = all(
+        type(value) is type(kept[name]) and (not isinstance(value, list) or repr(value) == repr(kept[name]))
+        for name, value in constituents.items()
+    )
     expect(same, field, "shares as floats", constituents)
 
 

@@ -3,13 +3,18 @@
 import csv
 
 import pytest
-from touches import OBSERVED, SETTINGS, filled, require_same, spoil
+from touches import OBSERVED, SETTINGS, filled, require_same, spoil, stream
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.pipelines.plain_export import export_plain
 
-SAID = {"a": {"silk": 0.25, "wool": 0.75}, "b": {"silk": 1.0}, "d": {"soft": True, "wool": 0.5, "jute": None}}
+HARD = {"hardness": [62.0, "Shore A"]}
+SAID = {
+    "a": {"silk": 0.25, "wool": 0.75, **HARD},
+    "b": {"silk": 1.0},
+    "d": {"soft": True, "wool": 0.5, "jute": None},
+}
 
 
 @pytest.fixture
@@ -80,3 +85,26 @@ def test_it_is_written_out_plain(path, tmp_path):
         ["d", "soft", "yes", ""],
         ["d", "wool", "yes", "0.5"],
     ]
+    properties = (tmp_path / "plain" / "properties.csv").read_text(encoding="utf-8")
+    assert properties.split() == ["material,property,value,unit", "a,hardness,62.0,Shore", "A"]
+
+
+def test_a_property_has_a_value_and_one_unit_for_all_materials(path, tmp_path):
+    with told(path, [], {"a": {"hardness": (62, "Shore A")}})[0] as learner:
+        assert learner.descriptions == {"a": HARD}
+        for wrong, match in (
+            ({"hardness": (3.5, "MPa")}, "'b', 'hardness': expected it in Shore A, as of 'a'; came 3.5 MPa"),
+            ({"hardness": (float("nan"), "Shore A")}, "the value finite"),
+            ({"hardness": (62,)}, "a property as"),
+            ({"hardness": ("62", "Shore A")}, "a property as"),
+            ({"hardness": (62, "")}, "1 to 40 printable"),
+        ):
+            with pytest.raises(DescriptionError, match=match):
+                learner.describe("b", wrong)
+        with pytest.raises(DescriptionError, match="nothing was described yet"):
+            learner.compose(stream((7, 25)))  # a property is no constituent
+        other, _ = told(tmp_path / "other", [], {"b": {"hardness": (3.5, "MPa")}})
+        with other, pytest.raises(MismatchError, match=r"expected it in Shore A, as of 'a'; came 3\.5 MPa"):
+            learner.merge(other, shared="once")
+        learner.describe("a", {"hardness": (6.2, "MPa")})  # the only one may change its unit
+        assert learner.descriptions == {"a": {"hardness": [6.2, "MPa"]}}

@@ -145,7 +145,7 @@ def test_touches_far_longer_than_usual_are_kept_in_part_and_known(matching):
     learner = learned(of_each=4)
     for i in range(4):
         learner.observe("long", lasting(SCENE.touch(SCENE.materials[7], i).readings, 5))
-    assert max(levels.shape[1] for *_, levels in learner.memory.kept) == 160
+    assert max(touch.levels.shape[1] for *_, touch in learner.memory.kept) == 160
     rng = np.random.default_rng(0)
     asked = [lasting(SCENE.touch(SCENE.materials[7], i).readings, 5) for i in range(20, 26)]
     assert np.mean([learner.predict(values).material == "long" for values in asked]) >= 0.8

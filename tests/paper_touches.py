@@ -55,10 +55,10 @@ def pressed(letters: str = "ABCDEFGHJKLMNOPQRTVXYZ") -> Recordings:
 
 
 def slid() -> Slides:
-    """Slides over two fabrics, at four forces and four speeds."""
+    """Slides over three fabrics, at four forces and four speeds."""
     rng = np.random.default_rng(0)
     names, forces, speeds, streams = [], [], [], []
-    for name in ("felt", "silk"):
+    for name in ("felt", "silk", "wool"):
         shape = 1 + 0.3 * rng.standard_normal((50, 16)).cumsum(axis=0) / 7
         for force in (120, 150, 210, 250):
             for speed in (-150, -10, 20, 120):

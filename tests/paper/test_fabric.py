@@ -147,7 +147,7 @@ class TestRatios:
 
 
 def test_directions_are_of_slides_at_other_speeds_and_forces():
-    assert [(int(a.sum()), int(b.sum())) for a, b in directions(slid()).values()] == [(16, 16)] * 4
+    assert [(int(a.sum()), int(b.sum())) for a, b in directions(slid()).values()] == [(24, 24)] * 4
 
 
 def test_groups_share_the_names_out():

@@ -134,6 +134,15 @@ STUDIES = {
         {("parts", 0): {*("part", "learned", "tested", "accuracy", "of each", "unknown", "digest", "seconds")}},
         ("slow → fast",),
     ),
+    "quantities": Study(
+        "fabric quantities --no-peers",
+        {
+            ("parts", 0): {*("part", "learned", "tested", "ours", "ours, 64", "ours, 128", "ours, 1024", "seconds")},
+            ("parts", 0, "ours", "4 s", "force"): {"squares", "spread", "off", "covers", "width"},
+            ("means", 0): {*("held out", "system", "from", "of", "off", "covers", "width", "r2", "least")},
+        },
+        ("a fabric", "ours, 128", "0.3 s"),
+    ),
     "attributes": Study(
         "fabric attributes --grades G.csv --sets roboskin-20 --dimension 64",
         {("sets", "roboskin-20", "means", "shaking"): {*GRADED}},
@@ -214,7 +223,7 @@ def test_a_quick_run_ends_with_its_columns_and_is_not_done_again(name, words_of,
     study = STUDIES[name]
     words = [*words_of(study.words), "--run", tmp_path / "run"]
     words += ["--data", gelsight] if "contactile" not in study.words else []
-    words += ["--quick"] if "slide" not in study.words else []
+    words += ["--quick"] if name not in ("slide", "quantities") else []
     first = run(*words, "--json", tmp_path / "a.json")
     assert first.exit_code == 0, first.output
     shown = re.sub(r"\s+", " ", first.output)

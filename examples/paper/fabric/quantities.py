@@ -24,6 +24,7 @@ from examples.paper.runs.results import show, write
 from scroll_tactile import Kernels
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.embeddings.protocol import window_plan
+from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.libraries import optional
 from scroll_tactile.prediction.features import FeatureExtractor
@@ -68,12 +69,18 @@ class Quantities:
 
     slides: of `fabric_slide`. peers: whether scikit-learn's, MAPIE's and crepes' are measured too. seed: of the peers'
     folds. folder: where finished parts are noted, so that an interrupted run resumes; or None.
+
+    Raises InputError for fewer than three fabrics: with one left out, one would be left to hold out.
     """
 
     slides: Slides
     peers: bool = True
     seed: int = 0
     folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        if (count := len(set(self.slides.recordings.materials))) < 3:
+            raise InputError(f"expected slides over three fabrics or more; came {count}")
 
     @property
     def plan(self) -> dict[str, Any]:

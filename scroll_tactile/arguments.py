@@ -11,7 +11,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor, known
 from scroll_tactile.signals.copies import Augmented
 
-__all__ = ["require_arguments"]
+__all__ = ["require_arguments", "silent"]
 
 
 def require_arguments(needed: Mapping[str, Any], optional: Mapping[str, Any] | None = None) -> None:
@@ -61,6 +61,10 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "known": ("True, False, or None for what the prediction says", lambda value: isinstance(value, bool)),
     "progress": ("a function of (what is being done, steps done, steps in all)", callable),
 }
+
+
+def silent(what: str, done: int, of: int) -> None:
+    """The progress of calls that are given none: shows nothing."""
 
 
 def _advice(name: str, value: Any) -> str:

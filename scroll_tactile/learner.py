@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from scroll_tactile.arguments import require_arguments
+from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import AnnotationError, DescriptionError, InputError, RangeWarning
 from scroll_tactile.memory.tuned import TuneReport
@@ -220,7 +220,7 @@ class TactileLearner(MemoryKeeper):
         path and in a batch; StoreError. The memory is then as it was; where the exchange itself failed it is closed.
         """
         require_arguments({}, {"embedding": embedding, "progress": progress})
-        before, self._predictor = embed_again(self._predictor, embedding, progress or _silent)
+        before, self._predictor = embed_again(self._predictor, embedding, progress or silent)
         return before
 
     def predict(
@@ -374,7 +374,7 @@ class TactileLearner(MemoryKeeper):
 
         require_arguments({}, {"progress": progress})
         how: dict[str, Any] = {"epochs": epochs, "seed": seed, "device": device}
-        return fine_tune_memory(self._predictor, **how, progress=progress or _silent)
+        return fine_tune_memory(self._predictor, **how, progress=progress or silent)
 
     def close(self) -> None:
         """Write a checkpoint, so that opening replays nothing, and release the files; a second call does nothing.
@@ -394,7 +394,3 @@ class TactileLearner(MemoryKeeper):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _silent(what: str, done: int, of: int) -> None:
-    """The default progress: shows nothing."""

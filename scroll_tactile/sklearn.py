@@ -27,7 +27,43 @@ Touches = npt.NDArray[Any] | Sequence[npt.ArrayLike]
 Labels = npt.NDArray[Any] | Sequence[Any]
 
 
-class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
+class _TouchEstimator(BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
+    """The settings of both estimators, and the learner that they make."""
+
+    def __init__(
+        self,
+        sensor: Sensor | None = None,
+        embedding: Embedding | None = None,
+        readout: str = "lda",
+        kept_touches: int | None = None,
+    ) -> None:
+        self.sensor = sensor
+        self.embedding = embedding
+        self.readout = readout
+        self.kept_touches = kept_touches
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.three_d_array = True
+        tags.target_tags.required = True
+        return tags
+
+    def _empty_learner(self, touches: Sequence[npt.NDArray[Any]]) -> TactileLearner:
+        """A learner with these settings, for touches like these."""
+        sensor = _sensor_of(touches) if self.sensor is None else self.sensor
+        how: dict[str, Any] = {"embedding": self.embedding, "readout": self.readout, "kept_touches": self.kept_touches}
+        return TactileLearner(sensor=sensor, exemplars=0, **how)
+
+    def _fitted_learner(self) -> TactileLearner:
+        """The learner. Raises NotFittedError where nothing was fitted."""
+        learner: TactileLearner | None = getattr(self, "learner_", None)
+        if learner is None:
+            calls = " or ".join(name for name in ("fit", "partial_fit") if hasattr(self, name))
+            raise NotFittedError(f"this {type(self).__name__} knows no touches yet: call {calls} first")
+        return learner
+
+
+class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]  # as above
     """`TactileLearner`, in memory only, behind fit, partial_fit, predict, predict_proba and score.
 
     Touches X: an array (N, T, n) of N touches of T readings of n channels, (N, T) where there is one channel, or a list
@@ -43,18 +79,6 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
     Raises InputError for labels that do not fit the touches, StreamError for touches that do not fit the sensor,
     NotFittedError for predictions before anything was fitted.
     """
-
-    def __init__(
-        self,
-        sensor: Sensor | None = None,
-        embedding: Embedding | None = None,
-        readout: str = "lda",
-        kept_touches: int | None = None,
-    ) -> None:
-        self.sensor = sensor
-        self.embedding = embedding
-        self.readout = readout
-        self.kept_touches = kept_touches
 
     def fit(self, X: Touches, y: Labels) -> Self:
         """Observe these touches and nothing else."""
@@ -72,7 +96,7 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
             )
         learner: TactileLearner | None = getattr(self, "learner_", None)
         if learner is None:
-            learner = _learner_of(self, touches)
+            learner = self._empty_learner(touches)
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):
             learner.observe(str(label), stream, again=True)  # a row that comes twice weighs twice
@@ -88,21 +112,13 @@ class TactileClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  
 
     def predict_proba(self, X: Touches) -> npt.NDArray[np.float64]:
         """The probability of each label in the order of classes_, (N, classes), calibrated on touches left out."""
-        learner: TactileLearner | None = getattr(self, "learner_", None)
-        if learner is None:
-            raise NotFittedError("this TactileClassifier knows no touches yet: call fit or partial_fit first")
+        learner = self._fitted_learner()
         names = [str(label) for label in self.classes_]
         rankings = [dict(learner.predict(touch).ranking) for touch in _arrays(X)]
         return np.array([[shares[name] for name in names] for shares in rankings]).reshape(-1, len(names))
 
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.three_d_array = True
-        tags.target_tags.required = True
-        return tags
 
-
-class TactileRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # as above
+class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  # as above
     """A quantity of touches, in memory only, behind fit, predict and score, with intervals by predict_interval.
 
     Touches X: as of `TactileClassifier`. Numbers y, (N,), finite. materials: what each touch is of, (N,), passed to
@@ -117,18 +133,6 @@ class TactileRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # 
     Raises InputError for numbers or materials that do not fit the touches, and where they say too little for a head.
     """
 
-    def __init__(
-        self,
-        sensor: Sensor | None = None,
-        embedding: Embedding | None = None,
-        readout: str = "lda",
-        kept_touches: int | None = None,
-    ) -> None:
-        self.sensor = sensor
-        self.embedding = embedding
-        self.readout = readout
-        self.kept_touches = kept_touches
-
     def fit(self, X: Touches, y: npt.ArrayLike, materials: Labels | None = None) -> Self:
         """Observe these touches and nothing else."""
         touches, numbers, names = list(_arrays(X)), np.asarray(y, dtype=np.float64), np.asarray(materials)
@@ -139,7 +143,7 @@ class TactileRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # 
             )
         if names.shape != numbers.shape or len(np.unique(names)) < 2:
             raise InputError("expected materials=, what each touch is of, two or more: intervals are held out by them")
-        learner, low, high = _learner_of(self, touches), float(numbers.min()), float(numbers.max())
+        learner, low, high = self._empty_learner(touches), float(numbers.min()), float(numbers.max())
         reach = (high - low) or 1.0
         learner.declare(Quantity(name="y", unit="1", low=low - reach, high=high + reach, resolution=reach / 2**18))
         for name, number, touch in zip(names, numbers.tolist(), touches, strict=True):
@@ -159,26 +163,11 @@ class TactileRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]  # 
         return np.array([estimate.interval for estimate in found], dtype=np.float64).reshape(-1, 2)
 
     def _estimates(self, touches: Touches, risk: float, known: bool | None) -> list[Estimate]:
-        learner: TactileLearner | None = getattr(self, "learner_", None)
-        if learner is None:
-            raise NotFittedError("this TactileRegressor knows no touches yet: call fit first")
+        learner = self._fitted_learner()
         found = [learner.estimate(touch, risk=risk, known=known)["y"] for touch in _arrays(touches)]
         if lacking := next((each.missing for each in found if each.value is None), None):
             raise InputError(f"these touches say too little: {lacking}")
         return found
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.three_d_array = True
-        tags.target_tags.required = True
-        return tags
-
-
-def _learner_of(asked: TactileClassifier | TactileRegressor, touches: Sequence[npt.NDArray[Any]]) -> TactileLearner:
-    """An empty learner with the settings of an estimator, for touches like these."""
-    sensor = _sensor_of(touches) if asked.sensor is None else asked.sensor
-    how: dict[str, Any] = {"embedding": asked.embedding, "readout": asked.readout, "kept_touches": asked.kept_touches}
-    return TactileLearner(sensor=sensor, exemplars=0, **how)
 
 
 def _arrays(touches: Touches) -> Iterator[npt.NDArray[Any]]:

@@ -18,6 +18,7 @@ from scroll_tactile.cli.options import (
     Sources,
     StreamFile,
     Topic,
+    materials_of,
     sensor_for,
 )
 from scroll_tactile.cli.terminal import (
@@ -138,7 +139,7 @@ def predict(
     from scroll_tactile.pipelines.learning import answers
     from scroll_tactile.pipelines.sources import SourceOptions, find_sources
 
-    candidates = None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
+    candidates = materials_of(scene)
     found, refused = find_sources(sources)
     options = SourceOptions(topic=topic, field=field, clock=clock, columns=columns, preset=preset)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv

@@ -31,6 +31,7 @@ __all__ = [
     "Sources",
     "StreamFile",
     "Topic",
+    "materials_of",
     "sensor_for",
     "source_options",
 ]
@@ -105,6 +106,11 @@ def sensor_for(memory: Path, sensor: str | None, preset: str | None) -> Sensor |
     if sensor is None and preset is not None and not memory.exists():
         return presets.find(preset).sensor
     return None if sensor is None else read_sensor(sensor)
+
+
+def materials_of(scene: str | None) -> list[str] | None:
+    """The materials that an option names with commas between; None where it was not given."""
+    return None if scene is None else [name.strip() for name in scene.split(",") if name.strip()]
 
 
 def source_options(

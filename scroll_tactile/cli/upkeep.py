@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from scroll_tactile.cli.options import MemoryFolder
+from scroll_tactile.cli.options import MemoryFolder, materials_of
 from scroll_tactile.cli.terminal import Commands, opened, opened_for_upkeep, progress_bar, say, say_json, shown
 from scroll_tactile.errors import InputError, ScrollTactileError
 from store import Store, StoreError, repair_store
@@ -167,7 +167,7 @@ def _export_c(folder: Path, target: Path, scene: str | None) -> str:
     from scroll_tactile.firmware.c_files import flash_bytes, kept_levels, write_firmware
 
     with opened(folder, mode="read") as learner:
-        judge = learner.exported(None if scene is None else [name.strip() for name in scene.split(",") if name.strip()])
+        judge = learner.exported(materials_of(scene))
         touches = kept_levels(judge, learner.memory)
     write_firmware(judge, target, touches)
     return (

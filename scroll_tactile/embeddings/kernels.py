@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Final
@@ -26,7 +26,7 @@ from scroll_tactile.embeddings.convolution.banks import (
     triangle_features,
     window_statistics,
 )
-from scroll_tactile.embeddings.convolution.counting import GROUP, CountRequest, competing_groups, count
+from scroll_tactile.embeddings.convolution.counting import GROUP, CountRequest, Counts, competing_groups, count
 from scroll_tactile.embeddings.convolution.responses import TAPS, Bank
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.errors import InputError
@@ -186,16 +186,23 @@ class Kernels:
         levels: whole numbers in ±LEVELS, float32 of shape (C, T). windows: width → first columns; T is at least 12 and
         0.65 of every width. counts: at how many of the places each threshold is exceeded, shape (windows, features).
         """
-        channels, readings = levels.shape
-        parts = _parts(
-            self.dimension, channels, readings, tuple((w, tuple(starts)) for w, starts in windows.items()), None
-        )
-        requests = [part.request(self.bank_of(channels, part.dilation)) for part in parts]
+        widths = {width: tuple(starts) for width, starts in windows.items()}
         found: dict[int, list[tuple[npt.NDArray[np.integer], int]]] = {width: [] for width in windows}
-        for part, counts in zip(parts, count(levels, requests), strict=True):
+        for part, counts in self._counted(levels, widths, None):
             for width, rows, features, places in part.pools:
                 found[width].append((counts.features[rows, :features], places))
         return found
+
+    def level_features(
+        self, levels: npt.NDArray[np.float32], width: int, starts: Sequence[int]
+    ) -> npt.NDArray[np.float32] | None:
+        """The triangle features of windows, (windows, count), in steps of 1/64; None where their width has none."""
+        triangles = self.triangles(len(levels), width)
+        if triangles is None:
+            return None
+        cut = np.stack([levels[:, start : start + width] for start in starts])
+        with one_thread():
+            return triangles(window_statistics(cut))
 
     def triangles(self, channels: int, width: int) -> TriangleFeatures | None:
         """The features of levels of windows of a width; None where it has none."""
@@ -224,25 +231,29 @@ class Kernels:
         parts = (np.ascontiguousarray(image[:, start : start + width]) for start in starts)
         return np.stack([self.embed(part, width) for part in parts])
 
+    def _counted(
+        self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]], competing: int | None
+    ) -> Iterator[tuple[Part, Counts]]:
+        """What is counted of each dilation."""
+        channels, readings = levels.shape
+        parts = _parts(self.dimension, channels, readings, tuple(windows.items()), competing)
+        requests = [part.request(self.bank_of(channels, part.dilation)) for part in parts]
+        return zip(parts, count(levels, requests), strict=True)
+
     def _read(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]], competing: int | None = None
     ) -> tuple[dict[int, npt.NDArray[np.float32]], list[npt.NDArray[np.float32]]]:
         """Features of windows; and of competing kernels, dilation by dilation, where a width is given for these."""
-        channels, readings = levels.shape
-        widths = tuple(windows.items())
-        parts = _parts(self.dimension, channels, readings, widths, competing)
-        requests = [part.request(self.bank_of(channels, part.dilation)) for part in parts]
+        readings = levels.shape[1]
         pooled: dict[int, list[npt.NDArray[np.float32]]] = {width: [] for width in windows}
         proportions: list[npt.NDArray[np.float32]] = []
-        for part, found in zip(parts, count(levels, requests), strict=True):
+        for part, found in self._counted(levels, windows, competing):
             proportions.append(angles(readings - (TAPS - 1) * part.dilation)[found.competing.ravel()])
             for width, rows, features, places in part.pools:
                 pooled[width].append(angles(places)[found.features[rows, :features]])
-        for width, starts in widths:
-            if (triangles := self.triangles(channels, width)) is not None:
-                cut = np.stack([levels[:, start : start + width] for start in starts])
-                with one_thread():
-                    pooled[width].append(triangles(window_statistics(cut)))
+        for width, starts in windows.items():
+            if (features_of_levels := self.level_features(levels, width, starts)) is not None:
+                pooled[width].append(features_of_levels)
         return {width: np.concatenate(arrays, axis=1) for width, arrays in pooled.items()}, proportions
 
 

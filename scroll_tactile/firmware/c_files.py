@@ -248,7 +248,7 @@ def _scales(judge: ExportedJudge, tables: Tables) -> str:
         count = len(tables.get(f"phases_{w}", ()))
         terms = f"terms_{w}, inputs_{w}, factors_{w}, phases_{w}" if count else "0, 0, 0, 0"
         found.append(
-            f"    {{{w}, {one.least}, shares_{w}, {count}, {terms}, weights_{w}, {one.shift}, offsets_{w}, halves_{w}, "
+            f"    {{{w}, shares_{w}, {count}, {terms}, weights_{w}, {one.shift}, offsets_{w}, halves_{w}, "
             f"background_{w}, {one.background_shift}}},\n"
         )
     return "".join(found)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.convolution.banks import LEVELS, to_levels, window_statistics
+from scroll_tactile.embeddings.convolution.banks import LEVELS, to_levels
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.prediction.features import Readings
@@ -58,12 +58,11 @@ CHANCES = np.rint(65535 * np.exp(-np.arange(MOST_CHANCES) / 64)).astype(np.uint1
 class ExportedScale:
     """How the windows of one width are weighed, for M materials; see `tactile_scale` in native/judge.h.
 
-    least: readings of a touch that has such a window. weights: (F, M). shift: z is a weighed mean less so many bits.
+    weights: (F, M). shift: z is a weighed mean less so many bits.
     offsets: c, halves: h, (M,). background: H, (M, M), and its shift.
     """
 
     scale: Scale
-    least: int
     weights: npt.NDArray[np.int16]
     shift: int
     offsets: Integers
@@ -175,17 +174,15 @@ class ExportedJudge:
 
     def _sums(self, levels: npt.NDArray[np.float32], among: Sequence[ExportedScale]) -> list[tuple[Integers, int]]:
         """For each scale the weighed sums of its features over its windows, (M,), and how many windows these are."""
-        steps, channels = levels.shape[1], len(levels)
+        steps = levels.shape[1]
         extent, places = self.plan.extent(steps), self.plan.places(steps)
         windows = {one.scale.width: [extent[one.scale.width][place] for place in places[one.scale]] for one in among}
         found, sums = self.embedding.window_counts(levels, windows), []
         for one in among:
             width, starts = one.scale.width, windows[one.scale.width]
             parts = [_angled(counts, places).sum(axis=0, dtype=np.int64) for counts, places in found[width]]
-            if (triangles := self.embedding.triangles(channels, width)) is not None:
-                cut = np.stack([levels[:, start : start + width] for start in starts])
-                features = triangles(window_statistics(cut)) * np.float32(ONE)
-                parts.append(features.astype(np.int64).sum(axis=0))
+            if (features := self.embedding.level_features(levels, width, starts)) is not None:
+                parts.append((features * np.float32(ONE)).astype(np.int64).sum(axis=0))
             sums.append((np.concatenate(parts) @ one.weights.astype(np.int64), len(starts)))
         return sums
 

@@ -137,7 +137,6 @@ class _Quantised:
         fine, shift = fine - max(0, shift - MOST_SHIFT), min(shift, MOST_SHIFT)
         return ExportedScale(
             scale=Scale("window", width),
-            least=_least(width),
             weights=np.rint(self._weights.T * 2.0**self._unit).astype(np.int16),
             shift=15 + self._unit - self.bits,
             offsets=np.rint(self._offsets * 2.0**self.bits).astype(np.int64),

@@ -21,7 +21,7 @@ enum {
 
 /* The windows of one width, and how the mean of their features is weighed; M materials, F features. */
 typedef struct {
-    int32_t width, least;      /* readings of a window; a touch of so many has one */
+    int32_t width;             /* readings of a window */
     const uint16_t *shares;    /* (dilations): the proportions of each */
     int32_t triangles;         /* features of levels, behind the proportions */
     const uint16_t *begins;    /* (triangles + 1): where each one's terms begin */

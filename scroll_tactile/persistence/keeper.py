@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from scroll_tactile.arguments import require_arguments
+from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
@@ -173,7 +173,7 @@ class MemoryKeeper(ABC):
         path = other._ledger.require_store("be merged").path if isinstance(other, MemoryKeeper) else other
         require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
         rules = MergeRules(once=shared == "once", descriptions=descriptions)
-        return self._ledger.merge(path, rules, progress or _silent)[0]
+        return self._ledger.merge(path, rules, progress or silent)[0]
 
     def backup(
         self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
@@ -250,7 +250,3 @@ class MemoryKeeper(ABC):
         """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
         tuned = self.memory.tuned
         return None if tuned is None else tuned.digest()
-
-
-def _silent(what: str, done: int, of: int) -> None:
-    """The default progress: shows nothing."""

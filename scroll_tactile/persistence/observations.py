@@ -117,12 +117,12 @@ def observations(store: Store) -> list[Observation]:
 
     quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
 
-    def told(head: Head) -> Observation:
+    def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
         values, labels = annotation.measured(quantities), dict(annotation.labels)
         return Observation(head.sequence, head.label, head.key, head.time, state(head), _source(head), values, labels)
 
-    return [told(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
+    return [observation(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
 
 
 def _source(head: Head) -> str | None:

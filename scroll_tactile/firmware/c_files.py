@@ -195,7 +195,7 @@ static const tactile_stage stages[] = {{
 
 static const tactile_memory memory = {{
     TOUCH_MEMORY_CHANNELS, TOUCH_MEMORY_READINGS, TOUCH_MEMORY_MATERIALS,
-    {len(judge.scales)}, {len(judge.stages)}, {len(_dilations(judge))}, banks, scales, stages, angles, chances
+    {len(judge.stages)}, {len(_dilations(judge))}, banks, scales, stages, angles, chances
 }};
 
 static int16_t levels[TOUCH_MEMORY_CHANNELS * TOUCH_MEMORY_READINGS];

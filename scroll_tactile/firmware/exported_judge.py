@@ -49,6 +49,7 @@ ANGLE_STEPS = 4096
 MOST_CHANCES = 768
 MOST_MATERIALS = 64
 MOST_Z, MOST_U, MOST_DISTANCE = 2**26, 2**30, 2**32
+FIXED_BYTES = 3624  # of tactile_touch with 32-bit pointers
 
 ANGLES = np.rint(ONE * (2 / np.pi) * np.arcsin(np.sqrt(np.arange(ANGLE_STEPS + 1) / ANGLE_STEPS))).astype(np.uint16)
 CHANCES = np.rint(65535 * np.exp(-np.arange(MOST_CHANCES) / 64)).astype(np.uint16)
@@ -196,9 +197,6 @@ class ExportedJudge:
     def _triangles(self, scale: ExportedScale) -> int:
         made = self.embedding.triangles(self.sensor.channels, scale.scale.width)
         return 0 if made is None else len(made.phases)
-
-
-FIXED_BYTES = 3624  # of tactile_touch with 32-bit pointers
 
 
 def _angled(counts: npt.NDArray[np.integer], places: int) -> Integers:

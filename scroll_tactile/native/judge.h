@@ -48,7 +48,7 @@ typedef struct {
 
 typedef struct {
     int32_t channels, capacity; /* readings that a touch can have: those of the longest that was learned */
-    int32_t materials, scales_count, stages_count, dilations;
+    int32_t materials, stages_count, dilations;
     const tactile_bank *banks;
     const tactile_scale *scales;
     const tactile_stage *stages;

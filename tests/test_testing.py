@@ -25,7 +25,7 @@ TOUCHES = [("ab"[i % 2], RNG.random((60, 3))) for i in range(6)]  # as few as it
 def test_a_learner_keeps_its_promises(way):
     touches = None if way == "camera" else TOUCHES  # the usual learner is that of the docstring
     held = check_learner(lambda path: TactileLearner.open(path, **WAYS[way]), touches=touches)
-    assert len(held) == 13
+    assert len(held) == 14
 
 
 class Forgetful(TactileLearner):

@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.options import Columns, MemoryFolder
+from scroll_tactile.cli.options import Axis, Columns, MemoryFolder
 from scroll_tactile.cli.terminal import console, estimate_text, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
@@ -47,6 +47,7 @@ def live(
         bool, typer.Option("--touch", help="All of it is one touch; otherwise touches are found, after 2 s at rest.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
+    of: Axis = None,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
     from scroll_tactile.recordings.recording import places
@@ -54,7 +55,7 @@ def live(
     screen = console()
     with opened(memory, mode="read") as learner:
         shape = learner.sensor.shape
-        session = learner.live(risk=risk, contact="manual" if touch else "auto")
+        session = learner.live(risk=risk, contact="manual" if touch else "auto", of=of)
         growing = Live(console=screen, auto_refresh=False, transient=True)
         with session, growing if screen.is_terminal and not as_json else nullcontext():
             if touch:

@@ -156,6 +156,9 @@ def test_the_command_line_declares_observes_answers_and_lists_them(data, tmp_pat
         assert said in refused("observe", memory, "oak", str(data / "4.npy"), *words)
     answer = json.loads(run("predict", memory, sources(data)[1], "--of", "slip", "--json").output)
     assert answer["material"] == "s" and len(answer["ranking"]) == 2
+    lines = run("live", memory, sources(data)[1], "--touch", "--of", "slip", "--json").output.splitlines()
+    assert [said["material"] for said in map(json.loads, lines) if "material" in said][-1] == "s"
+    assert "expected an axis" in refused("live", memory, sources(data)[1], "--of", "slop")
     listed = [json.loads(line) for line in run("memory", "list", memory, "--json").output.splitlines()]
     assert [row["values"] for row in listed] == [{"force": float(i)} for i in range(4)]
     assert "force=3.0  slip=s" in run("memory", "list", memory).output

@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from scroll_tactile.cli.everyday import ANSWER, answer_row
 from scroll_tactile.cli.options import (
+    Annotate,
     AsJson,
     Clock,
     Columns,
@@ -70,6 +71,7 @@ def learn(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    annotate: Annotate = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
@@ -81,7 +83,8 @@ def learn(
     from scroll_tactile.pipelines.sources import find_sources, has_touches
 
     found, missing = find_sources(sources)
-    options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(found, preset, *how)
     chosen = sensor_for(memory, sensor, preset)
     with progress_bar() as progress:
         # What is refused makes no memory.
@@ -145,6 +148,7 @@ def fleet(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    annotate: Annotate = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn recordings and memories, in folders, files and buckets, by many workers into one memory.
@@ -156,7 +160,8 @@ def fleet(
 
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
-    options = source_options(sources, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(sources, preset, *how)
     chosen = sensor_for(destination, sensor, preset)
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(_connected(scheduler))
@@ -228,6 +233,7 @@ def evaluate(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    annotate: Annotate = None,
     with_learned: Annotated[
         bool, typer.Option("--with-learned", help="Answer also the touches that the memory has learned.")
     ] = False,
@@ -242,7 +248,8 @@ def evaluate(
     from scroll_tactile.pipelines.sources import find_sources
 
     found, missing = find_sources(sources)
-    options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(found, preset, *how)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
         done = evaluate_sources(learner, found, options, progress, with_learned=with_learned)
     refused = [*missing, *done.refused]

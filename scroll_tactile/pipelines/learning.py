@@ -67,7 +67,7 @@ def learn_sources(
     StoreError and CapacityError; what was learned until then is kept.
     """
     done, batch = Learned(), _Batch(learner, every)
-    for quantity in options.quantities:
+    for quantity in options.declared:
         learner.declare(quantity)
     for number, address in enumerate(sources):
         progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))

@@ -267,7 +267,7 @@ class TactileLearner(MemoryKeeper):
         Raises StreamError; AnnotationError where nothing, or one of these, was not declared; InputError for a risk.
         """
         require_arguments({"risk": risk}, {"known": known})
-        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)
+        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)[1]
 
     def live(
         self,

@@ -239,7 +239,8 @@ def _values(noted: Noted, quantities: Mapping[str, Quantity]) -> dict[str, float
     for name, unit, value in noted.values:
         if name in quantities and quantities[name].unit != unit:
             raise AnnotationError(
-                f"expected {name!r} in {quantities[name].unit}, as it was declared; came {value:g} {unit}"
+                f"expected {name!r} in {quantities[name].unit}, as it was declared; came {value:g} {unit}: convert the "
+                f"column, and head it {name} [{quantities[name].unit}]"
             )
     return {name: value for name, _, value in noted.values}
 

@@ -87,6 +87,21 @@ def test_what_is_noted_in_a_table_is_learned_once_and_another_value_is_refused(d
         assert learner.observations()[-1].values == {"force": 3.0}
 
 
+def test_a_fleet_learns_by_the_quantities_of_the_memory_that_it_adds_to(data):
+    with TactileLearner.open(data / "m", **SETTINGS) as learner:
+        learner.declare(FORCE)
+
+    def learned(heading):
+        path = table(data, ["0.npy,0,2,oak,1.4"], f"file,begin,end,material,{heading}")
+        shutil.rmtree(data / "m.fleet", ignore_errors=True)
+        return learn(data / "m", sources(data, 1), options(path), client=DyingExecutor(), **SETTINGS, add=True)
+
+    with pytest.raises(AnnotationError, match=r"declared as force \[N\] 0..10 step 0.01; came force \[N\] 0..20"):
+        learned("force [N] 0..20 step 0.01")
+    assert "expected 'force' in N" in learned("force [mN]").refused[0].why
+    assert learned("force [N]").observations == 1
+
+
 @pytest.mark.parametrize(
     ("heading", "row", "match"),
     [

@@ -97,9 +97,10 @@ def noted_in(columns: Mapping[str, Column], begin: int, end: int) -> Noted:
             numbers = own[np.isfinite(own)].tolist()
             values += [(heading.name, heading.unit, math.fsum(numbers) / len(numbers))] if numbers else []
             continue
-        found = list(dict.fromkeys(filter(None, map(str.strip, own.tolist()))))
+        texts = [one.strip() for one in own.tolist()]
+        found = list(dict.fromkeys(filter(None, texts)))
         if len(found) > 1:
-            change = begin + next(i for i, one in enumerate(own.tolist()) if one.strip() == found[1])
+            change = begin + texts.index(found[1])
             raise InputError(
                 f"expected one label of a touch in column {heading.column!r}; came {found[0]!r:.60}, and "
                 f"{found[1]!r:.60} from reading {change} on: cut it there, or leave the column out"

@@ -23,6 +23,7 @@ MORE = {
     "speed": ("float64", pa.array([*np.linspace(1, 2, 10), *[None] * 20])),
     "slip": ("string", pa.array(["", "north", *["north"] * 8, *["south"] * 10, *[None] * 10])),
     "grade": ("int64", pa.array([*[3] * 20, *[None] * 10])),
+    "said": ("string", pa.array(["x" * 300] * 30)),
     "two": ("string", pa.array(["a"] * 24 + ["b"] * 6)),
 }
 FORCE, SPEED = "force [N] 0..10 step 0.001 from observation.wrench[2]", "speed [m/s] 0..5 step 0.01"
@@ -85,6 +86,7 @@ def test_a_touch_with_two_labels_is_refused_and_the_others_are_learned(data):
         ("wrench [N] 0..9 step 1 from wrench[7]", FieldError, "beyond its 3 columns"),
         ("slip [N] 0..9 step 1", FieldError, "is of type string; expected numbers"),
         ("speed [label]", FieldError, "holds double; expected texts, or whole numbers"),
+        ("said [label]", FieldError, "a text of 300 characters; expected labels of at most 200"),
         ("image [label]", FieldError, "is of type video; expected texts"),
         ("slop [label]", FieldError, "nearest is 'observation.slip'|there are"),
         ("slip", InputError, r"expected a column as 'force \[N\]'"),

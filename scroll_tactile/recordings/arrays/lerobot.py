@@ -19,6 +19,7 @@ from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, So
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.headings import Heading
 from scroll_tactile.recordings.paths import matched, select
+from scroll_tactile.settings import LONGEST_NAME
 
 __all__ = ["LeRobot", "is_lerobot"]
 
@@ -121,6 +122,11 @@ class LeRobot(Source):
         if self.types.is_dictionary(column.type):
             self.budget.take(batch.num_rows * 8 + column.dictionary.nbytes)
             texts = np.array(["", *(text or "" for text in column.dictionary.to_pylist())], object)
+            if (longest := max(map(len, texts))) > LONGEST_NAME:
+                raise FieldError(
+                    f"column {key!r} of {self.address} has a text of {longest} characters; expected labels of at most "
+                    f"{LONGEST_NAME}"
+                )
             found: npt.NDArray[Any] = texts[column.indices.fill_null(-1).to_numpy() + 1]
             return found
         rows = select(self._rows(column, key), rest, heading.column)

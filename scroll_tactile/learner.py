@@ -267,7 +267,7 @@ class TactileLearner(MemoryKeeper):
         Raises StreamError; AnnotationError where nothing, or one of these, was not declared; InputError for a risk.
         """
         require_arguments({"risk": risk}, {"known": known})
-        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)
+        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)[1]
 
     def live(
         self,
@@ -285,6 +285,7 @@ class TactileLearner(MemoryKeeper):
         noise at rest, which it learns first: for two seconds nothing may touch it. "manual" leaves that to
         `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene, of: as for `predict`.
         widths: quantity → how narrow its interval is to be, in its unit, before `LiveState.settled` says so.
+        By labels nothing is estimated.
 
         Each touch is predicted by the memory as it was when it began, and by itself unless `LiveSession.again` says
         that it is of the same thing as the last.

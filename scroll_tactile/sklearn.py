@@ -68,7 +68,8 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
 
     Touches X: an array (N, T, n) of N touches of T readings of n channels, (N, T) where there is one channel, or a list
     of arrays (T, n), whose lengths may differ. Labels y, (N,): of any kind that numpy can sort; each is the name of a
-    material as its text.
+    material as its text. For names of another axis, such as the direction of a slip, fit one to these: it answers as
+    `TactileLearner.predict(of=…)` does.
 
     sensor: of the readings; None: 100 Hz, and the range of the first touches that are fitted, a tenth wider at both
     ends. embedding, readout, kept_touches: as of the learner.

@@ -19,8 +19,8 @@ TIP = RNG.standard_normal((30, 19)).astype(np.float32)
 PAD = RNG.standard_normal((30, 4, 6, 3)).astype(np.float32)
 
 
-def lerobot(folder: Path) -> Path:
-    """A LeRobotDataset v3 of three episodes in two files, as its writer lays it out."""
+def lerobot(folder: Path, **more: tuple[str, pa.Array]) -> Path:
+    """A LeRobotDataset v3 of three episodes in two files, as its writer lays it out; more: its type and 30 rows."""
     episode = np.repeat([0, 1, 2], 10)
     columns = {
         "tip": pa.FixedSizeListArray.from_arrays(pa.array(TIP.ravel()), 19),
@@ -32,6 +32,8 @@ def lerobot(folder: Path) -> Path:
         "task_index": pa.array(np.where(episode == 1, 1, 0)),
     }
     table = pa.table({("observation.tactile." + k if k in ("tip", "pad") else k): v for k, v in columns.items()})
+    for name, (_, column) in more.items():
+        table = table.append_column(f"observation.{name}", column)
     for name in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / name).mkdir(parents=True)
     pq.write_table(table[:20], folder / "data/chunk-000/file-000.parquet")
@@ -45,6 +47,8 @@ def lerobot(folder: Path) -> Path:
         "observation.tactile.pad": {"dtype": "float32", "shape": [4, 6, 3]},
         "observation.image": {"dtype": "video", "shape": [4, 4, 3]},
     } | {name: {"dtype": "int64", "shape": [1]} for name in list(columns)[2:]}
+    for name, (kind, column) in more.items():
+        features[f"observation.{name}"] = {"dtype": kind, "shape": [getattr(column.type, "list_size", 1)]}
     about = {"codebase_version": "v3.0", "fps": 100, "total_frames": 30, "features": features}
     about["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     (folder / "meta/info.json").write_text(json.dumps(about))

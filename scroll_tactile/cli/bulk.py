@@ -11,7 +11,9 @@ from rich.markup import escape
 
 from scroll_tactile.cli.everyday import ANSWER, answer_row
 from scroll_tactile.cli.options import (
+    Annotate,
     AsJson,
+    Axis,
     Clock,
     Columns,
     CutBy,
@@ -70,6 +72,7 @@ def learn(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    annotate: Annotate = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
@@ -81,7 +84,8 @@ def learn(
     from scroll_tactile.pipelines.sources import find_sources, has_touches
 
     found, missing = find_sources(sources)
-    options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(found, preset, *how)
     chosen = sensor_for(memory, sensor, preset)
     with progress_bar() as progress:
         # What is refused makes no memory.
@@ -145,6 +149,7 @@ def fleet(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    annotate: Annotate = None,
     as_json: AsJson = False,
 ) -> None:
     """Learn recordings and memories, in folders, files and buckets, by many workers into one memory.
@@ -156,7 +161,8 @@ def fleet(
 
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
-    options = source_options(sources, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(sources, preset, *how)
     chosen = sensor_for(destination, sensor, preset)
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(_connected(scheduler))
@@ -228,6 +234,8 @@ def evaluate(
     labels: Labels = None,
     label_topic: LabelTopic = None,
     cut: CutBy = None,
+    annotate: Annotate = None,
+    of: Axis = None,
     with_learned: Annotated[
         bool, typer.Option("--with-learned", help="Answer also the touches that the memory has learned.")
     ] = False,
@@ -236,22 +244,24 @@ def evaluate(
 ) -> None:
     """Answer all touches in files and folders, and compare with what they are: accuracy, confusions, calibration.
 
+    Of values that a table or a column gives, how many lie in their intervals, how wide these are, R² and mean error.
     Touches that it has learned are left out. The memory stays as it is. The exit code is 1 where something was refused.
     """
     from scroll_tactile.pipelines.learning import evaluate_sources
     from scroll_tactile.pipelines.sources import find_sources
 
     found, missing = find_sources(sources)
-    options = source_options(found, preset, topic, field, clock, columns, label, label_by, labels, label_topic, cut)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(found, preset, *how)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
-        done = evaluate_sources(learner, found, options, progress, with_learned=with_learned)
+        done = evaluate_sources(learner, found, options, progress, of=of, with_learned=with_learned)
     refused = [*missing, *done.refused]
     if as_json:
         say_json(_figures(done) | {"refused": _refusals(refused)})
     elif as_csv:
-        say_csv(*ANSWER, "material", "right")
+        say_csv(*ANSWER, of or "material", "right")
         for each in done.answered:
-            say_csv(*answer_row(each), each.touch.material, each.prediction.material == each.touch.material)
+            say_csv(*answer_row(each), done.truth(each), each.prediction.material == done.truth(each))
     else:
         _report_evaluated(done, with_learned)
     if not as_json:
@@ -266,10 +276,9 @@ def _refusals(refused: Sequence[Refused]) -> list[dict[str, str]]:
 
 def _figures(done: Evaluation) -> dict[str, Any]:
     learned, never_learned = done.of_learned, done.of_others
-    wrong = [
-        dict(zip(ANSWER, answer_row(each), strict=True)) | {"material": each.touch.material} for each in done.wrong
-    ]
+    wrong = [dict(zip(ANSWER, answer_row(each), strict=True)) | {"material": done.truth(each)} for each in done.wrong]
     return {
+        **({} if done.of is None else {"of": done.of, "unlabelled": done.unlabelled}),
         "touches": len(learned),
         "learned_before": done.seen,
         "accuracy": done.answers.accuracy if learned else None,
@@ -284,14 +293,15 @@ def _figures(done: Evaluation) -> dict[str, Any]:
 
 
 def _measured_text(figures: Mapping[str, Any]) -> str:
-    without = f"; {figures['without']} without a number" if figures["without"] else ""
+    without = f"; {figures['without']} without a number: {shown(figures['missing'])}" if figures["without"] else ""
     if not figures["touches"]:
-        return f"no number{without}"
+        return without.removeprefix("; ")
+    unit = shown(figures["unit"])
     r2 = "" if figures["r2"] is None else f", R² {figures['r2']:.3f}"
     return (
         f"{percent(figures['covered'])} of {figures['touches']} in their interval, where "
-        f"{percent(1 - figures['risk'])} are asked; {figures['width']:.4g} wide; "
-        f"off by {figures['mean_error']:.4g}{r2}{without}"
+        f"{percent(1 - figures['risk'])} are asked; {figures['width']:.4g} {unit} wide; "
+        f"off by {figures['mean_error']:.4g} {unit}{r2}{without}"
     )
 
 
@@ -302,24 +312,29 @@ def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
     if done.seen:
         what = "answered all the same" if with_learned else "left out; --with-learned answers them, too"
         say(f"[bold]touches that it has learned:[/] {done.seen}, {what}")
-    say(f"[bold]touches:[/] {found['touches']} of {len(set(answers.truth))} materials that it learned")
+    names = "materials" if done.of is None else f"labels on {shown(done.of)}"
+    if done.unlabelled:
+        say(f"[bold]touches without a label on {shown(str(done.of))}:[/] {done.unlabelled}, left out")
+    say(f"[bold]touches:[/] {found['touches']} of {len(set(answers.truth))} {names} that it learned")
     if found["touches"]:
         say(f"[bold]accuracy:[/] {percent(found['accuracy'])}")
         say(f"[bold]calibration error:[/] {found['calibration_error']:.3f}")
         say(f"[bold]called unknown:[/] {found['called_unknown']}")
     if found["never_learned"]:
         say(
-            f"[bold]touches of materials that it never learned:[/] {found['never_learned']}, of which it calls "
+            f"[bold]touches of {names} that it never learned:[/] {found['never_learned']}, of which it calls "
             f"{found['never_learned_called_unknown']} unknown"
         )
     for name, found_of in done.measured.items():
+        if not found_of:
+            say(f"[bold]{shown(name)}[/]: not declared in this memory, which estimates nothing of it")
         for of, figures in found_of.items():
             say(f"[bold]{shown(name)}[/], {of} materials: {_measured_text(figures)}")
-    names = sorted({*answers.truth, *(name for name in answers.predicted if name)})
-    if answers.confusions() and len(names) <= MOST_NAMES:
-        tested = [answers.truth.count(name) for name in names]
-        say(escape(confusion_text(names, confusion_counts(names, tested, answers.confusions()))))
+    rows = sorted({*answers.truth, *(name for name in answers.predicted if name)})
+    if answers.confusions() and len(rows) <= MOST_NAMES:
+        tested = [answers.truth.count(name) for name in rows]
+        say(escape(confusion_text(rows, confusion_counts(rows, tested, answers.confusions()))))
     for each in done.wrong[:MOST_SHOWN]:
-        say(f"  {shown(each.touch.source)}, {shown(each.touch.material)}: {verdict(each.prediction)}")
+        say(f"  {shown(each.touch.source)}, {shown(done.truth(each))}: {verdict(each.prediction)}")
     if len(done.wrong) > MOST_SHOWN:
         say(f"  … and {len(done.wrong) - MOST_SHOWN} more, which --json lists")

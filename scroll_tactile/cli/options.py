@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from scroll_tactile.sensors import Sensor
 
 __all__ = [
+    "Annotate",
     "AsJson",
     "Axis",
     "Clock",
@@ -91,6 +92,14 @@ Labels = Annotated[
 LabelTopic = Annotated[
     str | None, typer.Option(help="A topic with texts, or a column, that says what is touched from then on.")
 ]
+Annotate = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A column of LeRobot data sets that is learned as a value or a label of each touch: 'force [N] 0..10 step "
+        "0.01' (or 'force [N]', once declared), 'slip [label]', and 'force [N] from observation.wrench[2]' where the "
+        "column is called otherwise; several times. A value is the mean over the touch."
+    ),
+]
 CutBy = Annotated[
     Cut | None, typer.Option(help="Where touches begin and end; without it by intervals or episodes if there are any.")
 ]
@@ -125,6 +134,7 @@ def source_options(
     labels: Path | None,
     label_topic: str | None,
     cut: Cut | None,
+    annotate: Sequence[str] | None,
 ) -> SourceOptions:
     """How these recordings are cut and named, by the options of a command."""
     from scroll_tactile.pipelines.sources import SourceOptions
@@ -142,6 +152,7 @@ def source_options(
         columns=columns,
         preset=preset,
         labels=label_topic,
+        annotate=tuple(annotate or ()),
         cut=None if cut is None else cut.value,
         material=label,
         by=None if label_by is None else label_by.value,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, cast
 
 import typer
 
-from scroll_tactile.cli.options import sensor_for
+from scroll_tactile.cli.options import Axis, sensor_for
 from scroll_tactile.cli.terminal import opened, say, shown
 from scroll_tactile.errors import InputError
 
@@ -35,6 +35,7 @@ def ros2(
     contact: Annotated[
         str, typer.Option(help="auto finds touches, after 2 s at rest; manual waits for the services begin and end.")
     ] = "auto",
+    of: Axis = None,
     sensor: Annotated[
         str | None, typer.Option(help="As for observe: whose readings they are. Needed only to make a new memory.")
     ] = None,
@@ -61,7 +62,7 @@ def ros2(
     chosen = sensor_for(memory, sensor, preset)  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
         way = cast(Literal["auto", "manual"], contact)
-        met = serve(learner, topic, field, kind=kind, risk=risk, contact=way, arguments=context.args)
+        met = serve(learner, topic, field, kind=kind, risk=risk, contact=way, of=of, arguments=context.args)
         count = len(learner.materials)
     counted = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
     say(f"{shown(memory)}: {count} materials. {counted}")

@@ -14,11 +14,11 @@ __all__ = ["has_option", "in_options", "typed"]
 
 _ARGUMENTS = (
     *("topic", "field", "clock", "columns", "preset", "rate", "labels", "decimal", "definitions"),  # of `read`
-    *("material", "by", "intervals", "cut", "sensor", "add", "source", "scene", "risk"),
+    *("annotate", "again", "material", "by", "intervals", "cut", "sensor", "add", "source", "scene", "risk"),
 )
 _RENAMED = {"material": "label", "by": "label_by", "intervals": "labels", "labels": "label_topic"}
 _TEXT = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""  # as repr writes one
-_NAMED = re.compile(rf"(?<![^\s(])({'|'.join(_ARGUMENTS)})=({_TEXT}|True|(?!['\"]))")
+_NAMED = re.compile(rf"(?<![^\s(])({'|'.join(_ARGUMENTS)})=({_TEXT}|True|(?![\w('\"\[]))")
 _UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)  # what parsing and evaluating any text raises
 
 _options: ContextVar[dict[str, str]] = ContextVar("_options")

@@ -339,7 +339,8 @@ def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[s
             raise InputError(f"expected the width of {name!r} as a number above 0; came {width!r:.60}")
     if estimator is None:
         if asked:
-            raise InputError(f"expected widths of declared quantities; came {sorted(asked)}, and none was declared")
+            why = "none was declared, or answers are by labels"
+            raise InputError(f"expected widths of declared quantities; came {sorted(asked)}, and {why}")
         return {}
     estimator.wanted(list(asked))
     for stage in range(estimator.last + 1):

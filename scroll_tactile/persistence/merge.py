@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Literal, Self, cast
 
@@ -22,7 +22,6 @@ from scroll_tactile.memory.touch_rows import (
     SOURCE,
     VALUES,
     active_rows,
-    annotated,
     annotation_of,
     declaration,
 )
@@ -111,11 +110,12 @@ class MergePlan:
             require_counted(theirs.path, found, heads)
         incoming = active_rows(heads)
         both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
+        declared = memory.quantities | {quantity.name: quantity for quantity in quantities}
         refused, again = (
-            _by_first_names(incoming, contents, compacted, rules.clipped) if rules.one_name else ([], set())
+            _by_first_names(incoming, contents, compacted, rules.clipped, declared) if rules.one_name else ([], set())
         )
         for head in (head for head in incoming if head.sequence in both and rules.once):
-            why = _annotated_otherwise(head, contents.rows(head.label, head.key).items(), ours.path)
+            why = _annotated_otherwise(head, contents.rows(head.label, head.key).items(), ours.path, declared)
             if why is not None and not rules.one_name:
                 raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {why}")
             refused += [] if why is None else [(head, why)]
@@ -231,21 +231,26 @@ def _quantities(
     return [quantity for name, quantity in both.items() if name not in memory.quantities]
 
 
-def _annotated_otherwise(head: Head, rows: Iterable[tuple[int, Annotation]], where: object) -> str | None:
+def _annotated_otherwise(
+    head: Head, rows: Iterable[tuple[int, Annotation]], where: object, declared: Mapping[str, Quantity]
+) -> str | None:
     """Why their touch, which is in these rows as well, cannot be left out: its values or labels are in none of them."""
     came, there = annotation_of(head.attributes), dict(rows)
     if not came or not there or came in there.values():
         return None
     first = min(there)
     return (
-        f"row {first} of {where} has this touch of {head.label!r} with "
-        f"{annotated(there[first]) or 'no values or labels'}; row {head.sequence} comes with {annotated(came)}: "
-        "retract one of them, or count both with shared='twice'"
+        f"row {first} of {where} has this touch of {head.label!r} with {there[first].shown(declared)}; row "
+        f"{head.sequence} comes with {came.shown(declared)}: retract one of them, or count both with shared='twice'"
     )
 
 
 def _by_first_names(
-    incoming: Sequence[Head], contents: ListedContents | StoredContents, compacted: int, clipped: Collection[bytes]
+    incoming: Sequence[Head],
+    contents: ListedContents | StoredContents,
+    compacted: int,
+    clipped: Collection[bytes],
+    declared: Mapping[str, Quantity],
 ) -> tuple[list[tuple[Head, str]], set[int]]:
     """The touches that our memory, or an earlier row of theirs, has under another name, each with the reason.
 
@@ -263,7 +268,7 @@ def _by_first_names(
         names = known or [came.setdefault(head.key, head.label)]
         why = refusal(names, head.label, head.key in clipped)
         if why is None and not known:
-            why = _annotated_otherwise(head, noted.get(head.key, ()), "the same memory")
+            why = _annotated_otherwise(head, noted.get(head.key, ()), "the same memory", declared)
             noted.setdefault(head.key, []).append((head.sequence, annotation_of(head.attributes)))
         if why is not None:
             refused.append((head, why))

@@ -244,8 +244,8 @@ class OpenMemory:
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
-            store, self._closed = self.store, True
-            if store is None:
+            store, closed, self._closed = self.store, self._closed, True
+            if store is None or closed:
                 return
             try:
                 # A change that was cut short is never saved: the journal holds all of it, or nothing.

@@ -91,9 +91,9 @@ def learn(
     Warns at the end, by a RangeWarning, where touches do not fit the sensor's range; they are learned all the same.
 
     Raises InputError where there is nothing to learn, or the destination was made from other sources; MismatchError
-    for a destination of another sensor; CapacityError beyond what exact sums hold; LockedError while another fleet is
-    at work for this destination; ScrollTactileError where nobody runs the jobs; StoreFullError and other StoreErrors:
-    call again to go on.
+    for a destination of another sensor; AnnotationError where it has a quantity with another unit or range;
+    CapacityError beyond what exact sums hold; LockedError while another fleet is at work for this destination;
+    ScrollTactileError where nobody runs the jobs; StoreFullError and other StoreErrors: call again to go on.
     """
     require_workers(workers)
     begun = time.perf_counter()

@@ -67,7 +67,7 @@ def learn_sources(
     StoreError and CapacityError; what was learned until then is kept.
     """
     done, batch = Learned(), _Batch(learner, every)
-    for quantity in options.quantities:
+    for quantity in options.declared:
         learner.declare(quantity)
     for number, address in enumerate(sources):
         progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))
@@ -172,8 +172,9 @@ def answers(
 def _answered(
     learner: TactileLearner, touch: SourceTouch, scene: Sequence[str] | None = None, of: str | None = None
 ) -> Answered:
-    estimates = learner.estimate(touch.stream) if learner.quantities else {}
-    return Answered(touch, learner.predict(touch.stream, of=of, scene=scene), estimates)
+    if not learner.quantities:
+        return Answered(touch, learner.predict(touch.stream, of=of, scene=scene))
+    return Answered(touch, *learner._predictor.estimate(touch.stream, scene=scene, axis=of))
 
 
 def _touches(
@@ -186,43 +187,48 @@ def _touches(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Answers to touches whose material is known.
+    """Answers to touches whose material is known, or whose label on an axis is: their name.
 
-    answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory.
-    seen: touches that the memory had learned, under any name; left out, or answered with `with_learned`.
+    answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory, or its
+    labels. seen: touches that the memory had learned, under any name; left out, or answered with `with_learned`.
+    of: the axis; None for materials. unlabelled: touches without a label on it, which are left out.
     """
 
     answered: tuple[Answered, ...]
     refused: tuple[Refused, ...]
     learned: frozenset[str]
     seen: int = 0
+    of: str | None = None
+    unlabelled: int = 0
+
+    def truth(self, answered: Answered) -> str:
+        """The name of a touch."""
+        return str(_name_of(answered.touch, self.of))
 
     @property
     def of_learned(self) -> list[Answered]:
-        """Touches of materials that the memory has: accuracy, confusions and calibration are theirs."""
-        return [each for each in self.answered if each.touch.material in self.learned]
+        """Touches whose name the memory has: accuracy, confusions and calibration are theirs."""
+        return [each for each in self.answered if self.truth(each) in self.learned]
 
     @property
     def of_others(self) -> list[Answered]:
-        """Touches of materials that it never learned, which it should call unknown."""
-        return [each for each in self.answered if each.touch.material not in self.learned]
+        """Touches whose name it never learned, which it should call unknown."""
+        return [each for each in self.answered if self.truth(each) not in self.learned]
 
     @property
     def answers(self) -> Answers:
-        """Those to touches of materials that the memory has."""
-        return Answers(
-            [str(each.touch.material) for each in self.of_learned], [each.prediction for each in self.of_learned]
-        )
+        """Those to touches whose name the memory has."""
+        return Answers([self.truth(each) for each in self.of_learned], [each.prediction for each in self.of_learned])
 
     @property
     def wrong(self) -> list[Answered]:
-        """Touches taken for another material: of materials that the memory has, and of others that it called known."""
-        mistaken = (each for each in self.answered if each.prediction.material != each.touch.material)
-        return [each for each in mistaken if each.touch.material in self.learned or each.prediction.known is not False]
+        """Touches taken for another: of names that the memory has, and of others that it called known."""
+        mistaken = (each for each in self.answered if each.prediction.material != self.truth(each))
+        return [each for each in mistaken if self.truth(each) in self.learned or each.prediction.known is not False]
 
     @property
     def calibration_error(self) -> float | None:
-        """Expected calibration error of touches of materials that the memory has, see `metrics`; None without any."""
+        """Expected calibration error of touches whose name the memory has, see `metrics`; None without any."""
         learned, truth = self.of_learned, self.answers
         right = [name == predicted for name, predicted in zip(truth.truth, truth.predicted, strict=True)]
         return calibration_error([each.prediction.probability for each in learned], right) if learned else None
@@ -232,8 +238,11 @@ class Evaluation:
         """Quantity → figures of its estimates of touches whose value is known, see `interval_figures`.
 
         For those of learned materials by name, and for "new" materials behind it, with the number of touches; what no
-        number was given for is left out of them and counted as "without".
+        number was given for is left out of them and counted as "without", "missing" says why. Empty of a quantity that
+        was not declared. By an axis nothing is estimated.
         """
+        if self.of is not None:
+            return {}
         names = sorted({name for each in self.answered for name in each.touch.values})
         return {
             name: {
@@ -256,7 +265,9 @@ def _measured(name: str, answered: Sequence[Answered]) -> dict[str, Any] | None:
     if not pairs:
         return None
     figures = interval_figures(*np.array(said, dtype=np.float64).T) if said else {}
-    return {"touches": len(said), "without": len(pairs) - len(said), "risk": pairs[0][1].risk, **figures}
+    first, missing = pairs[0][1], next((own.missing for _, own in pairs if own.value is None), "")
+    told = {"touches": len(said), "without": len(pairs) - len(said), "missing": missing}
+    return told | {"risk": first.risk, "unit": first.unit} | figures
 
 
 def evaluate_sources(
@@ -265,22 +276,34 @@ def evaluate_sources(
     options: SourceOptions,
     progress: Progress = lambda what, done, of: None,
     *,
+    of: str | None = None,
     with_learned: bool = False,
 ) -> Evaluation:
     """Answer every touch in sources with what the memory knows, settled, and keep the right answers.
 
-    with_learned: also those that the memory learned, of which it knows the answer.
+    of: an axis of labels, to be answered by in place of materials. with_learned: also those that the memory learned, of
+    which it knows the answer. Raises AnnotationError for an axis that no touch of the memory has a label on.
     """
+    learner._by(of)  # it is settled, too
     learner.settle()
     answered: list[Answered] = []
     refused: list[Refused] = []
-    seen = 0
-    for touch in _touches(learner, sources, options, progress, named=True):
+    seen = unlabelled = 0
+    for touch in _touches(learner, sources, options, progress, named=of is None):
         if isinstance(touch, Refused):
             refused.append(touch)
-            continue
-        known = bool(learner.names_of(touch.stream))
-        seen += known
-        if with_learned or not known:
-            answered.append(_answered(learner, touch))
-    return Evaluation(tuple(answered), tuple(refused), frozenset(learner.materials), seen)
+        elif _name_of(touch, of) is None:
+            unlabelled += 1
+        else:
+            known = bool(learner.names_of(touch.stream))
+            seen += known
+            if with_learned or not known:
+                own = _answered(learner, touch) if of is None else Answered(touch, learner.predict(touch.stream, of=of))
+                answered.append(own)
+    learned = frozenset(learner.materials if of is None else learner.axes[of])
+    return Evaluation(tuple(answered), tuple(refused), learned, seen, of, unlabelled)
+
+
+def _name_of(touch: SourceTouch, of: str | None) -> str | None:
+    """A touch's material, or its label on an axis; None where it has none."""
+    return touch.material if of is None else touch.labels.get(of)

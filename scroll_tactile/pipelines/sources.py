@@ -19,6 +19,7 @@ from scroll_tactile.live.detector import ContactDetector
 from scroll_tactile.live.pressing import REST_FOLLOWED, PressDetector
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
+from scroll_tactile.recordings.headings import Heading, Noted, noted_in
 from scroll_tactile.recordings.locations import is_remote
 from scroll_tactile.recordings.recording import require_columns
 from scroll_tactile.sensors import Sensor
@@ -46,11 +47,14 @@ Cut = Literal["episodes", "intervals", "none", "contact"]
 class SourceOptions:
     """How sources are read, cut into touches, and named.
 
-    topic, field, clock, columns, preset, labels: as of `recordings.read`. cut: None cuts by the intervals where there
-    are some, by episodes where a recording has some, and not otherwise.
+    topic, field, clock, columns, preset, labels, annotate: as of `recordings.read`. cut: None cuts by the intervals
+    where there are some, by episodes where a recording has some, and not otherwise.
     material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
     At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
-    anything is learned, as the table's headings do (`recordings.declared_quantities`).
+    anything is learned, as the table's headings do (`recordings.declared_quantities`), beside those of `annotate`.
+
+    The value of a touch in a column that annotates it is the mean of the touch's readings that have a number there, its
+    label the one text that they have: a touch with two is refused.
 
     Raises InputError for what does not fit together, MaterialError for a material that is none.
     """
@@ -61,6 +65,7 @@ class SourceOptions:
     columns: str | None = None
     preset: str | None = None
     labels: str | None = None
+    annotate: Sequence[str] = ()
     cut: Cut | None = None
     material: str | None = None
     by: Literal["topic", "file", "folder", "task"] | None = None
@@ -80,6 +85,15 @@ class SourceOptions:
             raise InputError("cut='intervals' takes intervals=, a table with columns file, begin, end and material")
         if self.intervals is not None and self.cut not in (None, "intervals"):
             raise InputError(f"intervals= cuts by itself; came cut={self.cut!r} beside it")
+        names = [Heading.parsed(text).name for text in self.annotate]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise InputError(f"expected each quantity and axis once in annotate=; came {twice[0]!r} several times")
+
+    @property
+    def declared(self) -> list[Quantity]:
+        """All quantities that are declared before anything is learned."""
+        of_columns = (Heading.parsed(text).quantity for text in self.annotate)
+        return [*self.quantities, *(quantity for quantity in of_columns if quantity is not None)]
 
     def touches_in(self, address: str, learner: TactileLearner) -> tuple[Recording, tuple[Touch, ...]]:
         """A source and the touches in it; raises what `recordings.read` and `recordings.touches` raise."""
@@ -92,6 +106,7 @@ class SourceOptions:
             preset=self.preset,
             rate=learner.sensor.rate,  # where it has no clock
             labels=self.labels,
+            annotate=self.annotate,
         )
         if self.intervals is not None:
             return recording, touches(recording, self.intervals)
@@ -212,20 +227,22 @@ def source_touches(
                 raise InputError("nothing names it: give material= for all, by='folder', by='file' or intervals=")
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
             stream = learner.stream(part.stream(learner.sensor))
-            values, name = _values(touch, learner.quantities), material if material is None else require_name(material)
-            yield SourceTouch(source, name, stream, values, dict(touch.labels))
+            noted = Noted(touch.values, touch.labels) + noted_in(recording.annotations, touch.begin, touch.end)
+            values, name = _values(noted, learner.quantities), material if material is None else require_name(material)
+            yield SourceTouch(source, name, stream, values, dict(noted.labels))
         except (InputError, SensorMismatchError) as error:
             yield Refused(source, str(error))
 
 
-def _values(touch: Touch, quantities: Mapping[str, Quantity]) -> dict[str, float]:
+def _values(noted: Noted, quantities: Mapping[str, Quantity]) -> dict[str, float]:
     """What was measured of a touch. Raises AnnotationError for another unit than a quantity's."""
-    for name, unit, value in touch.values:
+    for name, unit, value in noted.values:
         if name in quantities and quantities[name].unit != unit:
             raise AnnotationError(
-                f"expected {name!r} in {quantities[name].unit}, as it was declared; came {value:g} {unit}"
+                f"expected {name!r} in {quantities[name].unit}, as it was declared; came {value:g} {unit}: convert the "
+                f"column, and head it {name} [{quantities[name].unit}]"
             )
-    return {name: value for name, _, value in touch.values}
+    return {name: value for name, _, value in noted.values}
 
 
 def _source(recording: Recording, touch: Touch, options: SourceOptions) -> str:

@@ -180,24 +180,41 @@ class Predictor:
         return self._of_one_state(begin)
 
     def estimate(
-        self, readings: Readings, wanted: Sequence[str] | None, risk: float, known: bool | None
-    ) -> dict[str, Estimate]:
-        """As `TactileLearner.estimate`."""
+        self,
+        readings: Readings,
+        wanted: Sequence[str] | None = None,
+        risk: float = 0.1,
+        known: bool | None = None,
+        *,
+        scene: Sequence[str] | None = None,
+        axis: str | None = None,
+    ) -> tuple[Prediction, dict[str, Estimate]]:
+        """As `TactileLearner.predict` and `estimate`, of a touch that is encoded once.
+
+        scene, axis: of the prediction; the estimates rest on what the touch is among all materials.
+        """
         touch = self.extractor.stream(readings)
 
-        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], dict[str, Estimate]]:
+        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], tuple[Prediction, dict[str, Estimate]]]:
             estimator = self.current.estimator(self.ledger)
-            names = estimator.wanted(wanted)
+            names, by = estimator.wanted(wanted), self if axis is None else self.of_axis(axis)
+            frozen = by.current.frozen(by.ledger)  # this object keeps its model unchanged
+            candidates = candidates_of(scene, frozen.model.names, frozen.model.known)
 
-            def scales_for(steps: int) -> list[Scale]:
-                return sorted({*model.scales_for(model.names, steps), *estimator.scales_for(steps)})
+            scales_for = _scales_for([(model, model.names), (frozen.model, candidates)], estimator)
 
-            def estimated() -> dict[str, Estimate]:
+            def estimated() -> tuple[Prediction, dict[str, Estimate]]:
+                nothing = nothing_known(touch.seconds)
                 if not model.names:
-                    return estimates_of(estimator, names, None, extractor, nothing_known(touch.seconds), risk, known)
+                    return nothing, estimates_of(estimator, names, None, extractor, nothing, risk, known)
                 encoded = extractor.encode(touch, model.longest, scales_for)
                 prediction = self._answer(model, extractor, model.names, [(encoded, None)])
-                return estimates_of(estimator, names, encoded, extractor, prediction, risk, known)
+                found = estimates_of(estimator, names, encoded, extractor, prediction, risk, known)
+                if by is not self or candidates != model.names:
+                    if frozen.model.longest != model.longest:
+                        encoded = extractor.encode(touch, frozen.model.longest, scales_for)
+                    prediction = by.answer_of(frozen.model, extractor, candidates, [encoded]) if candidates else nothing
+                return prediction, found
 
             return estimated
 
@@ -321,6 +338,16 @@ def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> Feature
 def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) -> Codes:
     """The rows of codes of a touch, from readings that the memory stored."""
     return extractor.learned(Stream(extractor.sensor, readings))[1]
+
+
+def _scales_for(asked: Sequence[tuple[Model, Sequence[str]]], estimator: Estimator) -> Callable[[int], Sequence[Scale]]:
+    """Steps → the scales that models read of a touch to choose among candidates, and an estimator."""
+
+    def scales_for(steps: int) -> list[Scale]:
+        judging = (model.scales_for(candidates, steps) for model, candidates in asked if candidates)
+        return sorted({*estimator.scales_for(steps), *(scale for own in judging for scale in own)})
+
+    return scales_for
 
 
 def nothing_known(seconds: float) -> Prediction:

@@ -37,6 +37,7 @@ class Request:
     decimal: str = "."
     likely: str | None = None  # the topic, where several have the field
     definitions: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    annotate: tuple[str, ...] = ()
 
 
 @dataclass(eq=False)
@@ -47,12 +48,14 @@ class Block:
     clocks: seconds, float64 of shape (k,), by the clock's name; the first that runs is preferred.
     counters: what counts readings at their source, int64 of shape (k,), by name.
     episodes: the number of the episode of each reading, int64 of shape (k,), where a file has episodes.
+    annotations: the columns that were requested to annotate touches by, as of `Recording`, of shape (k,).
     """
 
     readings: npt.NDArray[Any]
     clocks: dict[str, npt.NDArray[np.float64]] = dataclasses.field(default_factory=dict)
     counters: dict[str, npt.NDArray[np.int64]] = dataclasses.field(default_factory=dict)
     episodes: npt.NDArray[np.int64] | None = None
+    annotations: dict[str, npt.NDArray[Any]] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -106,10 +109,10 @@ class Source(ABC):
     marks: the texts of a topic of labels, each with its time in seconds by the clock "log".
     continuous: whether time goes on from one episode to the next, and does not begin anew.
     budget: what reading it may still cost.
-    topics, labels: whether the format has topics, and something that labels.
+    topics, labels, annotate: whether the format has topics, something that labels, and columns beside the readings.
     """
 
-    continuous = topics = labels = False
+    continuous = topics = labels = annotate = False
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         self.path, self.address, self.request = path, address, request

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -35,6 +35,7 @@ def read(
     preset: str | None = None,
     rate: float | None = None,
     labels: str | None = None,
+    annotate: Sequence[str] = (),
     resample: float | None = None,
     header: bool | None = None,
     delimiter: str | None = None,
@@ -54,6 +55,9 @@ def read(
     preset: a known sensor, in place of topic and field, see `presets`; of a file without topics it is only the sensor.
     rate: in Hz, counts times where a file has no clock.
     labels: a topic with texts, or a column: what they say become episodes.
+    annotate: columns of a LeRobotDataset that say something of touches, as headings such as "force [N]" or
+        "slip [label]", with " from observation.wrench[2]" behind it where the data set calls it otherwise; they become
+        `annotations`.
     resample: a rate in Hz; see `resampled` for the rule. Readings are left as they are without it.
     header, delimiter, decimal: how a table is written, where it does not show.
     definitions: of messages that a bag does not define, the text of the .msg by the type's name.
@@ -63,7 +67,8 @@ def read(
     `bounds`); MissingLibraryError where it needs a library that is not installed; ChannelCountError where a preset is
     of another sensor; InputError for a clock that is not there.
     """
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, definitions=definitions or {})
+    more: dict[str, Any] = {"definitions": definitions or {}, "annotate": tuple(annotate)}
+    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, **more)
     address = fspath(path)
     with local(address) as place, guarded(address):
         source = _open(place, address, request, preset)
@@ -176,6 +181,11 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
     for name, value, takes in (("topic", request.topic, source.topics), ("labels", request.labels, source.labels)):
         if value is not None and not takes:
             raise InputError(f"{address} has no {name}; came {name}={value!r}: give field= alone")
+    if request.annotate and not source.annotate:
+        raise InputError(
+            f"{address} has no columns to annotate touches by; expected a LeRobot data set; came "
+            f"annotate={request.annotate[0]!r}: give values and labels in a table of intervals="
+        )
     return source
 
 
@@ -221,7 +231,7 @@ def _joined(blocks: Iterator[Block], source: Source) -> Block:
     """All blocks as one; raises RecordingError where there are none, or more than a file of this size can hold."""
     parts = []
     for block in blocks:
-        source.budget.give(block.readings.nbytes)
+        source.budget.give(block.readings.nbytes + sum(column.nbytes for column in block.annotations.values()))
         parts.append(block)
     if not parts:
         raise RecordingError(f"{source.address} holds no readings")
@@ -236,13 +246,15 @@ def _joined(blocks: Iterator[Block], source: Source) -> Block:
         return {key: np.concatenate([column[key] for column in columns]) for key in columns[0]}
 
     episodes = None if parts[0].episodes is None else np.concatenate([part.episodes for part in parts])
-    return Block(np.concatenate([part.readings for part in parts]), whole("clocks"), whole("counters"), episodes)
+    readings = np.concatenate([part.readings for part in parts])
+    return Block(readings, whole("clocks"), whole("counters"), episodes, whole("annotations"))
 
 
 def _recording(block: Block, source: Source, clock: str | None, columns: str | None) -> Recording:
     readings, times, episodes, report = assemble(block, clock, source)
     report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
-    recording = Recording(source.address, source.topic, source.field(), readings, times, episodes, report)
+    within = source.address, source.topic, source.field()
+    recording = Recording(*within, readings, times, episodes, report, block.annotations)
     return recording if columns is None else only_columns(recording, columns)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -103,6 +105,7 @@ class Recording:
         uint8 of shape (T, height, width, 3).
     times: seconds by the clock in the report, float64 of shape (T,); NaN where there is no clock and no rate was given.
     episodes: begin, end and name of each, in order; a label's span is one, too. Empty where the file has none.
+    annotations: by heading, the columns that say something of touches: numbers, float64, or texts, of shape (T,).
     """
 
     source: str
@@ -112,6 +115,7 @@ class Recording:
     times: npt.NDArray[np.float64]
     episodes: tuple[Episode, ...]
     report: Report
+    annotations: Mapping[str, npt.NDArray[Any]] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.readings)
@@ -148,14 +152,16 @@ def resampled(recording: Recording, rate: float) -> Recording:
     left out. Between two readings more than 0.1 s and five steps apart there is no line but NaN, which a sensor with
     non_finite="missing" takes. Pictures are not interpolated.
 
-    Raises InputError for pictures, for a recording without a clock, and for a rate that is no positive number or would
-    make over a hundred times as many readings.
+    Raises InputError for pictures, for a recording without a clock or with annotations, and for a rate that is no
+    positive number or would make over a hundred times as many readings.
     """
     if not rate > 0 or not np.isfinite(rate):
         raise InputError(f"expected a positive rate in Hz to resample to; came {rate!r}")
     if recording.readings.ndim != 2 or not np.isfinite(recording.times).all():
         what = "pictures" if recording.readings.ndim != 2 else "no clock: give clock= or rate="
         raise InputError(f"{recording.source} cannot be resampled: it has {what}")
+    if recording.annotations:
+        raise InputError(f"{recording.source} has annotations, one a reading: take resample=, or annotate=, not both")
     whole = [Episode(0, len(recording))] if len(recording) else []
     parts, times, episodes = [], [], []
     borders = sorted({0, len(recording), *(e.begin for e in recording.episodes), *(e.end for e in recording.episodes)})

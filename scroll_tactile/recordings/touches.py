@@ -14,13 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, InputError, RecordingError
-from scroll_tactile.quantities import WRITTEN, Quantity
+from scroll_tactile.quantities import Quantity
+from scroll_tactile.recordings.headings import Heading, Noted
 from scroll_tactile.recordings.paths import nearest
 from scroll_tactile.recordings.recording import Episode, Recording
 
 __all__ = ["Interval", "Touch", "declared_quantities", "read_intervals", "touches"]
-
-LABEL = "label"  # in brackets behind the name of an axis, in place of a unit
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,8 @@ def read_intervals(path: str | PathLike[str], files: Iterable[str | PathLike[str
 
 def declared_quantities(path: str | PathLike[str]) -> list[Quantity]:
     """The quantities whose range the headings of a table of intervals say. Raises as `read_intervals`."""
-    return [Quantity.parsed(name) for name in _table(path)[0] if (found := WRITTEN.fullmatch(name)) and found["low"]]
+    found = [Heading.found(name) for name in _table(path)[0]]
+    return [heading.quantity for heading in found if heading is not None and heading.quantity is not None]
 
 
 def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -208,12 +208,12 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
             table = [(i + 2, row) for i, row in enumerate(csv.reader(file, delimiter=delimiter)) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path} cannot be read as a table of intervals: {error}") from error
-    names = [cell if WRITTEN.fullmatch(cell) else cell.lower() for cell in cells]
+    names = [cell if Heading.found(cell) else cell.lower() for cell in cells]
     names = ["material" if name == "label" else name for name in names]
     for name in ("file", "begin", "end", "material"):
         if name not in names:
             raise FieldError(f"{path} has no column {name!r}; expected file, begin, end, material; there are {names}")
-    noted = [found["name"] for name in names if (found := WRITTEN.fullmatch(name))]
+    noted = [heading.name for name in names if (heading := Heading.found(name))]
     if twice := sorted({name for name in noted if noted.count(name) > 1}):
         raise FieldError(f"{path} has several columns {twice[0]!r} with a unit; expected one")
     return names, table
@@ -232,20 +232,21 @@ def _interval(path: Any, row: int, cells: dict[str, str], files: list[str] | Non
         raise InputError(f"{where}: expected begin before end; came {begin:g} and {end:g}")
     if files is not None and not any(_same(file, source) for source in files):
         raise InputError(f"{where}: {file!r} is none of the recordings{nearest(file, files)}")
-    return Interval(file, begin, end, material, row, *_noted(where, cells))
+    noted = _noted(where, cells)
+    return Interval(file, begin, end, material, row, noted.values, noted.labels)
 
 
-def _noted(where: str, cells: dict[str, str]) -> tuple[tuple[tuple[str, str, float], ...], tuple[tuple[str, str], ...]]:
-    """The values and labels in the columns of a row that have brackets."""
+def _noted(where: str, cells: dict[str, str]) -> Noted:
+    """What the columns of a row that have brackets say."""
     values, labels = [], []
-    for heading, cell in cells.items():
-        if (found := WRITTEN.fullmatch(heading)) is None or not cell.strip():
+    for text, cell in cells.items():
+        if (heading := Heading.found(text)) is None or not cell.strip():
             continue
-        if found["unit"].strip() == LABEL:
-            labels.append((found["name"], cell.strip()))
+        if heading.unit is None:
+            labels.append((heading.name, cell.strip()))
             continue
         try:
-            values.append((found["name"], found["unit"].strip(), float(cell)))
+            values.append((heading.name, heading.unit, float(cell)))
         except ValueError as error:
-            raise InputError(f"{where}: expected {heading!r} as a number: {error}") from error
-    return tuple(values), tuple(labels)
+            raise InputError(f"{where}: expected {text!r} as a number: {error}") from error
+    return Noted(tuple(values), tuple(labels))

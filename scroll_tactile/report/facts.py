@@ -19,7 +19,9 @@ from scroll_tactile.errors import (
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.match import KeptTouch
+from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.current import estimator_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
@@ -42,12 +44,14 @@ CANNOT_EMBED = EmbeddingError, MismatchError, StreamError, WeightsError
 class MemoryFacts:
     """What a memory knows.
 
-    risk: the share of wrong answers among those decided. missing: what the page lacks and why, filled as it is made.
-    unread: whether the embedding is not at hand, and nothing was fitted to beginnings.
+    risk: the share of wrong answers among those decided. of: an axis, whose labels it then knows in place of materials.
+    missing: what the page lacks and why, filled as it is made. unread: whether the embedding is not at hand, and
+    nothing was fitted to beginnings.
     """
 
     learner: TactileLearner
     risk: float
+    of: str | None = None
     missing: list[str] = field(default_factory=list)
     unread: bool = False
 
@@ -56,10 +60,24 @@ class MemoryFacts:
         self.missing.append(f"{what}: {why}")
         return note(f"Not shown: {why}")
 
+    def by(self, axis: str) -> MemoryFacts:
+        """What it knows by the labels on an axis; what is missing there is noted here."""
+        return MemoryFacts(self.learner, self.risk, axis, self.missing)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """What was learned, by materials or by labels."""
+        return self.learner.memory if self.of is None else axis_memory(self.learner.memory, self.of)
+
+    @property
+    def names(self) -> str:
+        """What touches are called by."""
+        return "materials" if self.of is None else f"labels on {self.of}"
+
     @cached_property
     def counts(self) -> dict[str, int]:
         """Material → touches, in the order of names."""
-        return dict(sorted(self.learner.materials.items(), key=lambda pair: as_counted(pair[0])))
+        return dict(sorted(self.memory.statistics.materials.items(), key=lambda pair: as_counted(pair[0])))
 
     @cached_property
     def journal(self) -> list[Observation]:
@@ -79,12 +97,12 @@ class MemoryFacts:
 
     def _fitted(self) -> Model:
         try:
-            return self.learner.model()
+            return self.learner._by(self.of).fitted()
         except CANNOT_EMBED as error:
             self.missing.append(f"When answers are decided: {error}")
             self.unread = True
             with enough_memory():
-                return Draft.of(self.learner.memory, self.learner.settings.readout).fit(None)
+                return Draft.of(self.memory, self.learner.settings.readout).fit(None)
 
     @cached_property
     def held_out(self) -> list[HeldOutTouch]:
@@ -106,12 +124,12 @@ class MemoryFacts:
         """Materials and their separations; none where there are too few, or too many."""
         if self.model is None or not 1 < len(self.counts) <= MOST_NEAR:
             return [], np.zeros((0, 0))
-        return separations(self.learner, self.model)
+        return separations(self.memory.statistics, self.model)
 
     @cached_property
     def kept(self) -> list[KeptTouch]:
         """The kept touches, in the order of observation where that is known."""
-        touches = self.learner.memory.kept.touches() if self.learner.memory.kept is not None else []
+        touches = self.memory.kept.touches() if self.memory.kept is not None else []
         place = {row.key: row.sequence for row in self.journal}
         return sorted(touches, key=lambda touch: (place.get(touch.key, 0), touch.material, touch.key))
 
@@ -141,7 +159,7 @@ class MemoryFacts:
     @cached_property
     def estimator(self) -> Estimator | None:
         """What estimates quantities; None where none was declared."""
-        return estimator_of(self.learner.memory) if self.learner.memory.quantities else None
+        return estimator_of(self.memory) if self.memory.quantities else None
 
     @cached_property
     def soon(self) -> Soon | None:
@@ -177,5 +195,5 @@ class MemoryFacts:
         if not self.counts:
             return "no touch was observed yet."
         if len(self.counts) == 1:
-            return "one material has nothing to be mixed up with; teach a second one."
-        return "nothing can be left out: that takes two materials with two touches or more of each."
+            return f"there is one of the {self.names}, with nothing to be mixed up with; teach a second one."
+        return f"nothing can be left out: that takes two {self.names} with two touches or more of each."

@@ -62,7 +62,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
         return facts.lacks("What it mixes up", facts.nothing_left_out)
     tested = {touch.material for touch in facts.held_out}
     words = (
-        f"{trust.count} touches of {len(tested)} materials were left out one by one: {trust.right:.1%} right "
+        f"{trust.count} touches of {len(tested)} {facts.names} were left out one by one: {trust.right:.1%} right "
         f"(95% interval {trust.low:.1%} to {trust.high:.1%})."
     )
     if len(tested) < len(facts.counts):
@@ -75,7 +75,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
     more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
     found = f"<div><h3>Worst confusions</h3>{listed}{more}{_by_name(facts)}</div>"
-    found = found if rows else note("None was called another material.")
+    found = found if rows else note("None was called by another name.")
     if len(tested) > SQUARE:
         return note(words) + found
     names = [name for name in order or facts.counts if name in tested]
@@ -87,7 +87,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
             counts[place[touch.material], place[touch.answer]] += 1
     caption = (
         "Rows: what was touched; columns, by number: what it was called. Right answers lie on the diagonal, and "
-        "materials that feel alike stand side by side."
+        f"{facts.names} that feel alike stand side by side."
     )
     return note(words) + side_by_side(figure(confusions(names, counts), caption), found)
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction.judging import HeldOutTouch
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.report.charts import Bin
 from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["MOST_NEAR", "Mistake", "Trust", "bins_of", "interval", "mistakes", "separations", "trust_in", "unknown_by"]
 
@@ -25,7 +25,7 @@ PRIOR = 0.1  # of a readout's scores, where the calibration is that of another k
 BINS = 10
 
 
-def separations(learner: TactileLearner, model: Model) -> tuple[list[str], FloatArray]:
+def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatArray]:
     """The separation of materials: names, and the log-odds that a typical touch of one has over another, (C, C).
 
     Half the squared Mahalanobis distance of their means, of each scale that judges whole touches, as far as the
@@ -39,7 +39,7 @@ def separations(learner: TactileLearner, model: Model) -> tuple[list[str], Float
         model.fusion.complete.calibration.weights if model.kind == "lda" else np.full(len(scales), PRIOR / len(scales))
     )
     names = [name for name in model.names if all(name in model.readouts[scale].places for scale in scales)]
-    total, statistics = np.zeros((len(names), len(names))), learner.memory.statistics
+    total = np.zeros((len(names), len(names)))
     with one_thread():
         for scale, weight in zip(scales, weights.tolist(), strict=True):
             readout = model.readouts[scale]

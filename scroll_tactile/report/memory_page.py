@@ -64,6 +64,9 @@ def memory_page(
         ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
         ("pictures", "What touches look like", exemplar_pictures(sensor, facts.kept, facts.exemplars)),
     ]
+    for i, axis in enumerate(learner.axes):
+        by = facts.by(axis)
+        sections.append((f"axis-{i}", f"By {axis}", mixed_up(by, alike(by)[1]) + calibration_plots(by)))
     channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
     summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels])
     if facts.missing:

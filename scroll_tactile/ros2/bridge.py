@@ -43,15 +43,17 @@ class BridgeReport:
 class Bridge:
     """A live session of a learner, fed with messages.
 
-    field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact: see
-    `learner.live`. answer: called with each answer, when something changed. warn: called with each kind of fault once.
+    field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact, of:
+    see `learner.live`. answer: called with each answer, when something changed. warn: called with each kind of fault
+    once.
 
     An answer has event ("began", "prediction", "decided", "ended", or "brief" for a contact too short for a touch),
     stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
     probability, known, novelty (None where nothing was ever observed), unusual, candidates and ranking (the five
     likeliest); "ended" also has end, why it did, and touches, of how many of the same thing the answer is. All but
     event, stamp and contact may be missing where nothing was predicted yet. estimates, by quantity, is there where any
-    was declared: of each what an `Estimate` has.
+    was declared: of each what an `Estimate` has. By an axis each answer has its name as of, a label as material, and
+    no estimates.
 
     A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
     the clock of the stamps before it.
@@ -67,16 +69,18 @@ class Bridge:
         *,
         risk: float = 0.05,
         contact: Literal["auto", "manual"] = "auto",
+        of: str | None = None,
         answer: Callable[[Answer], object],
         warn: Callable[[str], object],
     ) -> None:
         self.field = FieldPath(field)
         self.learner = learner
-        self.session = learner.live(risk=risk, contact=contact)
+        self.session = learner.live(risk=risk, contact=contact, of=of)
         self.report = BridgeReport()
         self.state = LiveState()
         self.stamp = 0.0
         self._answer, self._warn = answer, warn
+        self._by: dict[str, Any] = {} if of is None else {"of": of}
         self._pictures = learner.sensor.camera and self.field.text == "data"
         self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
         self._ahead = 0.0  # of when a message is published, by its stamp
@@ -200,12 +204,12 @@ class Bridge:
     def _now(self, event: str, now: LiveState) -> Answer:
         answer = {} if now.prediction is None else _answer_of(now.prediction, now.estimates)
         here = {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
-        return {"event": event, "stamp": self.stamp, **here, **answer}
+        return {"event": event, "stamp": self.stamp} | self._by | here | answer
 
     def _ended(self, touch: LiveTouch) -> Answer:
         over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
         over |= {"touches": 1 + len(touch.earlier)}
-        return {"event": "ended", "stamp": self.stamp, **over, **_answer_of(touch.prediction, touch.estimates)}
+        return {"event": "ended", "stamp": self.stamp} | self._by | over | _answer_of(touch.prediction, touch.estimates)
 
 
 def _answer_of(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dict[str, Any]:

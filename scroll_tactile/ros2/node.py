@@ -31,7 +31,7 @@ class TactileNode:
     """A learner at a topic, within a node of one's own; `serve` makes the node, too.
 
     topic, field, kind: where the readings are. Without a kind, such as sensor_msgs/msg/JointState, the type is what the
-    topic is sent as, and it may appear later. risk, contact: see `learner.live`. answered: called with each answer
+    topic is sent as, and it may appear later. risk, contact, of: see `learner.live`. answered: called with each answer
     that is published, for what acts in the same process.
 
     Subscribes with the quality of service of sensor data, best effort and volatile, which any publisher can serve; but
@@ -65,6 +65,7 @@ class TactileNode:
         kind: str | None = None,
         risk: float = 0.05,
         contact: Literal["auto", "manual"] = "auto",
+        of: str | None = None,
         answered: Callable[[Answer], object] | None = None,
     ) -> None:
         self.node, self.kind = node, kind
@@ -72,7 +73,8 @@ class TactileNode:
         message = None if kind is None else interface(kind)
         text, trigger = interface("std_msgs/msg/String"), interface("std_srvs/srv/Trigger")
         self._log = node.get_logger()
-        self.bridge = Bridge(learner, field, risk=risk, contact=contact, answer=self._publish, warn=self._log.warning)
+        how: dict[str, Any] = {"risk": risk, "contact": contact, "of": of}
+        self.bridge = Bridge(learner, field, **how, answer=self._publish, warn=self._log.warning)
         self._text, self._answered = text, answered
         self._answers = node.create_publisher(text, "~/answer", 10)
         self._diagnostics = _Diagnostics(node)
@@ -238,6 +240,7 @@ def serve(
     kind: str | None = None,
     risk: float = 0.05,
     contact: Literal["auto", "manual"] = "auto",
+    of: str | None = None,
     arguments: Sequence[str] = (),
 ) -> dict[str, int | bool]:
     """Run the node `scroll_tactile` until ctrl-C or SIGTERM, or until ROS ends; returns what it met, by name.
@@ -261,7 +264,7 @@ def serve(
         try:
             executor = SingleThreadedExecutor(context=context)
             node = rclpy.create_node("scroll_tactile", context=context)
-            served = TactileNode(node, learner, topic, field, kind=kind, risk=risk, contact=contact)
+            served = TactileNode(node, learner, topic, field, kind=kind, risk=risk, contact=contact, of=of)
             executor.add_node(node)
             try:
                 while not ended.is_set() and context.ok():

@@ -41,7 +41,8 @@ class Annotation:
         if strange := sorted(map(str, numbers.keys() - quantities.keys())):
             raise AnnotationError(
                 f"expected values of declared quantities, out of {sorted(quantities)}; came {strange[:5]}: declare it "
-                "first, with its unit and range (learner.declare)"
+                f"first, as '{strange[0]} [UNIT] LOW..HIGH step RESOLUTION', by memory declare, learner.declare, "
+                "or in the heading of its column"
             )
         if len(names) > MOST_AXES:
             raise AnnotationError(f"expected labels on at most {MOST_AXES} axes; came {len(names)}")

@@ -74,7 +74,7 @@ def test_what_is_noted_in_a_table_is_learned_once_and_another_value_is_refused(d
     assert learned(table(data)) == (0, 4, [])
     count, repeated, why = learned(table(data, [ROWS[0].replace("1.4", "1.5"), *ROWS[1:]]))
     assert (count, repeated, len(why)) == (0, 3, 1)
-    assert ("'force': 150" if fleet else "'force': 1.5") in why[0].why
+    assert "values {'force': 1.4} and labels {'slip': 'north'}" in why[0].why and "values {'force': 1.5}" in why[0].why
     with TactileLearner.open(data / "m", **SETTINGS) as learner:
         whole = expected()
         assert learner.digest() == whole.digest() and learner.axes == whole.axes
@@ -85,6 +85,21 @@ def test_what_is_noted_in_a_table_is_learned_once_and_another_value_is_refused(d
         later = table(data, ["4.npy,0,2,oak,3,"], "file,begin,end,material,force [N],slip [label]")
         assert learn_sources(learner, [str(data / "4.npy")], options(later)).learned == {"oak": 1}
         assert learner.observations()[-1].values == {"force": 3.0}
+
+
+def test_a_fleet_learns_by_the_quantities_of_the_memory_that_it_adds_to(data):
+    with TactileLearner.open(data / "m", **SETTINGS) as learner:
+        learner.declare(FORCE)
+
+    def learned(heading):
+        path = table(data, ["0.npy,0,2,oak,1.4"], f"file,begin,end,material,{heading}")
+        shutil.rmtree(data / "m.fleet", ignore_errors=True)
+        return learn(data / "m", sources(data, 1), options(path), client=DyingExecutor(), **SETTINGS, add=True)
+
+    with pytest.raises(AnnotationError, match=r"declared as force \[N\] 0..10 step 0.01; came force \[N\] 0..20"):
+        learned("force [N] 0..20 step 0.01")
+    assert "expected 'force' in N" in learned("force [mN]").refused[0].why
+    assert learned("force [N]").observations == 1
 
 
 @pytest.mark.parametrize(
@@ -110,7 +125,9 @@ def test_another_unit_is_refused_for_each_touch_that_has_a_value(data):
     learner.declare(FORCE)
     path = table(data, ["0.npy,0,2,oak,1400", "1.npy,0,2,silk,"], "file,begin,end,material,force [mN]")
     done = learn_sources(learner, sources(data, 2), options(path))
-    assert [each.why for each in done.refused] == ["expected 'force' in N, as it was declared; came 1400 mN"]
+    assert [each.why for each in done.refused] == [
+        "expected 'force' in N, as it was declared; came 1400 mN: convert the column, and head it force [N]"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -445,3 +445,13 @@ def test_a_reader_of_many_materials_keeps_what_it_mapped_where_a_writer_has_repl
             writer.observe("a", stream("a", 80))
             writer.settle()
         assert bits(reader) == said[2]
+
+
+def test_a_memory_that_is_closed_twice_says_nothing_of_a_model_that_it_kept(tmp_path, caplog):
+    learner = TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL)
+    for name, seed in OBSERVED[:8]:
+        learner.observe(name, stream(name, seed))
+    learner.predict(stream("a", 50))
+    learner.close()
+    learner.close()
+    assert not caplog.records

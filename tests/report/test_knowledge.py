@@ -111,7 +111,7 @@ def test_how_soon_answers_come_is_counted(learner):
 
 def test_separations_are_the_log_odds_between_means(learner):
     model = learner.model()
-    names, apart = separations(learner, model)
+    names, apart = separations(learner.memory.statistics, model)
     assert names == sorted(NAMES)
     assert np.array_equal(apart, apart.T)
     assert (np.diagonal(apart) == 0).all()

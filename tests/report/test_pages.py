@@ -10,6 +10,7 @@ from commands import refused, run
 
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
+from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.report import memory_page, recording_page, save
 from scroll_tactile.simulation.scene import Scene
 
@@ -265,13 +266,13 @@ def test_more_materials_than_the_ridge_weighs_leave_a_page(learner, monkeypatch)
     def refuse(_):
         raise InputError("the readout weighs 1024 materials at most")
 
-    monkeypatch.setattr(TactileLearner, "model", refuse)
+    monkeypatch.setattr(Predictor, "fitted", refuse)
     assert "Nothing could be fitted: the readout weighs 1024 materials at most" in words(memory_page(learner))
 
     def lack(_):
         raise CapacityError("no memory is left")
 
-    monkeypatch.setattr(TactileLearner, "model", lack)
+    monkeypatch.setattr(Predictor, "fitted", lack)
     with pytest.raises(CapacityError):
         memory_page(learner)
 
@@ -363,3 +364,19 @@ def test_what_it_measures_is_shown_held_out():
     learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
     learner.observe("felt", scene.touch("felt", 0))
     assert "What it measures" not in words(memory_page(learner))
+
+
+def test_each_axis_of_labels_has_a_section():
+    scene, learner = Scene(sensor=PAD), TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
+    for i in range(10):
+        for name in scene.materials[:3]:
+            touch = scene.touch(name, i)
+            ways = {"way <b>": ["back", "forth"][i % 2], "once": "said"} if i else None
+            learner.observe(name, touch.readings[::-1] if i % 2 else touch, labels=ways)
+    html = memory_page(learner)
+    Checked(html)
+    text = words(html)
+    assert "27 touches of 2 labels on way <b> were left out one by one: 100.0% right" in text
+    assert "By once" in text and "there is one of the labels on once, with nothing to be mixed up with" in text
+    assert "30 touches of 3 materials were left out" in text
+    assert html.count('id="axis-') == 2

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from live_touches import GEL, frames, gel_learner, learner, shift
+from live_touches import GEL, frames, gel_learner, learner, shift, slide
 from robot import Bare, stamped, taught
 from touches import PAD, SMALL
 
@@ -197,3 +197,16 @@ def test_answers_carry_estimates_where_a_quantity_was_declared():
     made, answers, _ = bridge()
     run(made)
     assert not any("estimates" in answer for answer in answers)
+
+
+def test_answers_are_by_an_axis_of_labels_where_one_is_named():
+    source = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
+    for i in range(8):
+        for name, way in (("a", "north"), ("b", "south")):
+            source.observe(name, slide(name, 50, np.random.default_rng(i)), labels={"slip": way})
+    made, answers, _ = bridge(source=source, of="slip")
+    run(made)
+    assert {answer["of"] for answer in answers} == {"slip"}
+    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["north", "south"]
+    with pytest.raises(errors.AnnotationError, match="expected an axis that touches have labels on"):
+        bridge(source=source, of="way")

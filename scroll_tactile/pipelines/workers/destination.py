@@ -15,6 +15,7 @@ from scroll_tactile.pipelines.learning import learn_sources, store_model
 from scroll_tactile.pipelines.sources import Refused, SourceOptions, has_touches
 from scroll_tactile.pipelines.workers.jobs import Made, Making, hush
 from scroll_tactile.pipelines.workers.steps import Step
+from scroll_tactile.quantities import require_declarable
 from scroll_tactile.recipe import RecipeRequest
 from store import Head
 from store.files import remove_tree
@@ -55,6 +56,8 @@ class Destination:
     """The memory that comes out: made when the first touches come in.
 
     making: what it is made with. learned: whether it was there before the run, with touches.
+
+    Raises AnnotationError where it has another quantity than is declared for it, under one name.
     """
 
     def __init__(
@@ -72,7 +75,11 @@ class Destination:
         if place.exists():
             self.learner = stack.enter_context(TactileLearner.open(place, **asked.arguments))
             hush(self.learner)
-        self.making = Making(asked.recipe() if self.learner is None else self.learner._recipe, options, patience)
+        there = {} if self.learner is None else self.learner.quantities
+        for quantity in options.declared:
+            require_declarable(there, quantity)
+        recipe = asked.recipe() if self.learner is None else self.learner._recipe
+        self.making = Making(recipe, options, patience, tuple(there.values()))
         self.learned = self.learner is not None and bool(self.learner.observations())
         self._made = self.learner is None
 

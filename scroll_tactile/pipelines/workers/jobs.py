@@ -20,6 +20,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import Refused, SourceOptions
+from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
 from store.archive import Files, files_of, write_archive
 from store.exceptions import reported
@@ -31,11 +32,15 @@ CONTENT = re.compile("[0-9a-f]{64}")
 
 @dataclass(frozen=True)
 class Making:
-    """What all memories of a run are made with, and how sources are read. patience: seconds for a job; None: any."""
+    """What all memories of a run are made with, and how sources are read.
+
+    patience: seconds for a job; None: any. quantities: that the memory which comes out has.
+    """
 
     recipe: Recipe
     options: SourceOptions
     patience: float | None = None
+    quantities: tuple[Quantity, ...] = ()
 
     @property
     def identity(self) -> Identity:
@@ -151,6 +156,8 @@ def learn_job(job: LearnJob) -> Made:
         place = Path(stack.enter_context(made)) / "memory"
         with job.making.open(place) as learner:
             hush(learner)
+            for quantity in job.making.quantities:
+                learner.declare(quantity)
             done = learn_sources(learner, job.sources, job.making.options, every=True)
             learner._ledger.saves = True  # it is merged by its checkpoint
         identity = ""

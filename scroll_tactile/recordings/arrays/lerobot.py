@@ -17,7 +17,9 @@ from scroll_tactile.libraries import missing
 from scroll_tactile.recordings.arrays.parquetpages import LONGEST_LIST, require_bounded_pages
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
+from scroll_tactile.recordings.headings import Heading
 from scroll_tactile.recordings.paths import matched, select
+from scroll_tactile.settings import LONGEST_NAME
 
 __all__ = ["LeRobot", "is_lerobot"]
 
@@ -34,6 +36,8 @@ def is_lerobot(path: Path) -> bool:
 
 class LeRobot(Source):
     """A LeRobotDataset; see `Source`. An episode is called what its task is."""
+
+    annotate = True
 
     def __init__(self, path: Path, address: str, request: Request) -> None:
         try:
@@ -71,27 +75,76 @@ class LeRobot(Source):
         key, rest = self._column()
         clock = self.request.clock or "timestamp"
         tasks = self._tasks()
-        columns = list(dict.fromkeys([key, clock, *_BOOKKEEPING]))
+        annotating = {text: self._annotating(text) for text in self.request.annotate}
+        required = list(dict.fromkeys([key, clock, *(own for own, *_ in annotating.values())]))
+        columns = list(dict.fromkeys([*required, *_BOOKKEEPING]))
+        labels = [own for own, _, heading in annotating.values() if heading.unit is None]
+        width = self._width(key)
+        for path in self._files():
+            with self._opened(path, columns, labels) as file:
+                there = [name for name in columns if name in file.schema_arrow.names]
+                for name in required:
+                    if name not in there:
+                        raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
+                for name in there:
+                    self._require_numbers(file.schema_arrow.field(name).type, name, texts=name in labels)
+                for batch in file.iter_batches(batch_size=rows_of(width), columns=there):
+                    if batch.num_rows:
+                        block = self._block(batch, key, rest, clock, tasks)
+                        block.annotations |= {text: self._column_of(batch, *own) for text, own in annotating.items()}
+                        yield block
+
+    def _width(self, key: str) -> int:
+        """The bytes of a reading of a column, as the data set describes it."""
         shape = self.features[key]["shape"]
         width = 8 * math.prod(int(size) for size in shape)
         if not 0 < width <= LARGEST:
             raise RecordingError(
                 f"{self.address} claims readings of shape {shape!r:.60} in {key!r}, and may be damaged"
             )
-        for path in self._files():
-            with self._opened(path, columns) as file:
-                there = [name for name in columns if name in file.schema_arrow.names]
-                for name in (key, clock):
-                    if name not in there:
-                        raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
-                for name in there:
-                    self._require_numbers(file.schema_arrow.field(name).type, name)
-                for batch in file.iter_batches(batch_size=rows_of(width), columns=there):
-                    if batch.num_rows:
-                        yield self._block(batch, key, rest, clock, tasks)
+        return width
 
-    def _opened(self, path: Path, columns: list[str] | None) -> Any:
+    def _annotating(self, text: str) -> tuple[str, str, Heading]:
+        """The column that a heading names, the index behind it, and the heading."""
+        heading = Heading.parsed(text)
+        key, rest = matched(heading.column, self.features, self.address)
+        kind = self.features[key]["dtype"]
+        if kind in ("video", "image") or (kind == "string") > (heading.unit is None):
+            raise FieldError(
+                f"column {key!r} of {self.address}, as {text!r}, is of type {kind}; expected "
+                + ("texts, or whole numbers" if heading.unit is None else "numbers")
+            )
+        return key, rest, heading
+
+    def _column_of(self, batch: Any, key: str, rest: str, heading: Heading) -> npt.NDArray[Any]:
+        """A column that annotates touches: a number a reading, NaN where there is none, or a text, as str."""
+        column = batch.column(key)
+        if self.types.is_dictionary(column.type):
+            self.budget.take(batch.num_rows * 8 + column.dictionary.nbytes)
+            texts = np.array(["", *(text or "" for text in column.dictionary.to_pylist())], object)
+            if (longest := max(map(len, texts))) > LONGEST_NAME:
+                raise FieldError(
+                    f"column {key!r} of {self.address} has a text of {longest} characters; expected labels of at most "
+                    f"{LONGEST_NAME}"
+                )
+            found: npt.NDArray[Any] = texts[column.indices.fill_null(-1).to_numpy() + 1]
+            return found
+        rows = select(self._rows(column, key), rest, heading.column)
+        if rows.shape[1] != 1:
+            raise FieldError(
+                f"column {key!r} of {self.address} has {rows.shape[1]} numbers a reading; expected one: give which by "
+                f"its place, as in {heading.name} [{heading.unit or 'label'}] from {key}[0]"
+            )
+        if heading.unit is not None:
+            return rows[:, 0].astype(np.float64)
+        # Of whole numbers some of which are missing pyarrow makes floats.
+        names = ["" if math.isnan(number) else str(number) for number in rows[:, 0].tolist()]
+        return np.array([name.removesuffix(".0") for name in names], object)
+
+    def _opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
+
+        texts: the columns of which each text is to be in memory once, and not once for every row that has it.
 
         The budget is charged for what their pages claim, before pyarrow opens it. What the footer holds
         about columns is not read by pyarrow: where that is damaged, pyarrow ends the process.
@@ -100,7 +153,7 @@ class LeRobot(Source):
         self.budget.add(stored_bytes(path))
         require_bounded_pages(path, columns, self.budget)
         limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": LONGEST_LIST}
-        return self.parquet.ParquetFile(path, pre_buffer=False, **limits)
+        return self.parquet.ParquetFile(path, pre_buffer=False, read_dictionary=texts, **limits)
 
     def _table(self, file: Any, numbers: list[str], text: str | None = None) -> dict[str, list[Any]]:
         """Some columns of a small parquet table, whole: of numbers, and one of texts."""
@@ -160,9 +213,18 @@ class LeRobot(Source):
             array = inner
         return np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).reshape(count, -1)
 
-    def _require_numbers(self, kind: Any, name: str) -> None:
-        """Raises FieldError for a column of anything else, before it is read: a text may stand for every row of it."""
+    def _require_numbers(self, kind: Any, name: str, *, texts: bool = False) -> None:
+        """Raises FieldError for a column of anything else, before it is read: a text may stand for every row of it.
+
+        texts: whether it is one of labels: texts that were opened as such are taken, and numbers with a fraction not.
+        """
         kind = getattr(kind, "storage_type", kind)
+        if texts and self.types.is_dictionary(kind):
+            kind = kind.value_type
+            if self.types.is_string(kind) or self.types.is_large_string(kind):
+                return
+        if texts and self.types.is_floating(kind):
+            raise FieldError(f"column {name!r} of {self.address} holds {kind}; expected texts, or whole numbers")
         while self.types.is_nested(kind) and hasattr(kind, "value_type"):
             kind = kind.value_type
         if not (self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)):

@@ -171,7 +171,7 @@ class Vision:
                 batch = members[first : first + BATCH]
                 with torch.inference_mode(), torch.autocast("cpu", enabled=False):
                     planes = to_planes(torch.from_numpy(np.stack([images[i] for i in batch]).astype(np.float32)))
-                    features[batch] = self._pooled(planes, [(0, steps)], steps)[:, 0]
+                    features[batch] = self._window_features(planes, [(0, steps)], steps)[:, 0]
         return features
 
     def network(self) -> TunableVision:
@@ -199,10 +199,10 @@ class Vision:
         """Features (windows, d) from one pass over an image."""
         with steady():
             planes = to_planes(torch.tensor(image[None], dtype=torch.float32))
-            features: FloatArray = self._pooled(planes, windows, image.shape[1])[0]
+            features: FloatArray = self._window_features(planes, windows, image.shape[1])[0]
             return features
 
-    def _pooled(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], steps: int) -> FloatArray:
+    def _window_features(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], steps: int) -> FloatArray:
         maps = self._run(planes.numpy())
         pooled = pool_windows([torch.from_numpy(maps[stage]) for stage in self.stages], steps, windows)
         # Rounding may pass 1 by a unit in the last place.

@@ -266,8 +266,8 @@ def _measured(name: str, answered: Sequence[Answered]) -> dict[str, Any] | None:
         return None
     figures = interval_figures(*np.array(said, dtype=np.float64).T) if said else {}
     first, missing = pairs[0][1], next((own.missing for _, own in pairs if own.value is None), "")
-    told = {"touches": len(said), "without": len(pairs) - len(said), "missing": missing}
-    return told | {"risk": first.risk, "unit": first.unit} | figures
+    counted = {"touches": len(said), "without": len(pairs) - len(said), "missing": missing}
+    return counted | {"risk": first.risk, "unit": first.unit} | figures
 
 
 def evaluate_sources(

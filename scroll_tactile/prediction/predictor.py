@@ -26,6 +26,7 @@ from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.replaying import load
+from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft
@@ -165,9 +166,7 @@ class Predictor:
                 nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
                 return lambda: Composition(nothing, 1.0, nothing_known(touch.seconds))
             composer = self.current.composer(self.ledger, model)
-
-            def scales_for(steps: int) -> list[Scale]:
-                return sorted({*model.scales_for(model.names, steps), *composer.scales_for(steps)})
+            scales_for = _scales_for([(model, model.names)], composer)
 
             def composed() -> Composition:
                 encoded = extractor.encode(touch, model.longest, scales_for)
@@ -200,7 +199,6 @@ class Predictor:
             names, by = estimator.wanted(wanted), self if axis is None else self.of_axis(axis)
             frozen = by.current.frozen(by.ledger)  # this object keeps its model unchanged
             candidates = candidates_of(scene, frozen.model.names, frozen.model.known)
-
             scales_for = _scales_for([(model, model.names), (frozen.model, candidates)], estimator)
 
             def estimated() -> tuple[Prediction, dict[str, Estimate]]:
@@ -340,12 +338,14 @@ def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) ->
     return extractor.learned(Stream(extractor.sensor, readings))[1]
 
 
-def _scales_for(asked: Sequence[tuple[Model, Sequence[str]]], estimator: Estimator) -> Callable[[int], Sequence[Scale]]:
-    """Steps → the scales that models read of a touch to choose among candidates, and an estimator."""
+def _scales_for(
+    asked: Sequence[tuple[Model, Sequence[str]]], beside: Composer | Estimator
+) -> Callable[[int], Sequence[Scale]]:
+    """Steps → the scales of a touch that models read to choose among candidates, and what rests on it beside them."""
 
     def scales_for(steps: int) -> list[Scale]:
         judging = (model.scales_for(candidates, steps) for model, candidates in asked if candidates)
-        return sorted({*estimator.scales_for(steps), *(scale for own in judging for scale in own)})
+        return sorted({*beside.scales_for(steps), *(scale for own in judging for scale in own)})
 
     return scales_for
 

@@ -187,19 +187,22 @@ def read_intervals(path: str | PathLike[str], files: Iterable[str | PathLike[str
     InputError for a row whose times are no numbers or end before they begin, whose material is empty, whose file is not
     there, or that has a value which is no number.
     """
-    names, table = _table(path)
+    names, headings, table = _table(path)
     sources = None if files is None else [fspath(file) for file in files]
-    return [_interval(path, row, dict(zip(names, cells, strict=False)), sources) for row, cells in table]
+    rows = ((row, dict(zip(names, cells, strict=False))) for row, cells in table)
+    return [_interval(f"{path}, row {row}", row, cells, headings, sources) for row, cells in rows]
 
 
 def declared_quantities(path: str | PathLike[str]) -> list[Quantity]:
     """The quantities whose range the headings of a table of intervals say. Raises as `read_intervals`."""
-    found = [Heading.found(name) for name in _table(path)[0]]
-    return [heading.quantity for heading in found if heading is not None and heading.quantity is not None]
+    return [heading.quantity for heading in _table(path)[1].values() if heading.quantity is not None]
 
 
-def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """The names of a table's columns, in lower case but for those with brackets, and its rows with their numbers."""
+def _table(path: str | PathLike[str]) -> tuple[list[str], dict[str, Heading], list[tuple[int, list[str]]]]:
+    """The names of a table's columns, what those with brackets say, and its rows with their numbers.
+
+    Names without brackets are in lower case.
+    """
     try:
         with Path(fspath(path)).open(encoding="utf-8-sig", newline="") as file:
             first = file.readline(1 << 16)
@@ -208,20 +211,22 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], list[tuple[int, list[s
             table = [(i + 2, row) for i, row in enumerate(csv.reader(file, delimiter=delimiter)) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path} cannot be read as a table of intervals: {error}") from error
-    names = [cell if Heading.found(cell) else cell.lower() for cell in cells]
+    headings = {cell: heading for cell in cells if (heading := Heading.found(cell)) is not None}
+    names = [cell if cell in headings else cell.lower() for cell in cells]
     names = ["material" if name == "label" else name for name in names]
     for name in ("file", "begin", "end", "material"):
         if name not in names:
             raise FieldError(f"{path} has no column {name!r}; expected file, begin, end, material; there are {names}")
-    noted = [heading.name for name in names if (heading := Heading.found(name))]
+    noted = [headings[name].name for name in names if name in headings]
     if twice := sorted({name for name in noted if noted.count(name) > 1}):
         raise FieldError(f"{path} has several columns {twice[0]!r} with a unit; expected one")
-    return names, table
+    return names, headings, table
 
 
-def _interval(path: Any, row: int, cells: dict[str, str], files: list[str] | None) -> Interval:
+def _interval(
+    where: str, row: int, cells: dict[str, str], headings: dict[str, Heading], files: list[str] | None
+) -> Interval:
     file, material = cells.get("file", "").strip(), cells.get("material", "").strip()
-    where = f"{path}, row {row}"
     if not file or not material:
         raise InputError(f"{where}: expected a file and a material; came {file!r} and {material!r}")
     try:
@@ -232,18 +237,18 @@ def _interval(path: Any, row: int, cells: dict[str, str], files: list[str] | Non
         raise InputError(f"{where}: expected begin before end; came {begin:g} and {end:g}")
     if files is not None and not any(_same(file, source) for source in files):
         raise InputError(f"{where}: {file!r} is none of the recordings{nearest(file, files)}")
-    noted = _noted(where, cells)
+    noted = _noted(where, cells, headings)
     return Interval(file, begin, end, material, row, noted.values, noted.labels)
 
 
-def _noted(where: str, cells: dict[str, str]) -> Noted:
+def _noted(where: str, cells: dict[str, str], headings: dict[str, Heading]) -> Noted:
     """What the columns of a row that have brackets say."""
     values, labels = [], []
-    for text, cell in cells.items():
-        if (heading := Heading.found(text)) is None or not cell.strip():
+    for text, heading in headings.items():
+        if not (cell := cells.get(text, "").strip()):
             continue
         if heading.unit is None:
-            labels.append((heading.name, cell.strip()))
+            labels.append((heading.name, cell))
             continue
         try:
             values.append((heading.name, heading.unit, float(cell)))

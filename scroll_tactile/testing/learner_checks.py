@@ -236,7 +236,7 @@ def _estimates_know_no_order(bench: _Bench) -> None:
     """values of touches give the same estimates in any order, and after opening again."""
     quantity = Quantity(name="number", unit="1", low=0.0, high=float(len(bench.touches)), resolution=1.0)
 
-    def told(learner: TactileLearner) -> str:
+    def estimated(learner: TactileLearner) -> str:
         learner.settle()
         return repr([learner.estimate(readings, risk=0.5) for _, readings in bench.touches[:3]])
 
@@ -246,9 +246,9 @@ def _estimates_know_no_order(bench: _Bench) -> None:
             learner.declare(quantity)
             for number, (material, readings) in order:
                 learner.observe(material, readings, values={"number": number})
-            answers.append(told(learner))
+            answers.append(estimated(learner))
         with bench.learner(name) as again:
-            answers.append(told(again))
+            answers.append(estimated(again))
     if len(set(answers)) > 1:
         raise LearnerError(f"estimates: expected the same; came {answers[0]:.200} and {answers[-1]:.200}")
 

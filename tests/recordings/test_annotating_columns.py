@@ -66,8 +66,8 @@ def test_the_command_line_learns_and_a_fleet_of_one_the_same(data, tmp_path):
     listed = [run("memory", "list", tmp_path / name, "--json").output.splitlines() for name in ("learn", "fleet")]
     ours, theirs = [[json.loads(line) for line in lines] for lines in listed]
     assert [row.get("labels") for row in ours] == [{"slip": "north"}, {"slip": "south"}, None]
-    told = [[(row.get("values"), row.get("labels")) for row in rows] for rows in (ours, theirs)]
-    assert told[0] == told[1] and round(told[0][1][0]["force"], 3) == round(float(WRENCH[10:20, 2].mean()), 3)
+    noted = [[(row.get("values"), row.get("labels")) for row in rows] for rows in (ours, theirs)]
+    assert noted[0] == noted[1] and round(noted[0][1][0]["force"], 3) == round(float(WRENCH[10:20, 2].mean()), 3)
     twice = refused("learn", tmp_path / "learn", data, *how, "--annotate", "force [N]")
     assert "each quantity and axis once in --annotate; came 'force' several times" in twice
 

@@ -235,8 +235,7 @@ class TactileLearner(MemoryKeeper):
         streams: one, as for `observe`, or several touches of one thing: what they say adds up, as far as touches of one
         material do not say the same anyway. Their order makes no difference, and one that comes twice counts once.
         of: an axis of labels, such as "slip", to answer by in place of materials: `Prediction.material` is a label
-        then, `known` and all else as for materials, from the touches that have a label on it. Its readouts are fitted
-        when it is first asked for.
+        then, `known` and all else as for materials, from the touches that have a label on it.
         scene: the materials, or labels, that can be here; None: all that were observed.
         tuned: let f* answer (see `fine_tune`), if one was kept, knows all candidates, and the touch is long enough for
         it; f answers otherwise. `Prediction.tuned` says which of them did: of several touches, whether f* did of all.

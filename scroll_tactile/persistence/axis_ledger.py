@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
+from store import Checkpoint
 
-__all__ = ["AxisLedger"]
+__all__ = ["AxisLedger", "of_axis"]
 
 
 class AxisLedger(Ledger):
@@ -31,6 +34,15 @@ class AxisLedger(Ledger):
             self._memory, self._seen = axis_memory(of, self._axis), self._of.version
         return self._memory
 
+    def derived(self, name: str) -> Checkpoint | None:
+        """As of the memory, under the name `of_axis` gives."""
+        return self._of.derived(of_axis(name, self._axis))
+
+    def saved_since(self, memory: Memory) -> bool:
+        """As of the memory, whose checkpoints have the axis."""
+        del memory
+        return self._of.saved_since(self._of.memory)
+
     def _follow(self, added: list[Added] | None) -> None:
         """Note what the memory changed by: of touches without a label that something did."""
         if added is None:
@@ -38,3 +50,8 @@ class AxisLedger(Ledger):
             return
         labelled = ((dict(touch.labels).get(self._axis), touch) for touch in added)
         self._changed([Added(label, touch.codes, touch.sign) for label, touch in labelled if label is not None])
+
+
+def of_axis(name: str, axis: str) -> str:
+    """The name of what is derived from an axis, where that of materials has a name: axes may have any characters."""
+    return f"{name}-{hashlib.sha256(axis.encode()).hexdigest()[:32]}"

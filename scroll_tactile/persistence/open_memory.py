@@ -6,7 +6,7 @@ import ctypes
 import logging
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -239,8 +239,8 @@ class OpenMemory:
         """Whether a checkpoint was written since the one that the memory was loaded from."""
         return self.store is not None and self.store.newest != memory.checkpoint
 
-    def close(self, name: str, derived: Callable[[], Derived | None]) -> None:
-        """As `TactileLearner.close`. derived: gives arrays to store under a name, with the newest checkpoint."""
+    def close(self, derived: Mapping[str, Callable[[], Derived | None]]) -> None:
+        """As `TactileLearner.close`. derived: by name, what gives the arrays to store with the newest checkpoint."""
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
@@ -253,7 +253,8 @@ class OpenMemory:
                     if self._memory.sequence > self._saved:
                         self._pass_over_failures(store)
                         self._write_checkpoint()
-                    self._keep(store, name, derived)
+                    for name, arrays in derived.items():
+                        self._keep(store, name, arrays)
             finally:
                 store.close()
                 give_back_scratch()

@@ -21,7 +21,7 @@ from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.persistence.axis_ledger import AxisLedger
+from scroll_tactile.persistence.axis_ledger import AxisLedger, of_axis
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
@@ -303,21 +303,24 @@ class Predictor:
                 predictor.current.prepare(predictor.ledger)
 
     def prepare_to_store(self) -> None:
-        """Make a model for `close` to store, unless there is one: each process that opens the memory reads it then.
+        """Make the models for `close` to store, unless there are some: each process that opens the memory reads them.
 
-        For a writer that learned many touches and predicted none. Where the fit fails, as without memory for it, the
+        For a writer that learned many touches and predicted none. Where a fit fails, as without memory for it, the
         touches are learned all the same, and a warning is logged.
         """
         try:
             self.frozen()
+            for axis in sorted(self.ledger.memory.targets.axes):
+                self.of_axis(axis).frozen()
         except ScrollTactileError as error:
-            logger.warning("the touches are learned, but no model is stored beside them: %s", error)
+            logger.warning("the touches are learned, but not all models are stored beside them: %s", error)
 
     def close(self) -> None:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
-            self.ledger.close(NAME, lambda: self.current.arrays_to_store(self.ledger))
-            for predictor in (self, *self._axes.values()):
+            models = {NAME: self, **{of_axis(NAME, axis): predictor for axis, predictor in self._axes.items()}}
+            self.ledger.close({name: partial(own.current.arrays_to_store, own.ledger) for name, own in models.items()})
+            for predictor in models.values():
                 predictor.current.close()
 
     def fitted(self) -> Model:

@@ -12,6 +12,7 @@ import store.derived
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError
 from scroll_tactile.memory.identity import FingerprintCheck
+from scroll_tactile.persistence.axis_ledger import of_axis
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.stored import MAPPED, NAME
 from scroll_tactile.statistics.sample import TouchSample
@@ -189,6 +190,40 @@ def test_a_damaged_file_is_not_used(made, path, fits):
         assert bits(learner) == made[1]  # and it closes
 
 
+def by_slip(learner):
+    return [learner.predict(stream("a", seed), of="slip") for seed in range(50, 53)]
+
+
+def test_the_model_of_an_axis_is_kept_beside_it_and_refused_where_it_is_wrong(tmp_path, fits):
+    path, name = tmp_path / "m", of_axis(NAME, "slip")
+    with opened(path, "write") as learner:
+        for i, (material, seed) in enumerate(OBSERVED):
+            learner.observe(material, stream(material, seed), labels={"slip": "ne"[i % 2]} if i % 5 else None)
+        learner._predictor.prepare_to_store()
+        told = bits(learner), by_slip(learner)
+    assert len(fits) == 2
+    for mode in ("read", "write"):
+        with opened(path, mode) as learner:
+            assert (bits(learner), by_slip(learner)) == told
+    assert len(fits) == 2
+    with opened(path, "write") as learner:
+        learner.observe("a", stream("a", 80))  # without a label: the axis has the same touches
+        followed = by_slip(learner)
+    with opened(path) as learner:
+        assert by_slip(learner) == followed
+        learner.settle()
+    assert len(fits) == 4
+    whole = (path / "derived" / name).read_bytes()
+    forge(path, of_array("moments", lambda array: np.full_like(array, np.nan)), name)
+    forged = (path / "derived" / name).read_bytes()
+    for data in (forged, whole[:5000] + bytes([whole[5000] ^ 1]) + whole[5001:]):
+        (path / "derived" / name).write_bytes(data)
+        fits.clear()
+        with opened(path) as learner:
+            assert len(by_slip(learner)) == 3
+        assert len(fits) == 1
+
+
 def test_a_link_is_not_followed(made, path, fits):
     shutil.move(kept(path), path.parent / "elsewhere")
     kept(path).symlink_to(path.parent / "elsewhere")
@@ -197,13 +232,13 @@ def test_a_link_is_not_followed(made, path, fits):
     assert fits
 
 
-def forge(path, change):
+def forge(path, change, name=NAME):
     """The same file with other arrays or attributes, under a digest that is right."""
     follows = read_current(path / "CURRENT").newest.sha256
-    about, arrays = read_derived(path, NAME, follows)
+    about, arrays = read_derived(path, name, follows)
     about, arrays = change(dict(about), dict(arrays))
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    write_derived(path, NAME, follows, store.records.to_json("attributes", about), arrays, [*filter(mapped, arrays)])
+    arrays = {own: np.ascontiguousarray(array) for own, array in arrays.items()}
+    write_derived(path, name, follows, store.records.to_json("attributes", about), arrays, [*filter(mapped, arrays)])
 
 
 def mapped(name):

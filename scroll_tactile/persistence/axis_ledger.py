@@ -10,7 +10,7 @@ from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
 from store import Checkpoint
 
-__all__ = ["AxisLedger", "of_axis"]
+__all__ = ["AxisLedger", "axis_name"]
 
 
 class AxisLedger(Ledger):
@@ -35,8 +35,8 @@ class AxisLedger(Ledger):
         return self._memory
 
     def derived(self, name: str) -> Checkpoint | None:
-        """As of the memory, under the name `of_axis` gives."""
-        return self._of.derived(of_axis(name, self._axis))
+        """As of the memory, under the name that `axis_name` gives."""
+        return self._of.derived(axis_name(name, self._axis))
 
     def saved_since(self, memory: Memory) -> bool:
         """As of the memory, whose checkpoints have the axis."""
@@ -52,6 +52,6 @@ class AxisLedger(Ledger):
         self._changed([Added(label, touch.codes, touch.sign) for label, touch in labelled if label is not None])
 
 
-def of_axis(name: str, axis: str) -> str:
+def axis_name(name: str, axis: str) -> str:
     """The name of what is derived from an axis, where that of materials has a name: axes may have any characters."""
     return f"{name}-{hashlib.sha256(axis.encode()).hexdigest()[:32]}"

@@ -21,7 +21,7 @@ from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.persistence.axis_ledger import AxisLedger, of_axis
+from scroll_tactile.persistence.axis_ledger import AxisLedger, axis_name
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
@@ -318,7 +318,7 @@ class Predictor:
     def close(self) -> None:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
-            models = {NAME: self, **{of_axis(NAME, axis): predictor for axis, predictor in self._axes.items()}}
+            models = {NAME: self, **{axis_name(NAME, axis): predictor for axis, predictor in self._axes.items()}}
             self.ledger.close({name: partial(own.current.arrays_to_store, own.ledger) for name, own in models.items()})
             for predictor in models.values():
                 predictor.current.close()

@@ -21,7 +21,7 @@ that most taxels stay quiet; "light" reads a contact of a tenth of the range on 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal, get_args
 
@@ -156,12 +156,14 @@ class Scene:
         seconds: float | None = None,
         speed: float | None = None,
         force: float | None = None,
+        heading: float = 0.0,
     ) -> Stream:
         """Slide over a material: a stream that depends on the arguments and the scene's seed alone.
 
         repetition: which touch of the material this is, 0 or more.
         seconds: its length; the sensor's duration where none is given.
         speed: in mm/s; force: in N. Where none is given they vary from touch to touch around 40 mm/s and 1 N.
+        heading: where to it slides over the pad, in degrees from the first axis of its layout to the second.
 
         Raises UnknownMaterialError, StreamTooShortError, and InputError for quantities that cannot be.
         """
@@ -175,11 +177,13 @@ class Scene:
         for name, value in (("seconds", seconds), ("speed", speed), ("force", force)):
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"expected {name} above 0 and finite; came {value}")
+        if not math.isfinite(heading):
+            raise InputError(f"expected a finite heading, in degrees; came {heading}")
         index = MATERIALS.index(material)
         random = np.random.default_rng([_TOUCH, self.seed, index, repetition])
         count = max(1, round(seconds * self.sensor.rate))  # validate refuses too few, as for any stream
         times = np.arange(count) / self.sensor.rate
-        pad = _pad(self.seed, self.sensor)
+        pad = _turned(_pad(self.seed, self.sensor), heading)
         width = _NARROW if self.response == "events" else _PAD / 2
         shares = _slide(_texture(self.seed, index), pad, times, random, speed, force, width)
         if self.response == "events":
@@ -213,6 +217,14 @@ def _pad(seed: int, sensor: Sensor) -> _Pad:
         rest=random.uniform(0.08, 0.2, sensor.channels),
         gain=random.uniform(0.7, 1.3, sensor.channels),
     )
+
+
+def _turned(pad: _Pad, heading: float) -> _Pad:
+    """The pad as it is met by a surface that passes it in another direction."""
+    if heading % 360 == 0:
+        return pad
+    cosine, sine = math.cos(math.radians(heading)), math.sin(math.radians(heading))
+    return replace(pad, along=cosine * pad.along + sine * pad.across, across=cosine * pad.across - sine * pad.along)
 
 
 def _places(sensor: Sensor) -> tuple[_Floats, _Floats]:

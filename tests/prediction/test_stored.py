@@ -12,7 +12,7 @@ import store.derived
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError
 from scroll_tactile.memory.identity import FingerprintCheck
-from scroll_tactile.persistence.axis_ledger import of_axis
+from scroll_tactile.persistence.axis_ledger import axis_name
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.stored import MAPPED, NAME
 from scroll_tactile.statistics.sample import TouchSample
@@ -195,7 +195,7 @@ def by_slip(learner):
 
 
 def test_the_model_of_an_axis_is_kept_beside_it_and_refused_where_it_is_wrong(tmp_path, fits):
-    path, name = tmp_path / "m", of_axis(NAME, "slip")
+    path, name = tmp_path / "m", axis_name(NAME, "slip")
     with opened(path, "write") as learner:
         for i, (material, seed) in enumerate(OBSERVED):
             learner.observe(material, stream(material, seed), labels={"slip": "ne"[i % 2]} if i % 5 else None)

@@ -55,15 +55,27 @@ def test_seconds_speed_and_force_do_what_they_say():
     assert changes[0] < 0.7 * changes[1]
 
 
-def test_channels_farther_along_feel_the_surface_earlier():
+@pytest.mark.parametrize("heading", [0.0, 180.0])
+def test_channels_farther_along_feel_the_surface_earlier(heading):
     line = Sensor(name="line", channels=3, rate=500, low=0, high=4095, unit="counts", duration=4, layout=(1, 3))
-    readings = Scene(sensor=line).touch("nylon", 0, speed=20.0).readings[500:].astype(float)
+    touch = Scene(sensor=line).touch("nylon", 0, speed=20.0, heading=heading)
+    readings = touch.readings[500:].astype(float)
     readings -= readings.mean(axis=0)
-    near, far = readings[:, 1], readings[:, 2]  # 14/3 mm apart: 0.233 s at 20 mm/s, 117 readings
+    near, far = readings[:, 1], readings[:, 0 if heading else 2]  # 14/3 mm apart: 0.233 s at 20 mm/s, 117 readings
     lags = np.arange(60, 180)
     matched = [np.corrcoef(far[:-lag], near[lag:])[0, 1] for lag in lags]
     assert max(matched) > 0.9
     assert abs(lags[int(np.argmax(matched))] - 117) < 8
+
+
+def test_channels_across_the_heading_feel_the_surface_at_once():
+    square = Sensor(name="square", channels=4, rate=500, low=0, high=4095, unit="counts", duration=4, layout=(2, 2))
+    for heading, together in ((0.0, (0, 2)), (90.0, (0, 1)), (270.0, (2, 3))):
+        touch = Scene(sensor=square).touch("nylon", 0, speed=20.0, heading=heading).readings[500:].astype(float)
+        alike = np.corrcoef(touch.T)
+        other = {0, 1, 2, 3} - {together[0], 3 - together[0]} - {together[1]}
+        assert alike[together] > 0.9 > max(alike[together[0], place] for place in other)
+    assert Scene(sensor=square).touch("nylon", 0, heading=360.0) == Scene(sensor=square).touch("nylon", 0)
 
 
 @pytest.mark.parametrize("sensor", [BIOTAC, ROBOSKIN])
@@ -96,6 +108,8 @@ def test_what_cannot_be_simulated_is_refused_with_the_reason():
         for value in (0.0, -1.0, np.inf, np.nan):
             with pytest.raises(InputError, match=f"expected {name} above 0 and finite; came {value}"):
                 SCENE.touch("bark", 0, **{name: value})
+    with pytest.raises(InputError, match="expected a finite heading, in degrees; came inf"):
+        SCENE.touch("bark", 0, heading=np.inf)
     with pytest.raises(StreamTooShortError, match="at least 2 readings"):
         SCENE.touch("bark", 0, seconds=0.001)
 

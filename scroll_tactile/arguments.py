@@ -57,6 +57,7 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "embedding": ("an embedding, such as Kernels()", _is_embedding),
     "augmentation": ("an Augmented", lambda value: isinstance(value, Augmented)),
     "unfamiliar": ("a probability from 0 to 1", _is_probability),
+    "bound": ("a probability between 0 and 1", _is_share),
     "risk": ("a share between 0 and 1", _is_share),
     "known": ("True, False, or None for what the prediction says", lambda value: isinstance(value, bool)),
     "progress": ("a function of (what is being done, steps done, steps in all)", callable),

@@ -11,10 +11,12 @@ from scroll_tactile.errors import InputError
 
 __all__ = [
     "Candidates",
+    "ChangeKind",
     "Compacted",
     "Composition",
     "Constituent",
     "Estimate",
+    "Health",
     "Merged",
     "Observation",
     "Prediction",
@@ -24,6 +26,33 @@ __all__ = [
 
 Unusual = Literal["shorter", "longer", "slower", "faster", "noisy", "zero moved", "channels dead"]
 """What may set a touch apart from those that were learned, whatever material it is of."""
+
+
+ChangeKind = Literal["", "gain", "offset", "dead", "noisier", "slower", "gains", "all gains", "all offsets", "material"]
+"""What a change of a sensor looks like; "gains": of several channels, "material": one material feels otherwise."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """Whether a sensor is still the one that learned.
+
+    since: the row of the journal from which on touches are other than before; None where nothing is wrong. channels:
+    that changed, from 0; empty where nothing is wrong, and where it is a material. kind: what it looks like; "" where
+    nothing is wrong. evidence: the bet against exchangeable touches, 1 at first; it reaches 1/bound with a probability
+    of at most `bound`, however long it goes on, where nothing changes. touches: how many rows it rests on, those at
+    rest too. alarmed: the row at which it reached 1/bound; later rows are not read. materials: that show the change.
+    grew: (row, logarithm of the evidence to base ten) for each row that could tell anything.
+    """
+
+    since: int | None
+    channels: tuple[int, ...]
+    kind: ChangeKind
+    evidence: float
+    bound: float
+    touches: int
+    alarmed: int | None
+    materials: tuple[str, ...]
+    grew: tuple[tuple[int, float], ...] = field(repr=False)
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Whether the sensor is still the one that learned: numbers of a touch's channels, and a bet against exchangeability."""
+"""Whether the sensor is still the one that learned: its channels in each touch, and a bet against exchangeability."""

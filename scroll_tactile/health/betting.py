@@ -11,18 +11,23 @@ and reaches 1/bound with a probability of at most the bound, ever (Ville).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.health.channel_numbers import KINDS, UNIT, Numbers
 
-__all__ = ["Bets", "Scatter", "tie_break"]
+__all__ = ["SCORES", "Bets", "Rows", "Scatter", "ranks", "resting_scores", "tie_break"]
 
 Floats = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int16]
 
-STAKES = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])[:, None]
+STAKES = np.array([-1.9, -0.95, 0.0, 0.95, 1.9])[:, None]  # below 2: a factor stays above 0
 JUMP = 0.01
-PRIOR = 0.02  # of a logarithm: the scatter that is assumed of a number before any touch, counted as one touch each
+PRIOR = 0.02  # of a logarithm: what a number scatters by, as far as a touch for each of them, before any came
+COARSE = 0.7  # of a logarithm, a factor of two: changes of a mixture are smaller
+SCORES = 5  # of a channel
 
 
 class Bets:
@@ -47,27 +52,76 @@ class Bets:
 
 
 class Scatter:
-    """The inverse of prior + Σ (x − mean of its cell)(x − mean)ᵀ, updated touch by touch (Sherman and Morrison 1950)."""
+    """The inverse of prior + Σ (x − mean of its cell)(x − mean)ᵀ, updated by each touch (Sherman, Morrison 1950)."""
 
     def __init__(self, channels: int) -> None:
         self.channels, size = channels, KINDS * channels + 1
         self.inverse: Floats = np.eye(size) / (size * PRIOR**2)
+        self.count = 0
 
-    def take(self, row: Numbers, cell: npt.NDArray[np.int16]) -> None:
+    def take(self, row: Numbers, cell: Rows) -> None:
         """Add a touch (size,) to a cell that has the rows (k, size)."""
         count = len(cell)
         if count:
+            self.count += 1
             away = (row - cell.mean(axis=0)) * (UNIT * np.sqrt(count / (count + 1)))
             moved = self.inverse @ away
             self.inverse -= np.outer(moved, moved / (1 + away @ moved))
 
-    def scores(self, rows: npt.NDArray[np.int16]) -> Floats:
-        """Of rows (k, size): how far each channel's gain, its offset and its noise stand out, (k, 3 n)."""
+    def without(self, away: Floats, among: Sequence[int]) -> Scatter:
+        """That of the other touches: away are some that were taken (k, size), beside so many of their cells."""
+        shares = np.array(among, np.float64)
+        taken = away * np.sqrt(shares / (shares + 1))[:, None]
+        other = Scatter(self.channels)
+        other.count = self.count - len(away)
+        # I − A P Aᵀ is positive but for rounding (Woodbury).
+        inside = np.eye(len(away)) - taken @ self.inverse @ taken.T
+        moved = self.inverse @ taken.T
+        other.inverse = self.inverse + moved @ np.linalg.solve(inside, moved.T)
+        return other
+
+    def signatures(self) -> Floats:
+        """How a gain, an offset and noise of each channel move the numbers, (size, 3 n).
+
+        A louder channel raises the mean over channels, too, from which the levels are counted.
+        """
+        n, one = self.channels, np.eye(self.channels)
+        level = np.zeros((KINDS * n + 1, n))
+        level[:n], level[-1] = one - 1 / n, 1 / n
+        gain, noise = level.copy(), np.zeros_like(level)
+        gain[n : 2 * n] = gain[2 * n : 3 * n] = noise[2 * n : 3 * n] = one
+        return np.concatenate([gain, level, noise], axis=1)
+
+    def scores(self, rows: Rows) -> Floats:
+        """Of rows (k, size) the scores of each channel, (k, 5 n): gain, offset and noise told from what else moves;
+        then, coarsely and by themselves, the level and how lively the channel is beside the others. A great change
+        widens the scatter and hides in it, and shows there.
+        """
         n = self.channels
         level, spread, noise = (self.inverse[:, at : at + n] for at in (0, n, 2 * n))
-        return np.asarray((rows * UNIT) @ np.concatenate([level + spread + noise, level, noise], axis=1))
+        offset = level - level.mean(axis=1, keepdims=True) + self.inverse[:, -1:] / n
+        fine = (rows * UNIT) @ np.concatenate([offset + spread + noise, offset, noise], axis=1)
+        lively = rows[:, n : 2 * n].astype(np.float64) + rows[:, 2 * n : 3 * n]
+        lively -= np.rint(np.median(lively, axis=1, keepdims=True))
+        return np.concatenate([fine, np.rint(rows[:, :n] * (UNIT / COARSE)), np.rint(lively * (UNIT / COARSE))], axis=1)
+
+
+def resting_scores(rows: Rows, channels: int) -> Floats:
+    """Of a resting sensor's rows (k, size): the level of each channel by itself, and its noise, (k, 2 n)."""
+    n = channels
+    return np.concatenate([rows[:, :n] + rows[:, -1:].astype(np.int32), rows[:, 2 * n : 3 * n]], axis=1).astype(float)
+
+
+def ranks(scores: Floats, random: float) -> Floats:
+    """The smoothed p-value of the last of scores (k, count) among all, (count,); random in [0, 1) breaks ties."""
+    last = scores[-1]
+    below, same = (scores < last).sum(axis=0), (scores == last).sum(axis=0)
+    return np.asarray((below + random * same) / len(scores))
 
 
 def tie_break(sequence: int) -> float:
-    """A number in [0, 1) that ties are broken by: the golden ratio's multiples, of a row's place in the journal."""
-    return (sequence * 0.6180339887498949) % 1.0
+    """A number in [0, 1) for a row of the journal, by which ties are broken: SplitMix64 of its place (Steele 2014)."""
+    mixed = (sequence * 0x9E3779B97F4A7C15) % 2**64
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> shift)) * factor % 2**64
+    return float((mixed ^ (mixed >> 31)) >> 11) * 2.0**-53

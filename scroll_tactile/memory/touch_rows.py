@@ -16,6 +16,7 @@ from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Ann
 from store import Head
 
 __all__ = [
+    "CHANNELS",
     "DECLARE",
     "DESCRIBE",
     "KINDS",
@@ -25,6 +26,7 @@ __all__ = [
     "MOST_BYTES",
     "OBSERVE",
     "RETRACT",
+    "SENSE",
     "SOURCE",
     "VALUES",
     "Added",
@@ -57,9 +59,11 @@ MERGE = "merge"  # a compacted memory came in as a whole; the arrays are those o
 MEMBER = "member"  # a stream that such a memory had observed: its name and hash alone
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
 DECLARE = "declare"  # a quantity that touches can carry: its unit, low, high and resolution; the label is its name
+SENSE = "sense"  # a touch of the material that is its label, or without one the sensor at rest: read, and not learned
 SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
 VALUES, LABELS = "values", "labels"  # of an observation or a member: quantity → steps, and axis → label, if any
-KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE]
+CHANNELS = "channels"  # of an observation or a sense: numbers of the channels, see `health.channel_numbers`
+KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE, SENSE]
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = dict[Scale, npt.NDArray[np.int32]]

@@ -7,21 +7,26 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.errors import InputError
+from scroll_tactile.health.watch import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
-from scroll_tactile.persistence.observations import observations
+from scroll_tactile.persistence.observations import health_of, observations
 from scroll_tactile.persistence.packing import pack_memory
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.results import Compacted, Merged, Observation, Receipt
+from scroll_tactile.results import Compacted, Health, Merged, Observation, Receipt
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name, require_source, require_text
+from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["MemoryKeeper"]
 
@@ -33,6 +38,11 @@ class MemoryKeeper(ABC):
     @abstractmethod
     def _ledger(self) -> Ledger:
         """The memory with its journal."""
+
+    @property
+    @abstractmethod
+    def sensor(self) -> Sensor:
+        """The sensor whose streams it reads."""
 
     @property
     def path(self) -> Path | None:
@@ -99,6 +109,42 @@ class MemoryKeeper(ABC):
         than 64 (nothing was changed); StoreError.
         """
         self._ledger.declare(quantity)
+
+    def sense(self, stream: Stream | npt.ArrayLike, material: str | None = None) -> None:
+        """Note how a touch of a known material reads, or the sensor at rest, for `health`; nothing is learned of it.
+
+        stream: as for `observe`, of a sensor with channels, three readings or more. material: such as that of a
+        prediction that is known; None: the sensor at rest, which alone shows a gain or an offset of all its channels.
+        Durable when this returns; some hundred bytes. Such a row stays behind where a memory is merged or packed.
+
+        Raises StreamError, MaterialError; InputError in a memory without a path, for a camera, and for more than 256
+        channels; StoreError.
+        """
+        name = "" if material is None else require_name(material)
+        self._ledger.sense(name, validate(stream, self.sensor))
+
+    def health(
+        self, *, bound: float = 0.01, after: int = 0, until: int | None = None, source: str | None = None
+    ) -> Health:
+        """Whether the sensor is still the one that learned, since which touch not, and in which channels.
+
+        bound: of the probability of a false alarm, over all time, where touches of each material are exchangeable.
+        after: the last row of the journal that does not count, such as that at which the sensor was changed. until: the
+        last that counts; None: all. source: only observations from there, such as one robot's; as for `forget`.
+
+        It is read from the observations in the order of the journal, and from what `sense` noted, as numbers of each
+        channel; touches are compared with earlier ones of the same material, of a similar length and level, so that no
+        mixture of materials, lengths and forces is a change. See `health.betting`. The digest knows nothing of it.
+
+        Raises InputError for values that cannot be, and in a memory without a path; StoreError.
+        """
+        require_arguments({"bound": bound})
+        rules = WatchRules(float(bound), _row("after", after), None if until is None else _row("until", until), source)
+        ledger = self._ledger
+        with ledger.lock:
+            store, memory = ledger.require_store("tell how its sensor is"), ledger.memory
+            ledger.watched = health_of(store, memory, self.sensor.channels, rules, ledger.watched)
+            return ledger.watched.told()
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -250,3 +296,9 @@ class MemoryKeeper(ABC):
         """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
         tuned = self.memory.tuned
         return None if tuned is None else tuned.digest()
+
+
+def _row(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise InputError(f"expected {name} as a row of the journal, a whole number of 0 or more; came {value!r}")
+    return value

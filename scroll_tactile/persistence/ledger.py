@@ -8,14 +8,17 @@ from contextlib import contextmanager
 from typing import Any
 
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
+from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.memory.descriptions import Description, describe, require_units
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    CHANNELS,
     DECLARE,
     DESCRIBE,
     OBSERVE,
     RETRACT,
+    SENSE,
     SOURCE,
     Added,
     Codes,
@@ -130,6 +133,8 @@ class Ledger(OpenMemory):
             return sequence
         attributes: dict[str, Any] = {"columns": columns} | annotated(annotation)
         attributes |= ({"nbytes": stream.readings.nbytes} if kept else {}) | ({SOURCE: source} if source else {})
+        if (numbers := channel_numbers(stream)) is not None:
+            attributes[CHANNELS] = to_text(numbers)
         arrays = packed if self._bare else packed | pack_codes(codes)
         head = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays)
         replay(memory, Record(**vars(head), arrays=arrays), self.store, codes)
@@ -173,6 +178,21 @@ class Ledger(OpenMemory):
                     head = self.store.append(DECLARE, quantity.name, b"", attributes=declaration(quantity))
                     memory.sequence = head.sequence
                 memory.quantities[quantity.name] = quantity
+            self._checkpoint_if_due()
+
+    def sense(self, material: str, stream: Stream) -> None:
+        """As `TactileLearner.sense`; material "" for the sensor at rest."""
+        numbers = channel_numbers(stream)
+        if numbers is None:
+            raise InputError(
+                f"the health of a sensor is told from its channels, 1 to {MOST_CHANNELS}, and three readings or more; "
+                f"came {len(stream)} readings of {stream.sensor.name!r}"
+            )
+        with self.lock:
+            store, memory = self.require_store("tell how its sensor is"), self.memory
+            with self._mutation(_nothing):
+                attributes: dict[str, Any] = {"columns": len(stream), CHANNELS: to_text(numbers)}
+                memory.sequence = store.append(SENSE, material, b"", attributes=attributes).sequence
             self._checkpoint_if_due()
 
     def retract(self, receipt: Receipt | int) -> None:

@@ -13,10 +13,12 @@ from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    CHANNELS,
     DECLARE,
     DESCRIBE,
     MERGE,
     OBSERVE,
+    SENSE,
     SOURCE,
     active_rows,
     annotation_of,
@@ -73,7 +75,7 @@ def pack_memory(
 
 def _append(into: Store, store: Store, head: Head, source: str | None, *, arrays: bool, readings: bool) -> Head:
     """Append a touch to a packed memory and return its row there. Raises StoreError."""
-    attributes = {key: value for key, value in head.attributes.items() if readings or key != "nbytes"}
+    attributes = {key: value for key, value in head.attributes.items() if readings or key not in ("nbytes", CHANNELS)}
     attributes |= {} if source is None or SOURCE in attributes else {SOURCE: source}
     own = store.record(head.sequence).arrays if arrays else None
     return into.append(head.kind, head.label, head.key, attributes=attributes, arrays=own, time=head.time)
@@ -98,7 +100,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]
     counts = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
-    if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE)):
+    if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE, SENSE)):
         return None
     if observed.ndim != 1 or counts != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)

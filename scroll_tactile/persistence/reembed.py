@@ -24,6 +24,7 @@ from scroll_tactile.memory.touch_rows import (
     DESCRIBE,
     OBSERVE,
     RETRACT,
+    SENSE,
     Codes,
     Readings,
     pack_codes,
@@ -142,7 +143,7 @@ class Reembedding:
 
 def _require_readings(store: Store) -> None:
     heads = list(store.heads())
-    brought = [head.sequence for head in heads if head.kind not in (OBSERVE, RETRACT, DESCRIBE, DECLARE)]
+    brought = [head.sequence for head in heads if head.kind not in (OBSERVE, RETRACT, DESCRIBE, DECLARE, SENSE)]
     bare = [head.sequence for head in heads if head.kind == OBSERVE and "nbytes" not in head.attributes]
     if store.compacted:
         what = f"rows 1 to {store.compacted} were compacted, and their readings given up"

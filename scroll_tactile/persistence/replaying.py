@@ -18,6 +18,7 @@ from scroll_tactile.memory.touch_rows import (
     MERGE,
     OBSERVE,
     RETRACT,
+    SENSE,
     Added,
     Codes,
     active_rows,
@@ -113,7 +114,7 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         _join(memory, record, store)
         changed = None
     else:
-        assert record.kind in (MEMBER, DESCRIBE, DECLARE), "the gate lets no other row through"
+        assert record.kind in (MEMBER, DESCRIBE, DECLARE, SENSE), "the gate lets no other row through"
     apply_description(memory.descriptions, record)
     memory.sequence = record.sequence
     return changed

@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import DescriptionError, InputError, MismatchError
+from scroll_tactile.health.channel_numbers import from_text
 from scroll_tactile.memory.descriptions import checked
 from scroll_tactile.memory.touch_rows import (
+    CHANNELS,
     CODES,
     DECLARE,
     DESCRIBE,
@@ -28,6 +30,7 @@ from scroll_tactile.memory.touch_rows import (
     PACKED_WHOLE,
     PACKED_ZERO,
     RETRACT,
+    SENSE,
     SOURCE,
     VALUES,
     Arrays,
@@ -189,12 +192,20 @@ class RowChecks:
             if SOURCE in head.attributes:
                 source(SOURCE, head.attributes[SOURCE])
             check_annotation("", head.attributes)
+        if CHANNELS in head.attributes:
+            given = head.attributes[CHANNELS]
+            expect(from_text(given, self._sensor.channels) is not None, CHANNELS, "numbers of the channels", given)
         if head.kind == OBSERVE:
             self._check_observation(head.attributes)
         elif head.kind == RETRACT:
             if head.label:
                 name("label", head.label)
             _check_spans(head.attributes.get("sequences"), head.sequence, most_rows())
+        elif head.kind == SENSE:
+            if head.label:
+                name("label", head.label)
+            whole("columns", head.attributes.get("columns"), 1, LONGEST_TOUCH)
+            expect(CHANNELS in head.attributes, CHANNELS, "numbers of the channels", None)
         elif head.kind == DECLARE:
             check_quantity("quantity", head.label, head.attributes)
         elif head.kind == DESCRIBE:

@@ -1,0 +1,204 @@
+"""Health: whether the sensor is still the one that learned, which channels changed, and nothing else that alarms."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scroll_tactile import Health, Scene, Sensor, TactileLearner, errors
+from scroll_tactile.health.channel_numbers import channel_numbers, from_text, to_text
+from scroll_tactile.health.watch import Watch
+from scroll_tactile.signals.stream import Stream, validate
+
+PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
+SCENE = Scene(sensor=PAD, seed=3)
+NAMES = SCENE.materials[:5]
+CHANNEL = 3
+
+Change = Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]
+
+
+def touch(name: str, repetition: int, change: Change | None = None, **how: float) -> Stream:
+    stream = SCENE.touch(name, repetition, **how)
+    if change is None:
+        return stream
+    return validate(np.clip(change(stream.readings.astype(np.float64)), 0, 1000).astype(np.float32), PAD)
+
+
+def on_channel(what: Change) -> Change:
+    def change(readings: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        readings[:, CHANNEL] = what(readings[:, CHANNEL])
+        return readings
+
+    return change
+
+
+def noisier(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return values + np.random.default_rng(0).normal(0, 12, values.shape)
+
+
+def watched(touches: Iterable[tuple[str, Stream]], bound: float = 0.01) -> Watch:
+    watch = Watch(PAD.channels, bound)
+    for sequence, (name, stream) in enumerate(touches, 1):
+        numbers = channel_numbers(stream)
+        assert numbers is not None
+        watch.take(sequence, name, len(stream), numbers)
+    return watch
+
+
+def sound(rounds: int, first: int = 0) -> list[tuple[str, Stream]]:
+    return [(name, touch(name, i)) for i in range(first, first + rounds) for name in NAMES]
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("gain", lambda values: 0.95 * values),
+        ("offset", lambda values: values + 20),
+        ("dead", lambda values: 0 * values),
+        ("noisier", noisier),
+    ],
+)
+def test_a_changed_channel_is_named(kind: str, change: Change) -> None:
+    changed = [(name, touch(name, i, on_channel(change))) for i in range(30, 50) for name in NAMES]
+    watch = watched([*sound(30), *changed])
+    assert watch.change is not None
+    assert (watch.change.kind, watch.change.channels) == (kind, (CHANNEL,))
+    assert watch.alarmed is not None
+    assert 150 < watch.alarmed <= 150 + 60
+    assert abs(watch.change.since - 150) <= 20
+
+
+@pytest.mark.parametrize(
+    "touches",
+    [
+        sound(30, 30),
+        [(NAMES[0], touch(NAMES[0], i)) for i in range(30, 130)],
+        [(name, touch(name, i)) for name in SCENE.materials[5:10] for i in range(20)],
+        [(name, touch(name, i, seconds=0.5)) for i in range(30, 50) for name in NAMES],
+        [(name, touch(name, i, force=2.0)) for i in range(30, 50) for name in NAMES],
+        [(name, touch(name, i, speed=80.0)) for i in range(30, 50) for name in NAMES],
+    ],
+    ids=["the same", "one material", "new materials", "half as long", "firmer", "faster"],
+)
+def test_no_mixture_of_touches_is_a_change(touches: list[tuple[str, Stream]]) -> None:
+    # Speeds and forces are known from before; only their mixture is new.
+    hows: list[dict[str, float]] = [{"force": 2.0}, {"speed": 80.0}]
+    known = [(name, touch(name, 200 + i, **how)) for name in NAMES for i in range(6) for how in hows]
+    learned = [*sound(20), *known, *sound(10, 20)]
+    assert watched([*learned, *touches]).alarmed is None
+
+
+def test_one_material_that_changed_is_no_sensor() -> None:
+    worn = on_channel(lambda values: 0.9 * values)
+    changed = [(NAMES[1], touch(NAMES[1], i, worn)) for i in range(30, 90)]
+    mixed = [each for i, own in enumerate(changed) for each in ([own, *sound(1, 30 + i)[2:3]] if i % 3 == 0 else [own])]
+    change = watched([*sound(30), *mixed]).change
+    assert change is not None
+    assert (change.kind, change.channels, change.materials) == ("material", (), (NAMES[1],))
+
+
+def test_all_zeros_are_told_at_rest() -> None:
+    random = np.random.default_rng(1)
+    levels = np.linspace(80, 200, 8)
+
+    def rest(shift: float, gain: float = 1.0) -> Stream:
+        level = levels * gain + shift + random.normal(0, 2, 8)
+        return validate((level + random.normal(0, 6, (25, 8))).astype(np.float32), PAD)
+
+    for kind, how in (("all offsets", (20.0, 1.0)), ("all gains", (0.0, 0.9))):
+        watch = watched([*(("", rest(0.0)) for _ in range(100)), *(("", rest(*how)) for _ in range(60))])
+        assert watch.alarmed is not None
+        assert watch.change is not None
+        assert (watch.change.kind, watch.change.since) == (kind, pytest.approx(101, abs=12))
+
+
+def test_a_sensor_dead_from_the_first_day_and_few_touches_are_sound() -> None:
+    dead = on_channel(lambda values: 0 * values)
+    assert watched((name, touch(name, i, dead)) for i in range(40) for name in NAMES).alarmed is None
+    assert watched(sound(1)).evidence == 0.0
+    assert watched([]).change is None
+
+
+def test_numbers_are_read_back_and_none_of_another_sensor() -> None:
+    numbers = channel_numbers(touch(NAMES[0], 0))
+    assert numbers is not None
+    found = from_text(to_text(numbers), 8)
+    assert found is not None
+    assert found.tobytes() == numbers.tobytes()
+    assert from_text(to_text(numbers), 9) is from_text("=", 8) is from_text(None, 8) is None
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """25 rounds of touches of a sound sensor, then 12 with a weaker channel."""
+    path = tmp_path_factory.mktemp("health") / "memory"
+    weaker = on_channel(lambda values: 0.9 * values)
+    with TactileLearner.open(path, sensor=PAD) as learner, learner.batch():
+        for i in range(37):
+            for name in NAMES:
+                learner.observe(name, touch(name, i, weaker if i >= 25 else None), source="a" if i < 25 else "b")
+    return path
+
+
+def test_health_is_a_function_of_the_journal(memory: Path) -> None:
+    with TactileLearner.open(memory, mode="read") as learner:
+        digest, found = learner.digest(), learner.health()
+        assert (found.kind, found.channels) == ("gain", (CHANNEL,))
+        assert found.alarmed is not None
+        part = learner.health(until=140)
+        assert part.since is None
+        assert learner.health() == found  # after another stretch, from the beginning
+        assert learner.health(until=140) == part
+        assert learner.health(after=125).since is None  # the new sensor alone
+        assert learner.health(source="b").since is None  # two streams: each is sound
+        assert learner.digest() == digest
+    with TactileLearner.open(memory, mode="read") as again:
+        again.health(until=100)
+        assert again.health() == found  # the same evidence, to the bit, after a restart
+
+
+def test_what_is_learned_later_or_retracted_counts(memory: Path, tmp_path: Path) -> None:
+    with TactileLearner.open(memory, mode="read") as learner:
+        learner.backup(tmp_path / "memory")
+        before = learner.health(until=125)
+    with TactileLearner.open(tmp_path / "memory") as learner:
+        assert learner.health().since is not None
+        learner.forget(source="b")
+        assert learner.health() == before
+        learner.compact()
+        assert learner.health() == before  # the numbers stay where readings were given up
+        learner.sense(touch(NAMES[0], 99), NAMES[0])
+        learner.sense(touch(NAMES[0], 99))
+        assert learner.health().touches == before.touches + 2
+        found = learner.health()
+    with TactileLearner.open(tmp_path / "memory", mode="read") as learner:
+        assert learner.health() == found
+
+
+def test_another_robots_touches_are_a_stream_of_their_own(memory: Path, tmp_path: Path) -> None:
+    other = on_channel(lambda values: 1.1 * values)
+    with TactileLearner.open(tmp_path / "other", sensor=PAD) as robot, robot.batch():
+        for name, i in [(name, i) for i in range(100, 115) for name in NAMES]:
+            robot.observe(name, touch(name, i, other), source="other/touches.npy")
+    with TactileLearner.open(memory, mode="read") as learner:
+        learner.backup(tmp_path / "memory")
+    with TactileLearner.open(tmp_path / "memory") as learner:
+        learner.forget(source="b")
+        learner.merge(tmp_path / "other", shared="once")
+        assert learner.health().since is not None  # not the sensor that learned
+        assert learner.health(source="other").since is learner.health(source="a").since is None
+
+
+def test_what_cannot_be_told_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(errors.InputError, match="without a path"):
+        TactileLearner(sensor=PAD).health()
+    with TactileLearner.open(tmp_path / "memory", sensor=PAD) as learner:
+        assert learner.health() == Health(None, (), "", 1.0, 0.01, 0, None, (), ())
+        for wrong in ({"bound": 0}, {"bound": "1"}, {"after": -1}, {"until": True}):
+            with pytest.raises(errors.InputError):
+                learner.health(**wrong)
+        with pytest.raises(errors.InputError, match="three readings"):
+            learner.sense(touch(NAMES[0], 0).readings[:2])

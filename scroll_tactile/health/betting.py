@@ -11,8 +11,6 @@ and reaches 1/bound with a probability of at most the bound, ever (Ville).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import numpy.typing as npt
 
@@ -68,10 +66,9 @@ class Scatter:
             moved = self.inverse @ away
             self.inverse -= np.outer(moved, moved / (1 + away @ moved))
 
-    def without(self, away: Floats, among: Sequence[int]) -> Scatter:
+    def without(self, away: Floats, among: npt.NDArray[np.int64]) -> Scatter:
         """That of the other touches: away are some that were taken (k, size), beside so many of their cells."""
-        shares = np.array(among, np.float64)
-        taken = away * np.sqrt(shares / (shares + 1))[:, None]
+        taken = away * np.sqrt(among / (among + 1))[:, None]
         other = Scatter(self.channels)
         other.count = self.count - len(away)
         # I − A P Aᵀ is positive but for rounding (Woodbury).

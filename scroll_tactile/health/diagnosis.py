@@ -51,26 +51,28 @@ def diagnose(recent: Sequence[Deviation], behind: Sequence[bool], scatter: Scatt
     of the greatest score, top, had begun to grow. P is of the touches before them.
     """
     n, own = scatter.channels, np.array(behind)
-    away = np.array([each.away for each in recent])
-    before = scatter.without(away[own], [each.among for each, mine in zip(recent, behind, strict=True) if mine])
+    away, among = np.array([each.away for each in recent]), np.array([each.among for each in recent])
+    sizes, found = np.zeros(len(away)), list[tuple[int, int, float]]()
+    for _ in range(2):  # as the martingale grew, then from where that change most likely began
+        before = scatter.without(away[own], among[own])
+        found = _explained(away[own], before, bound) or [(top % n, min(top // n, KINDS - 1), 0.0)]
+        signature = before.signatures()[:, found[0][1] * n + found[0][0]]
+        weighted = before.inverse @ signature
+        sizes = away @ weighted / float(signature @ weighted)
+        own = _began(sizes, own)
     dead = _dead(away[own], n)
-    found = _explained(away[own], before, bound) or [(top % n, min(top // n, KINDS - 1), 0.0)]
-    signature = before.signatures()[:, found[0][1] * n + found[0][0]]
-    weighted = before.inverse @ signature
-    sizes = away @ weighted / float(signature @ weighted)
-    since = _began(sizes, own)
-    names = [each.material for each in recent[since:]]
-    row, all_names = recent[since].row, tuple(sorted(set(names)))
+    names = [each.material for each, mine in zip(recent, own, strict=True) if mine]
+    row, all_names = recent[int(own.argmax())].row, tuple(sorted(set(names)))
     if 0 < len(dead) < MANY * n:
         return Change(row, dead, "dead", all_names)
-    if (alone := _alone(names, sizes[since:], found[0][2])) is not None:
+    if (alone := _alone(names, sizes[own], found[0][2])) is not None:
         return Change(row, (), "material", (alone,))
-    channels, kind = tuple(sorted({channel for channel, _, _ in found})), _kind(found, n)
-    return Change(row, channels, kind, all_names)
+    channels = tuple(sorted({channel for channel, _, _ in found}))
+    return Change(row, channels, _kind(found, n), all_names)
 
 
 def _kind(found: Sequence[tuple[int, int, float]], n: int) -> ChangeKind:
-    channel, kind, size = found[0]
+    _, kind, size = found[0]
     if len(found) > MANY * n:
         alike = len({size > 0 for _, _, size in found}) == 1
         return "all gains" if alike else "gains"
@@ -109,11 +111,11 @@ def _explained(away: Floats, scatter: Scatter, bound: float) -> list[tuple[int, 
     return found
 
 
-def _began(sizes: Floats, behind: npt.NDArray[np.bool_]) -> int:
-    """The place where sizes change from 0 to their median behind: the most likely one, for normal sizes."""
+def _began(sizes: Floats, behind: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Which rows lie behind the place where sizes change from 0 to their median behind: the most likely, if normal."""
     size = float(np.median(sizes[behind]))
     grown = np.cumsum((size * (sizes - size / 2))[::-1])[::-1]
-    return int(grown.argmax())
+    return np.asarray(np.arange(len(sizes)) >= grown.argmax())
 
 
 def _alone(names: Sequence[str], sizes: Floats, size: float) -> str | None:
@@ -129,8 +131,8 @@ def diagnose_rest(recent: Sequence[Deviation], behind: Sequence[bool], rows: Row
     n, own = channels, np.array(behind)
     away = np.array([each.away for each in recent])
     levels = away[:, :n] + away[:, -1:]
-    moved = np.median(levels[own], axis=0)
-    row = recent[_began(levels @ np.sign(moved), own)].row
+    own = _began(levels @ np.sign(np.median(levels[own], axis=0)), own)
+    row, moved = recent[int(own.argmax())].row, np.median(levels[own], axis=0)
     before = np.exp(np.median(rows[:, :n] + rows[:, -1:].astype(np.int32), axis=0) * UNIT)
     shift = before * np.expm1(moved)
     far = np.abs(shift) > np.abs(shift).max() / 4

@@ -77,7 +77,7 @@ def test_a_changed_channel_is_named(kind: str, change: Change) -> None:
         sound(30, 30),
         [(NAMES[0], touch(NAMES[0], i)) for i in range(30, 130)],
         [(name, touch(name, i)) for name in SCENE.materials[5:10] for i in range(20)],
-        [(name, touch(name, i, seconds=0.5)) for i in range(30, 50) for name in NAMES],
+        [(name, touch(name, i, seconds=0.5)) for i in range(60, 80) for name in NAMES],
         [(name, touch(name, i, force=2.0)) for i in range(30, 50) for name in NAMES],
         [(name, touch(name, i, speed=80.0)) for i in range(30, 50) for name in NAMES],
     ],

@@ -11,6 +11,7 @@ from examples.benchmarks.appending import log
 from examples.benchmarks.buffers import buffers
 from examples.benchmarks.chips.comparison import chips
 from examples.benchmarks.fleet import fleet
+from examples.benchmarks.health import health
 from examples.benchmarks.interleaved import interleaved
 from examples.benchmarks.live_decision import decisions
 from examples.benchmarks.live_shift import live
@@ -30,7 +31,7 @@ app = typer.Typer(
 )
 BENCHMARKS: tuple[Callable[..., None], ...] = (
     *(speed, live, decisions, ros2, vision),
-    *(buffers, interleaved, log, fleet, chips),
+    *(buffers, interleaved, log, fleet, chips, health),
 )
 for benchmark in BENCHMARKS:
     app.command()(benchmark)

@@ -197,7 +197,7 @@ def summed(name: str, case: str, orders: list[Record]) -> Record:
 
 def run_health(data: Path | None, *, orders: int, seed: int, cache: Path | None, note: Callable[[str], None]) -> Record:
     """A record for each set and case. cache: a file of what was measured already, one line an order."""
-    done: dict[tuple[str, ...], Record] = {}
+    done: dict[tuple[Any, ...], Record] = {}
     if cache is not None and cache.is_file():
         done = {tuple(key): value for key, value in map(text.loads, cache.read_text("utf-8").splitlines())}
     records = []

@@ -14,7 +14,7 @@ from scroll_tactile.health.betting import Floats, Rows, Scatter
 from scroll_tactile.health.channel_numbers import FLOOR, KINDS, UNIT
 from scroll_tactile.results import ChangeKind
 
-__all__ = ["Change", "Deviation", "diagnose", "diagnose_rest"]
+__all__ = ["SensorChange", "Deviation", "diagnose", "diagnose_rest"]
 
 DEAD = -1.5  # of a logarithm: spread and noise of a channel that fell by so much say nothing any more
 FEWEST = 3  # touches of each of two materials, from which one alone can be said to have changed
@@ -23,7 +23,7 @@ MANY = 0.5  # of the channels
 
 
 @dataclass(frozen=True)
-class Change:
+class SensorChange:
     """since: the first row that belongs to it. channels, kind: as in `Health`. materials: that show it."""
 
     since: int
@@ -43,7 +43,9 @@ class Deviation(NamedTuple):
     among: int
 
 
-def diagnose(recent: Sequence[Deviation], behind: Sequence[bool], scatter: Scatter, top: int, bound: float) -> Change:
+def diagnose(
+    recent: Sequence[Deviation], behind: Sequence[bool], scatter: Scatter, top: int, bound: float
+) -> SensorChange:
     """The change that the last touches show: the signatures that explain their mean.
 
     One signature after another is taken that explains most of what is left of δᵀ P δ, as long as chance would not
@@ -64,11 +66,11 @@ def diagnose(recent: Sequence[Deviation], behind: Sequence[bool], scatter: Scatt
     names = [each.material for each, mine in zip(recent, own, strict=True) if mine]
     row, all_names = recent[int(own.argmax())].row, tuple(sorted(set(names)))
     if 0 < len(dead) < MANY * n:
-        return Change(row, dead, "dead", all_names)
+        return SensorChange(row, dead, "dead", all_names)
     if (alone := _alone(names, sizes[own], found[0][2])) is not None:
-        return Change(row, (), "material", (alone,))
+        return SensorChange(row, (), "material", (alone,))
     channels = tuple(sorted({channel for channel, _, _ in found}))
-    return Change(row, channels, _kind(found, n), all_names)
+    return SensorChange(row, channels, _kind(found, n), all_names)
 
 
 def _kind(found: Sequence[tuple[int, int, float]], n: int) -> ChangeKind:
@@ -126,7 +128,7 @@ def _alone(names: Sequence[str], sizes: Floats, size: float) -> str | None:
     return showing[0] if len(showing) == 1 and others >= FEWEST and len(own[showing[0]]) >= FEWEST else None
 
 
-def diagnose_rest(recent: Sequence[Deviation], behind: Sequence[bool], rows: Rows, channels: int) -> Change:
+def diagnose_rest(recent: Sequence[Deviation], behind: Sequence[bool], rows: Rows, channels: int) -> SensorChange:
     """From readings at rest: whether levels moved by what they were (a gain) or all by the same (an offset)."""
     n, own = channels, np.array(behind)
     away = np.array([each.away for each in recent])
@@ -139,9 +141,9 @@ def diagnose_rest(recent: Sequence[Deviation], behind: Sequence[bool], rows: Row
     which = tuple(np.flatnonzero(far).tolist())
     if len(which) <= MANY * n:
         if np.abs(shift).max() > FLOOR:
-            return Change(row, which, "offset", ())
+            return SensorChange(row, which, "offset", ())
         noise = np.abs(np.median(away[own, 2 * n : 3 * n], axis=0))
-        return Change(row, (int(noise.argmax()),), "noisier", ())
+        return SensorChange(row, (int(noise.argmax()),), "noisier", ())
     gain = float(shift @ before / (before @ before))
     better = np.square(shift - gain * before).sum() < np.square(shift - shift.mean()).sum()
-    return Change(row, which, "all gains" if better else "all offsets", ())
+    return SensorChange(row, which, "all gains" if better else "all offsets", ())

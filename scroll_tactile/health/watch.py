@@ -10,7 +10,7 @@ import numpy as np
 
 from scroll_tactile.health.betting import SCORES, Bets, Rows, Scatter, ranks, resting_scores, tie_break
 from scroll_tactile.health.channel_numbers import KINDS, UNIT, Numbers
-from scroll_tactile.health.diagnosis import Change, Deviation, diagnose, diagnose_rest
+from scroll_tactile.health.diagnosis import SensorChange, Deviation, diagnose, diagnose_rest
 from scroll_tactile.results import Health
 
 __all__ = ["Watch", "WatchRules", "WatchedRows"]
@@ -50,7 +50,7 @@ class Watch:
         self.grew: list[tuple[int, float]] = []
         self.taken = 0
         self.alarmed: int | None = None
-        self.change: Change | None = None
+        self.change: SensorChange | None = None
 
     def take(self, sequence: int, material: str, steps: int, numbers: Numbers) -> None:
         """Take a touch of a material, of so many readings; material "": the sensor at rest. Nothing after the alarm."""

@@ -14,7 +14,7 @@ from scroll_tactile.health.betting import Floats, Rows, Scatter
 from scroll_tactile.health.channel_numbers import FLOOR, KINDS, UNIT
 from scroll_tactile.results import ChangeKind
 
-__all__ = ["SensorChange", "Deviation", "diagnose", "diagnose_rest"]
+__all__ = ["Deviation", "SensorChange", "diagnose", "diagnose_rest"]
 
 DEAD = -1.5  # of a logarithm: spread and noise of a channel that fell by so much say nothing any more
 FEWEST = 3  # touches of each of two materials, from which one alone can be said to have changed

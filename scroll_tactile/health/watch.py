@@ -10,7 +10,7 @@ import numpy as np
 
 from scroll_tactile.health.betting import SCORES, Bets, Rows, Scatter, ranks, resting_scores, tie_break
 from scroll_tactile.health.channel_numbers import KINDS, UNIT, Numbers
-from scroll_tactile.health.diagnosis import SensorChange, Deviation, diagnose, diagnose_rest
+from scroll_tactile.health.diagnosis import Deviation, SensorChange, diagnose, diagnose_rest
 from scroll_tactile.results import Health
 
 __all__ = ["Watch", "WatchRules", "WatchedRows"]

@@ -7,7 +7,7 @@ from contextlib import closing, nullcontext
 import pytest
 from commands import run
 
-from examples.benchmarks import appending, live_shift
+from examples.benchmarks import appending, health, live_shift
 from examples.benchmarks.interleaved import AsIs
 from examples.benchmarks.live_shift import _scored
 from scroll_tactile import sensors
@@ -25,6 +25,18 @@ def measured(tmp_path, *words):
     result = run("bench", *words, "--json", tmp_path / "r.json")
     assert result.exit_code == 0, result.output
     return result.output, json.loads((tmp_path / "r.json").read_text())
+
+
+def test_a_study_of_changed_sensors_goes_on_from_its_cache(tmp_path, monkeypatch):
+    monkeypatch.setattr(health, "ONE", ("dead",))
+    for cases in ("MANY", "AT_REST", "NONE"):
+        monkeypatch.setattr(health, cases, ())
+    words = ("health", "--orders", 1, "--cache", tmp_path / "cache")
+    _, result = measured(tmp_path, *words)
+    (record,) = result["records"]
+    assert (record["case"], record["false"], record["found"], record["named"], record["kind"]) == ("dead", 0, 1, 1, 1)
+    assert record["median"] <= 30
+    assert measured(tmp_path, *words)[1]["records"] == result["records"]
 
 
 def test_each_way_of_appending_keeps_the_rows(tmp_path, monkeypatch):

@@ -36,7 +36,8 @@ ChangeKind = Literal["", "gain", "offset", "dead", "noisier", "slower", "gains",
 class Health:
     """Whether a sensor is still the one that learned.
 
-    since: the row of the journal from which on touches are other than before; None where nothing is wrong. channels:
+    since: the row of the journal from which on touches are other than before; None where nothing is wrong. time: when
+    that row was written, in seconds since 1970 by the clock of then. channels:
     that changed, from 0; empty where nothing is wrong, and where it is a material. kind: what it looks like; "" where
     nothing is wrong. evidence: the bet against exchangeable touches, 1 at first; it reaches 1/bound with a probability
     of at most `bound`, however long it goes on, where nothing changes. touches: how many rows it rests on, those at
@@ -45,6 +46,7 @@ class Health:
     """
 
     since: int | None
+    time: float | None
     channels: tuple[int, ...]
     kind: ChangeKind
     evidence: float

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
@@ -36,6 +36,10 @@ def ros2(
         str, typer.Option(help="auto finds touches, after 2 s at rest; manual waits for the services begin and end.")
     ] = "auto",
     of: Axis = None,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="Note rest and known touches for the sensor's health, some hundred bytes each."),
+    ] = False,
     sensor: Annotated[
         str | None, typer.Option(help="As for observe: whose readings they are. Needed only to make a new memory.")
     ] = None,
@@ -62,7 +66,8 @@ def ros2(
     chosen = sensor_for(memory, sensor, preset)  # what is refused makes no memory
     with opened(memory, sensor=chosen) as learner:
         way = cast(Literal["auto", "manual"], contact)
-        met = serve(learner, topic, field, kind=kind, risk=risk, contact=way, of=of, arguments=context.args)
+        how: dict[str, Any] = {"risk": risk, "contact": way, "of": of, "watch": watch}
+        met = serve(learner, topic, field, kind=kind, arguments=context.args, **how)
         count = len(learner.materials)
     counted = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
     say(f"{shown(memory)}: {count} materials. {counted}")

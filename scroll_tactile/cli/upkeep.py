@@ -90,6 +90,33 @@ def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", 
 
 
 @memory.command()
+def health(
+    folder: MemoryFolder,
+    source: Annotated[str | None, typer.Option(help="Only touches from there, such as one robot's.")] = None,
+    after: Annotated[int, typer.Option(min=0, help="Only touches behind this observation.")] = 0,
+    bound: Annotated[float, typer.Option(help="Of the probability of a false alarm, over all time.")] = 0.01,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Tell whether the sensor is still the one that learned, since when not, which channels, and what to do.
+
+    The exit code is 1 where something changed.
+    """
+    from scroll_tactile.health.advice import advice, in_words
+
+    with opened(folder, mode="read") as learner:
+        found = learner.health(bound=bound, after=after, source=source)
+    if as_json:
+        say_json({name: value for name, value in vars(found).items() if name != "grew"})
+    elif found.since is None:
+        say(f"[green]well:[/] {shown(in_words(found))}")
+    else:
+        say(f"[red]changed:[/] {shown(in_words(found))}")
+        say(shown(advice(found)))
+    if found.since is not None:
+        raise typer.Exit(1)
+
+
+@memory.command()
 def repair(folder: MemoryFolder) -> None:
     """Keep what verifies of a damaged memory, up to the first row that is lost, and name what is lost."""
     # Where it still opens, closing it writes a checkpoint: a repair may give up the rows that led to it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,12 +105,12 @@ class WatchedRows:
     last: int
     compacted: int
 
-    def told(self) -> Health:
-        """What it says."""
+    def told(self, time_of: Callable[[int], float | None]) -> Health:
+        """What it says. time_of: a row's, in seconds since 1970."""
         watch, change = self.watch, self.watch.change
         grew = tuple((sequence, evidence / math.log(10)) for sequence, evidence in watch.grew)
         evidence = math.exp(min(watch.evidence, 700.0))
         if change is None:
-            return Health(None, (), "", evidence, watch.bound, watch.taken, None, (), grew)
-        found = (change.since, change.channels, change.kind)
+            return Health(None, None, (), "", evidence, watch.bound, watch.taken, None, (), grew)
+        found = (change.since, time_of(change.since), change.channels, change.kind)
         return Health(*found, evidence, watch.bound, watch.taken, watch.alarmed, change.materials, grew)

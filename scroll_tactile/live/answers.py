@@ -27,7 +27,8 @@ class LiveTouch:
     of the same thing before it that the prediction weighs with it, as `learner.predict(*earlier, stream)`; none unless
     `LiveSession.again` said so. revised: the prediction that was decided on before the touch ended, where the whole
     touch says otherwise; None where it does not. estimates: by quantity, those of all of it, equal to
-    `learner.estimate(stream, risk=…)`; none where no quantity was declared.
+    `learner.estimate(stream, risk=…)`; none where no quantity was declared. rest: the half second before it, for
+    `learner.sense`; None where less than that was at rest, of a camera, and where the session is told of contacts.
     """
 
     stream: Stream
@@ -38,6 +39,7 @@ class LiveTouch:
     earlier: tuple[Stream, ...] = ()
     revised: Prediction | None = None
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    rest: Stream | None = None
 
 
 class LiveState(NamedTuple):

@@ -93,7 +93,7 @@ class GrowingTouch:
     the next is the last of them. before: readings that are no part of it, such as a camera's resting image. earlier:
     the touches of the same thing before it; encoded: they, as its model reads them. estimator: None where no quantity
     was declared. widths: quantity → how narrow its interval is to be. estimates: by quantity, as of `stage`; settled:
-    whether every interval was as narrow as it is to be, False where none is asked to be.
+    whether every interval was as narrow as it is to be, False where none is asked to be. rest: readings before it.
     """
 
     predictor: Predictor
@@ -115,6 +115,7 @@ class GrowingTouch:
     estimates: dict[str, Estimate] = field(default_factory=dict)
     stage: int | None = None
     settled: bool = False
+    rest: Array | None = None
 
     def predict_in_time(self) -> None:
         """Predict at the last moment that the touch has come to, if any is new, until both are what was asked for."""

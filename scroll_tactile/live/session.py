@@ -27,13 +27,14 @@ from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.results import Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.contact import MOST_FRAMES, Rest
-from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
+from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings, validate
 
 __all__ = ["LiveSession"]
 
 Array = npt.NDArray[Any]
 
 REMEMBERED = 2.0  # seconds before a contact is noticed in which it may have begun
+RESTED = 0.5  # seconds of rest that a touch tells, always as many: noise of fewer readings scatters otherwise
 KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
 MOST_EARLIER = 7  # touches of one thing before a touch: more hardly say more, each has its price in every prediction
 
@@ -222,7 +223,9 @@ class LiveSession:
         if touch is None:
             self._recent.add(rows)
             if event is not None and event.kind == "began":
-                self._begin(self._recent.last(event.readings))
+                rested = max(3, round(RESTED * self.sensor.rate))
+                before = self._recent.last(event.readings + rested)[: -event.readings or None]
+                self._begin(self._recent.last(event.readings), before if len(before) == rested else None)
         else:
             touch.rows.add(rows)
             if event is None:
@@ -235,8 +238,8 @@ class LiveSession:
             self._leave(touch)
             self._recent.clear()
 
-    def _begin(self, rows: Array) -> None:
-        """A touch began with these readings."""
+    def _begin(self, rows: Array, rest: Array | None = None) -> None:
+        """A touch began with these readings, after those at rest."""
         self._recent.clear()
         frozen = self._predictor.frozen()
         model = frozen.model
@@ -257,6 +260,7 @@ class LiveSession:
             *(self._predictor, self._extractor, self._scene, kept, at, frozen, rule, moments, before, earlier),
             estimator=self._predictor.estimator(),
             widths=self._widths,
+            rest=None if self.sensor.camera else rest,
         )
         self._under_way.predict_in_time()
 
@@ -307,7 +311,8 @@ class LiveSession:
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
         said = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
-        self._ended.append(LiveTouch(stream, prediction, *said))
+        rest = None if touch.rest is None else validate(touch.rest, self.sensor)
+        self._ended.append(LiveTouch(stream, prediction, *said, rest))
         self._settled = touch.settled
 
     def _break(self, why: str) -> None:

@@ -144,7 +144,7 @@ class MemoryKeeper(ABC):
         with ledger.lock:
             store, memory = ledger.require_store("tell how its sensor is"), ledger.memory
             ledger.watched = health_of(store, memory, self.sensor.channels, rules, ledger.watched)
-            return ledger.watched.told()
+            return ledger.watched.told(lambda row: next((head.time for head in store.heads(row - 1)), None))
 
     @contextmanager
     def batch(self) -> Iterator[None]:

@@ -18,6 +18,7 @@ __all__ = [
     "answers",
     "confusions",
     "dated",
+    "evidence",
     "histogram",
     "over_time",
     "reliability",
@@ -203,6 +204,19 @@ def over_time(seconds: Sequence[float], lines: Mapping[str, Sequence[float]]) ->
         for at, share in zip(seconds, line, strict=True):
             drawing.dot(axis(at), up(share), 2, "point", f"{name}: {share:.0%} after {at:.2g} s")
     drawing.across(axis, 140, 140, "seconds of touch")
+    return drawing.svg()
+
+
+def evidence(grew: Sequence[tuple[int, float]], alarm: float) -> str:
+    """The logarithm of the evidence of a change, to base ten, over the rows of the journal. alarm: where it is one."""
+    drawing = Drawing(176, "Evidence that the sensor changed, over the touches")
+    lowest = min(0.0, *(power for _, power in grew))
+    axis = Axis(grew[0][0], max(grew[-1][0], grew[0][0] + 1), 40, RIGHT)
+    up = Axis(lowest, max(alarm, *(power for _, power in grew)) + 0.5, 140, 12)
+    drawing.up(up, 40, RIGHT, "{:.0f}")
+    drawing.line([(40, up(alarm)), (RIGHT, up(alarm))], "ideal")
+    drawing.line([(axis(row), up(power)) for row, power in grew], "own")
+    drawing.across(axis, 140, 140, "observation")
     return drawing.svg()
 
 

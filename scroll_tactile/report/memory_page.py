@@ -16,7 +16,13 @@ from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.report.judgement import ROWS, alike, calibration_plots, estimated, growing_answers, mixed_up
 from scroll_tactile.report.page import Card, State, cards, figure, page, table
-from scroll_tactile.report.sensing import channel_card, channel_section, exemplar_pictures
+from scroll_tactile.report.sensing import (
+    channel_card,
+    channel_section,
+    exemplar_pictures,
+    health_cards,
+    health_section,
+)
 
 __all__ = ["memory_page"]
 
@@ -54,6 +60,7 @@ def memory_page(
     grown = growing_answers(facts)
     show("channels", 2, STEPS)
     sensor = learner.sensor
+    found = None if learner.path is None or sensor.camera else learner.health()
     sections = [
         ("known", "What it knows", known),
         ("alike", "Who is near whom", near),
@@ -61,6 +68,7 @@ def memory_page(
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
         *([("estimated", "What it measures", estimated(facts))] if facts.estimator is not None else []),
+        *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
         ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
         ("pictures", "What touches look like", exemplar_pictures(sensor, facts.kept, facts.exemplars)),
     ]
@@ -68,7 +76,7 @@ def memory_page(
         by = facts.by(axis)
         sections.append((f"axis-{i}", f"By {axis}", mixed_up(by, alike(by)[1]) + calibration_plots(by)))
     channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
-    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels])
+    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels, *health_cards(found)])
     if facts.missing:
         reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))
         sections.append(("missing", "What is missing, and why", f"<ul>{reasons}</ul>"))

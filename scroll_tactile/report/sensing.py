@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, ChannelSummary, channels_of
+from scroll_tactile.report.charts import evidence
 from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
-from scroll_tactile.report.page import Card, name_of, note, table
+from scroll_tactile.report.page import Card, figure, name_of, note, table
+from scroll_tactile.results import Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down
 
-__all__ = ["channel_card", "channel_section", "exemplar_pictures", "level_picture", "listed", "state_rows"]
+__all__ = [
+    "channel_card",
+    "channel_section",
+    "exemplar_pictures",
+    "health_cards",
+    "health_section",
+    "level_picture",
+    "listed",
+    "state_rows",
+]
 
 MOST_ROWS = 128  # channels, of which all have a row in a table
 MOST_PICTURES = 60
@@ -32,6 +45,29 @@ def listed(channels: Sequence[ChannelSummary], most: int = 8) -> str:
     """Their numbers in words."""
     numbers = [str(channel.number) for channel in channels]
     return ", ".join(numbers[:most]) + (f" and {len(numbers) - most} more" if len(numbers) > most else "")
+
+
+def health_cards(found: Health | None) -> list[Card]:
+    """What is to be seen first of the sensor's health; nothing where it was not told."""
+    if found is None or not found.grew:
+        return []
+    if found.since is None:
+        return [("good", "Its sensor is", "the one that learned", f"{found.touches} touches and rest readings fit it.")]
+    what = found.kind if found.kind == "material" else f"another since observation {found.since}"
+    return [("bad" if found.kind == "dead" else "look", "Its sensor is", what, shown(in_words(found)))]
+
+
+def health_section(found: Health) -> str:
+    """Whether the sensor is still the one that learned, and how the evidence grew."""
+    if not found.grew:
+        return note("No two touches of a material are alike enough in length and level to be compared.")
+    alarm = -math.log10(found.bound)
+    caption = (
+        f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
+        f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on."
+    )
+    told = note(f"{shown(in_words(found))}. {shown(advice(found))}") if found.since is not None else ""
+    return told + figure(evidence(found.grew, alarm), caption)
 
 
 def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> Card:

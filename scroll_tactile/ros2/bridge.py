@@ -44,8 +44,9 @@ class Bridge:
     """A live session of a learner, fed with messages.
 
     field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact, of:
-    see `learner.live`. answer: called with each answer, when something changed. warn: called with each kind of fault
-    once.
+    see `learner.live`. watch: note the sensor at rest before each touch, and touches that were decided and are known,
+    for `learner.health`: some hundred bytes each. answer: called with each answer, when something changed. warn: called
+    with each kind of fault once.
 
     An answer has event ("began", "prediction", "decided", "ended", or "brief" for a contact too short for a touch),
     stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
@@ -58,7 +59,8 @@ class Bridge:
     A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
     the clock of the stamps before it.
 
-    Raises FieldError for a field that is no path, and InputError as `learner.live` does. Not for several threads at
+    Raises FieldError for a field that is no path, and InputError as `learner.live` does, and with watch as
+    `learner.health` does. Not for several threads at
     once.
     """
 
@@ -70,6 +72,7 @@ class Bridge:
         risk: float = 0.05,
         contact: Literal["auto", "manual"] = "auto",
         of: str | None = None,
+        watch: bool = False,
         answer: Callable[[Answer], object],
         warn: Callable[[str], object],
     ) -> None:
@@ -80,6 +83,9 @@ class Bridge:
         self.state = LiveState()
         self.stamp = 0.0
         self._answer, self._warn = answer, warn
+        if watch:
+            learner.health()  # or raises: it needs a memory on disk
+        self._watch, self._unlearned = watch, list[LiveTouch]()  # the last touch, until it is learned or another ended
         self._by: dict[str, Any] = {} if of is None else {"of": of}
         self._pictures = learner.sensor.camera and self.field.text == "data"
         self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
@@ -118,6 +124,7 @@ class Bridge:
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
+        self._unlearned.clear()  # its row tells of its channels, too
         if receipt.repeated:
             return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         count = self.learner.materials[receipt.material]
@@ -158,6 +165,15 @@ class Bridge:
     def close(self) -> None:
         """End the touch under way, if any; the learner stays open."""
         self.session.close()
+        self._sense()
+
+    def _sense(self) -> None:
+        """Note the last touch for the sensor's health, if its material is as good as certain."""
+        for touch in self._unlearned:
+            name = touch.prediction.material
+            if touch.decided and touch.prediction.known and name is not None and not self._by:
+                self.learner.sense(touch.stream, name)
+        self._unlearned.clear()
 
     def _reading(self, message: object) -> npt.NDArray[Any]:
         found = picture(message) if self._pictures else None
@@ -192,6 +208,11 @@ class Bridge:
         before, self.state = self.state, now
         for touch in now.touches:
             self._answer(self._ended(touch))
+            if self._watch:
+                self._sense()
+                self._unlearned.append(touch)
+                if touch.rest is not None:
+                    self.learner.sense(touch.rest)
         if now.contact:
             fresh = not before.contact or bool(now.touches)
             if now.decided and (fresh or not before.decided):

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import Any, Literal
 
 from scroll_tactile.errors import FieldError, InputError, MissingLibraryError, ScrollTactileError
+from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.recordings.paths import nearest
 from scroll_tactile.ros2.bridge import Answer, Bridge
@@ -31,7 +32,7 @@ class TactileNode:
     """A learner at a topic, within a node of one's own; `serve` makes the node, too.
 
     topic, field, kind: where the readings are. Without a kind, such as sensor_msgs/msg/JointState, the type is what the
-    topic is sent as, and it may appear later. risk, contact, of: see `learner.live`. answered: called with each answer
+    topic is sent as, and it may appear later. risk, contact, of, watch: see `Bridge`. answered: called with each answer
     that is published, for what acts in the same process.
 
     Subscribes with the quality of service of sensor data, best effort and volatile, which any publisher can serve; but
@@ -41,6 +42,10 @@ class TactileNode:
     Publishes `~/answer`, std_msgs/String with the JSON of an answer (see `Bridge`), when something changed; and once a
     second what was met, as diagnostic_msgs/DiagnosticArray on `/diagnostics`, or where that package is missing as JSON
     on `~/diagnostics`.
+
+    `/diagnostics` says as well when the sensor is no longer the one that learned (see `TactileLearner.health`): ERROR
+    for a dead channel, WARN for any other change. Once that is mended, set the parameter `health_after` to the
+    observation that it names, and only later touches count.
 
     Services, all std_srvs/Trigger, whose reply says what was done or why not: `~/learn` and `~/forget`, under the name
     that the parameter `material` has then; `~/begin` and `~/end`, with contact="manual"; `~/again`, before the next
@@ -66,6 +71,7 @@ class TactileNode:
         risk: float = 0.05,
         contact: Literal["auto", "manual"] = "auto",
         of: str | None = None,
+        watch: bool = False,
         answered: Callable[[Answer], object] | None = None,
     ) -> None:
         self.node, self.kind = node, kind
@@ -73,13 +79,14 @@ class TactileNode:
         message = None if kind is None else interface(kind)
         text, trigger = interface("std_msgs/msg/String"), interface("std_srvs/srv/Trigger")
         self._log = node.get_logger()
-        how: dict[str, Any] = {"risk": risk, "contact": contact, "of": of}
+        how: dict[str, Any] = {"risk": risk, "contact": contact, "of": of, "watch": watch}
         self.bridge = Bridge(learner, field, **how, answer=self._publish, warn=self._log.warning)
         self._text, self._answered = text, answered
         self._answers = node.create_publisher(text, "~/answer", 10)
-        self._diagnostics = _Diagnostics(node)
-        if not node.has_parameter("material"):
-            node.declare_parameter("material", "")
+        for name, default in (("material", ""), ("health_after", 0)):
+            if not node.has_parameter(name):
+                node.declare_parameter(name, default)
+        self._diagnostics = _Diagnostics(node, self.bridge)
         for name, call in self._calls().items():
             node.create_service(trigger, f"~/{name}", _service(call))
         self._received = self._reported = time.monotonic()
@@ -171,7 +178,7 @@ class TactileNode:
         if silent > MISSED and now - self._reported > MISSED:
             self._reported = now
             self._log.warning(self._absent(silent))
-        self._diagnostics.publish(self.bridge, silent > SILENT)
+        self._diagnostics.publish(silent > SILENT)
 
     def _absent(self, silent: float) -> str:
         """Why nothing comes, as far as can be seen."""
@@ -187,8 +194,9 @@ class TactileNode:
 class _Diagnostics:
     """Says once a second what was met, in the terms that ROS has for it where they are installed."""
 
-    def __init__(self, node: Any) -> None:
-        self._node, self._before = node, 0
+    def __init__(self, node: Any, bridge: Bridge) -> None:
+        self._node, self._bridge, self._before = node, bridge, 0
+        self._changed()  # reads a whole journal the first time, and what came since later
         try:
             self._array: Any = interface("diagnostic_msgs/msg/DiagnosticArray")
         except MissingLibraryError:
@@ -196,11 +204,27 @@ class _Diagnostics:
         name = "~/diagnostics" if self._array is None else "/diagnostics"
         self._publisher = node.create_publisher(self._array or self._text, name, 10)
 
-    def publish(self, bridge: Bridge, silent: bool) -> None:
-        """Publish the state of a bridge; silent: whether no reading came in the last second."""
+    def _changed(self) -> tuple[str, str] | None:
+        """The level and the text of a change of the sensor; None where none is seen, or where it cannot be told."""
+        learner = self._bridge.learner
+        if learner.path is None or learner.sensor.camera:
+            return None
+        try:
+            found = learner.health(after=int(self._node.get_parameter("health_after").value))
+        except (ScrollTactileError, StoreError) as error:
+            return "WARN", f"the health of the sensor cannot be told: {error}"
+        if found.since is None:
+            return None
+        what = advice(found).replace("--after", "parameter health_after")
+        return "ERROR" if found.kind == "dead" else "WARN", f"{in_words(found)}: {what}"
+
+    def publish(self, silent: bool) -> None:
+        """Publish the state; silent: whether no reading came in the last second."""
+        bridge, changed = self._bridge, self._changed()
         status = bridge.status()
         faults = bridge.report.refused + bridge.report.dropped
         level, text = ("OK", "reading") if faults == self._before else ("WARN", "messages were lost or refused")
+        level, text = (level, text) if changed is None else changed
         level, text = ("STALE", "no readings") if silent else (level, text)
         self._before = faults
         if self._array is None:
@@ -241,6 +265,7 @@ def serve(
     risk: float = 0.05,
     contact: Literal["auto", "manual"] = "auto",
     of: str | None = None,
+    watch: bool = False,
     arguments: Sequence[str] = (),
 ) -> dict[str, int | bool]:
     """Run the node `scroll_tactile` until ctrl-C or SIGTERM, or until ROS ends; returns what it met, by name.
@@ -264,7 +289,8 @@ def serve(
         try:
             executor = SingleThreadedExecutor(context=context)
             node = rclpy.create_node("scroll_tactile", context=context)
-            served = TactileNode(node, learner, topic, field, kind=kind, risk=risk, contact=contact, of=of)
+            how: dict[str, Any] = {"risk": risk, "contact": contact, "of": of, "watch": watch}
+            served = TactileNode(node, learner, topic, field, kind=kind, **how)
             executor.add_node(node)
             try:
                 while not ended.is_set() and context.ok():

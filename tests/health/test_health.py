@@ -1,15 +1,22 @@
 """Health: whether the sensor is still the one that learned, which channels changed, and nothing else that alarms."""
 
+import json
+import re
+import typing
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 
-from scroll_tactile import Health, Scene, Sensor, TactileLearner, errors
+from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
+from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text, to_text
 from scroll_tactile.health.watch import Watch
+from scroll_tactile.report import memory_page
+from scroll_tactile.results import ChangeKind
 from scroll_tactile.signals.stream import Stream, validate
 
 PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
@@ -196,9 +203,56 @@ def test_what_cannot_be_told_is_refused(tmp_path: Path) -> None:
     with pytest.raises(errors.InputError, match="without a path"):
         TactileLearner(sensor=PAD).health()
     with TactileLearner.open(tmp_path / "memory", sensor=PAD) as learner:
-        assert learner.health() == Health(None, (), "", 1.0, 0.01, 0, None, (), ())
+        assert learner.health() == Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
         for wrong in ({"bound": 0}, {"bound": "1"}, {"after": -1}, {"until": True}):
             with pytest.raises(errors.InputError):
                 learner.health(**wrong)
         with pytest.raises(errors.InputError, match="three readings"):
             learner.sense(touch(NAMES[0], 0).readings[:2])
+
+
+@pytest.fixture(scope="module")
+def changed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A memory whose channel 3 died after 100 touches."""
+    folder = tmp_path_factory.mktemp("changed") / "m"
+    with TactileLearner.open(folder, sensor=PAD, embedding=Kernels(dimension=64)) as learner, learner.batch():
+        dead = [(name, touch(name, i, on_channel(lambda values: 0 * values))) for i in range(20, 30) for name in NAMES]
+        for name, stream in [*sound(20), *dead]:
+            learner.observe(name, stream)
+    return folder
+
+
+def test_the_command_says_what_changed_and_what_to_do(changed: Path) -> None:
+    told = run("memory", "health", changed)
+    text = " ".join(told.output.split())
+    assert told.exit_code == 1
+    found = re.match(r"changed: since observation (\d+), 20.. *", text)
+    assert found is not None, text
+    assert "channel 3: says nothing any more look at its contact" in text
+    after = re.search(r"--after (\d+) asks", text)
+    assert after is not None
+    later = run("memory", "health", changed, "--after", after[1])
+    assert later.exit_code == 0 and "well: no change of the sensor is seen in" in later.output
+    told = run("memory", "health", changed, "--json")
+    record = json.loads(told.output)
+    assert record["channels"] == [3] and record["kind"] == "dead" and record["time"] > 1e9
+    assert told.exit_code == 1
+
+
+def test_the_page_shows_the_evidence_as_it_grew(changed: Path, tmp_path: Path) -> None:
+    with TactileLearner.open(changed, mode="read") as learner:
+        page = memory_page(learner)
+    assert "Evidence that the sensor changed" in page and "channel 3: says nothing any more" in page
+
+
+def test_what_is_said_of_each_kind_names_what_changed() -> None:
+    for kind in typing.get_args(ChangeKind):
+        found = Health(7 if kind else None, 0.0, (1, 2), kind, 200.0, 0.01, 9, 12, ("oak",), ())
+        text = in_words(found, lambda name: f"<{name}>")
+        if not kind:
+            assert text == "no change of the sensor is seen in 9 touches and rest readings" and advice(found) == ""
+        elif kind == "material":
+            assert "<oak> feels otherwise" in text and "memory relabel" in advice(found)
+        else:
+            assert text.startswith("since observation 7, 1970-01-01 00:00 UTC channels 1, 2: ")
+            assert "--after 12" in advice(found)

@@ -94,6 +94,20 @@ def test_a_touch_is_found_known_and_learned_from():
     assert copy.observe("c", live.touch).key == live.touch.key
 
 
+def test_a_touch_tells_the_half_second_at_rest_before_it():
+    rows, places = shift("ab")
+    session = learner().live()
+    touches = [touch for row in rows for touch in session.push(row).touches]
+    for (begin, _), touch in zip(places, touches, strict=True):
+        found = round(touch.at * PAD.rate)
+        assert abs(found - begin) <= 3
+        assert np.array_equal(touch.rest.readings, rows[found - 25 : found].astype(np.float32))
+    session = learner().live(contact="manual")
+    session.begin()
+    session.push(rows[places[0][0] : places[0][1]])
+    assert session.end().touches[0].rest is None
+
+
 def test_decided_never_goes_back_and_what_happens_in_a_block_is_not_lost():
     made, (rows, _) = learner(), shift("ab", 4)
     with made.live(risk=0.3) as live:

@@ -4,6 +4,7 @@ import array
 import copy
 import itertools
 import json
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,32 @@ def test_an_answer_is_given_only_when_something_changed():
         assert changing[0] != changing[1]
     for event in ("began", "ended"):
         assert sum(answer["event"] == event for answer in answers) + (event == "began") >= 2
+
+
+def test_a_watched_sensor_is_noted_at_rest_and_in_known_touches_that_nobody_learns(tmp_path):
+    with pytest.raises(errors.InputError, match="without a path"):
+        bridge(watch=True)
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as own:
+        random = np.random.default_rng(1)
+        for material in "abc" * 12:
+            own.observe(material, slide(material, 50, random))
+        own.settle()
+
+        def noted():
+            return Counter(row.label for row in own._ledger.store.heads() if row.kind == "sense")
+
+        made, answers, _ = bridge(source=own, watch=True)
+        run(made)
+        certain = [answer["decided"] and answer["known"] for answer in answers if answer["event"] == "ended"]
+        assert certain == [True, True]
+        assert noted() == {"": 2, "a": 1}  # of the last touch it may still be said what it was
+        made.learn("b")
+        made.close()
+        assert noted() == {"": 2, "a": 1}  # its own row has the numbers
+        made, *_ = bridge(source=own, watch=True)
+        run(made, start=2000.0)
+        made.close()
+        assert noted() == {"": 4, "a": 2, "b": 1}
 
 
 def test_the_first_message_without_the_field_says_what_there_is():

@@ -17,7 +17,7 @@ from readme import command_lines
 from robot import TOPIC, taught
 from touches import PAD, SMALL
 
-from scroll_tactile import TactileLearner, errors
+from scroll_tactile import Health, TactileLearner, errors
 from scroll_tactile.recordings import PRESETS, read
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
@@ -168,6 +168,31 @@ def test_diagnostics_say_what_was_met(spinning, learner):
     assert last["refused"] == "1" and last["readings"] == str(len(shift("a")[0]))
     assert last["touches"] == "1"
     assert heard[-1].header.stamp.sec > 0
+
+
+def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spinning, learner, monkeypatch):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+    asked = []
+
+    def health(self, *, after):
+        asked.append(after)
+        if after:
+            return Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
+        return Health(7, 0.0, (3,), "dead", 200.0, 0.01, 40, 12, ("a",), ())
+
+    monkeypatch.setattr(TactileLearner, "health", health)
+    node = spinning.node("scroll_tactile")
+    served = TactileNode(node, learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    heard = []
+    spinning.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+    feed(served, shift("a")[0])
+    spinning.until(lambda: any(array.status[0].level == DiagnosticStatus.ERROR for array in heard))
+    told = next(array for array in heard if array.status[0].level == DiagnosticStatus.ERROR).status[0].message
+    assert "channels 3" not in told and "channel 3: says nothing any more" in told
+    assert "parameter health_after 12 asks about later touches" in told
+    node.set_parameters([rclpy.parameter.Parameter("health_after", value=12)])
+    spinning.until(lambda: 12 in asked)
 
 
 def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning, learner):

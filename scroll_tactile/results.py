@@ -174,6 +174,16 @@ class Prediction:
     least_typicality: tuple[float, ...] = field(default=(), repr=False)
     unusual: tuple[Unusual, ...] = ()
 
+    def __repr__(self) -> str:
+        """On one line: the material, its probability and the next, and whether it is known."""
+        (_, *others), new = self.ranking or ((None, 0.0),), {True: "known", False: "unknown", None: "known or not"}
+        following = f", then {others[0][0]!r} {others[0][1]:.3g}, of {len(self.ranking)}" if others else ""
+        unusual = f", {' and '.join(self.unusual)}" if self.unusual else ""
+        return (
+            f"Prediction({self.material!r} {self.probability:.3g}{following}; {new[self.known]}, "
+            f"novelty {self.novelty:.2f}{unusual}; {self.seconds:g} s)"
+        )
+
     def candidates(self, error: float = 0.05, *, of_all: bool = False) -> Candidates:
         """The materials that it may be, likeliest first: all but those of which it would be an odd touch.
 

@@ -75,7 +75,8 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
     ends. embedding, readout, kept_touches: as of the learner.
 
     After fitting: classes_, the labels in ascending order; n_features_in_, the channels; learner_, the learner. An
-    estimator that was fitted in parts, in any order, is the same as one that was fitted at once.
+    estimator that was fitted in parts, in any order, is the same as one that was fitted at once, if it was given a
+    sensor: without one the range is that of the first part, and the rest is read within it.
 
     Raises InputError for labels that do not fit the touches, StreamError for touches that do not fit the sensor,
     NotFittedError for predictions before anything was fitted.

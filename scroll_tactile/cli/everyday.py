@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ANSWER", "answer_row", "compose", "describe", "inspect", "observe", "predict"]
 
+NEAR = 0.85  # likeness of two names, of which one is taken for a slip of the other
 WORDS = {"yes": True, "no": False, "unknown": None}
 
 ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
@@ -257,6 +260,7 @@ def describe(
             show_default=False,
         ),
     ] = None,
+    new: Annotated[bool, typer.Option("--new", help="Though its name is nearly that of an observed material.")] = False,
 ) -> None:
     """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
     named = [_constituent(text) for text in constituents or []]
@@ -264,10 +268,23 @@ def describe(
     if len(shares) < len(named):
         raise DescriptionError(f"expected each constituent once; came {', '.join(name for name, _ in named)}")
     with opened(memory) as learner:
+        known = {*learner.materials, *learner.memory.descriptions}
+        if not new and material not in known and (meant := _meant(material, known)) is not None:
+            raise InputError(
+                f"no material {material!r} was observed or described, and {meant!r} is nearly called so: name that "
+                "one, or add --new"
+            )
         learner.describe(material, shares or None)
         count = learner.materials.get(material, 0)
     now = "its description is removed" if not shares else f"made of {', '.join(map(shown, shares))}"
     say(f"{shown(material)}: {now}; observed {count} time{'s' * (count != 1)}")
+
+
+def _meant(name: str, known: Iterable[str]) -> str | None:
+    """The known name that this one is a slip of; names that differ in their numbers alone are other ones."""
+    letters = re.sub(r"\d", "", name)
+    others = [other for other in sorted(known) if re.sub(r"\d", "", other) != letters]
+    return next(iter(get_close_matches(name, others, 1, NEAR)), None)
 
 
 def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | None]:

@@ -319,11 +319,18 @@ def merge(
         Path,
         typer.Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
     ],
-    shared: Annotated[Shared, typer.Option(help="How a stream that both observed is counted.", show_default=False)],
+    shared: Annotated[
+        Shared | None, typer.Option(help="How a stream that both observed is counted.", show_default=False)
+    ] = None,
 ) -> None:
     """Make a memory the one that observed all that both did, exactly."""
     from scroll_tactile.pipelines.learning import store_model
 
+    if shared is None:
+        raise InputError(
+            "say how a stream that both memories observed is counted: --shared once as one touch, such as of two "
+            "copies of a memory that both went on; --shared twice as two, if it was observed again on purpose"
+        )
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         done = learner.merge(other, shared=shared.value, progress=progress)
         store_model(learner, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
@@ -15,7 +16,7 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
-from scroll_tactile.results import Estimate, Prediction
+from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.signals.ranges import all_clipped
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
@@ -82,6 +83,7 @@ class Bridge:
         self.report = BridgeReport()
         self.state = LiveState()
         self.stamp = 0.0
+        self._learned: list[Receipt] = []  # by this bridge, and not taken back
         self._answer, self._warn = answer, warn
         if watch:
             learner.health()  # or raises: it needs a memory on disk
@@ -127,11 +129,31 @@ class Bridge:
         self._unlearned.clear()  # its row tells of its channels, too
         if receipt.repeated:
             return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
+        self._learned.append(receipt)
         count = self.learner.materials[receipt.material]
         return (
             f"{receipt.material}: {receipt.seconds:g} s learned as observation {receipt.sequence}; "
             f"observed {count} time{'s' * (count != 1)}"
         )
+
+    def undo(self) -> str:
+        """Take back what was learned last; durable when this returns. Says what was done.
+
+        Raises InputError where nothing is left to be taken back, and what `learner.retract` raises.
+        """
+        if not self._learned:
+            raise InputError(
+                "expected a touch that was learned since the node began, and was not taken back; there is none"
+            )
+        receipt = self._learned[-1]
+        self.learner.retract(receipt)
+        self._learned.pop()
+        left = self.learner.materials.get(receipt.material, 0)
+        return f"{receipt.material}: observation {receipt.sequence} was taken back; {left} are left"
+
+    def materials(self) -> str:
+        """The materials with their observations, as JSON."""
+        return json.dumps(dict(self.learner.materials))
 
     def forget(self, material: str) -> str:
         """Forget a material; durable when this returns. Says what was done; raises what `learner.forget` raises."""

@@ -24,7 +24,8 @@ __all__ = ["TactileNode", "serve"]
 HELD = 2.0  # seconds of readings that may wait
 FASTEST = 1000.0  # Hz
 LOOKED = 0.2  # seconds between looks for a topic that is not there yet
-MISSED = 5.0  # seconds after which a topic that is not there, or silent, is named again
+MISSED = 5.0  # seconds after which a topic that is not there, or silent, is named; then after twice as long, and so on
+LONGEST = 600.0
 SILENT = 1.0  # seconds without a reading
 
 
@@ -39,7 +40,9 @@ class TactileNode:
     its queue holds two seconds of readings at 1 kHz, not five messages: while a touch is learned and its row reaches
     the disk no reading is taken, and a sensor at 1 kHz would overrun a queue of five in 5 ms.
 
-    Publishes `~/answer`, std_msgs/String with the JSON of an answer (see `Bridge`), when something changed; and once a
+    Publishes `~/answer`, std_msgs/String with the JSON of an answer (see `Bridge`), when something changed; the same as
+    `~/material`, std_msgs/String, `~/probability` and `~/novelty`, std_msgs/Float64, and `~/known`, std_msgs/Bool, False
+    where it cannot be told: for echo, plots and all that reads no JSON. Those who subscribe later get the last. Once a
     second what was met, as diagnostic_msgs/DiagnosticArray on `/diagnostics`, or where that package is missing as JSON
     on `~/diagnostics`.
 
@@ -48,8 +51,8 @@ class TactileNode:
     observation that it names, and only later touches count.
 
     Services, all std_srvs/Trigger, whose reply says what was done or why not: `~/learn` and `~/forget`, under the name
-    that the parameter `material` has then; `~/begin` and `~/end`, with contact="manual"; `~/again`, before the next
-    touch of the same thing.
+    that the parameter `material` has then; `~/undo`, of what was learned last; `~/materials`, whose reply is JSON, name
+    → observations; `~/begin` and `~/end`, with contact="manual"; `~/again`, before the next touch of the same thing.
 
         ros2 param set /scroll_tactile material silk
         ros2 service call /scroll_tactile/learn std_srvs/srv/Trigger
@@ -82,7 +85,8 @@ class TactileNode:
         how: dict[str, Any] = {"risk": risk, "contact": contact, "of": of, "watch": watch}
         self.bridge = Bridge(learner, field, **how, answer=self._publish, warn=self._log.warning)
         self._text, self._answered = text, answered
-        self._answers = node.create_publisher(text, "~/answer", 10)
+        self._answers = node.create_publisher(text, "~/answer", _kept(10))
+        self._fields = _Fields(node, text)
         for name, default in (("material", ""), ("health_after", 0)):
             if not node.has_parameter(name):
                 node.declare_parameter(name, default)
@@ -90,6 +94,7 @@ class TactileNode:
         for name, call in self._calls().items():
             node.create_service(trigger, f"~/{name}", _service(call))
         self._received = self._reported = time.monotonic()
+        self._patience = MISSED
         self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
         self.subscription: Any = None
         if message is not None:
@@ -107,11 +112,13 @@ class TactileNode:
             "begin": bridge.begin,
             "end": bridge.end,
             "again": bridge.again,
+            "undo": bridge.undo,
+            "materials": bridge.materials,
         }
 
     def receive(self, message: Any, about: Mapping[str, Any]) -> None:
         """Take a message; about: what ROS says of it."""
-        self._received = time.monotonic()
+        self._received, self._patience = time.monotonic(), MISSED
         published = about.get("source_timestamp") or about.get("received_timestamp") or time.time_ns()
         self._count(about)
         try:
@@ -162,6 +169,7 @@ class TactileNode:
 
     def _publish(self, answer: Answer) -> None:
         self._answers.publish(self._text(data=json.dumps(answer)))
+        self._fields.publish(answer)
         if self._answered is not None:
             self._answered(answer)
 
@@ -175,8 +183,8 @@ class TactileNode:
     def _each_second(self) -> None:
         now = time.monotonic()
         silent = now - self._received
-        if silent > MISSED and now - self._reported > MISSED:
-            self._reported = now
+        if silent > MISSED and now - self._reported > self._patience:
+            self._reported, self._patience = now, min(2 * self._patience, LONGEST)
             self._log.warning(self._absent(silent))
         self._diagnostics.publish(silent > SILENT)
 
@@ -189,6 +197,31 @@ class TactileNode:
             other = f", which send {' and '.join(kinds)} and not {self.kind}" * (self.kind not in kinds)
             return f"no reading for {silent:.0f} s from the {count} publishers of {self.topic}{other}"
         return f"no reading for {silent:.0f} s: nobody publishes {self.topic}{nearest(self.topic, topics)}"
+
+
+def _kept(depth: int) -> Any:
+    """The quality of service of what is kept for those who subscribe later; any subscriber can have it."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class _Fields:
+    """The fields of answers, each on a topic of its own. text: the class of std_msgs/String."""
+
+    def __init__(self, node: Any, text: Any) -> None:
+        number, truth = interface("std_msgs/msg/Float64"), interface("std_msgs/msg/Bool")
+        kinds = {"material": text, "probability": number, "novelty": number, "known": truth}
+        self._kinds = {name: (kind, node.create_publisher(kind, f"~/{name}", _kept(1))) for name, kind in kinds.items()}
+
+    def publish(self, answer: Answer) -> None:
+        """Publish those that an answer has."""
+        if answer.get("material") is None:
+            return
+        for name, (kind, publisher) in self._kinds.items():
+            value = answer[name]
+            value = bool(value) if name == "known" else value if value is not None else math.inf
+            publisher.publish(kind(data=value))
 
 
 class _Diagnostics:

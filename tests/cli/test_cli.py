@@ -82,6 +82,10 @@ class TestMemory:
         assert found["soft"]["presence"] is None and found["soft"]["unlearned"]
         text = run("compose", memory, files / "silk.csv").stdout
         assert "constituent" in text and "a material never observed" in text
+        typed = run("describe", memory, "silkk", "silk=1")
+        assert typed.exit_code == 1 and "'silk' is nearly called so" in " ".join(typed.output.split())
+        assert run("describe", memory, "silkk", "silk=1", "--new").exit_code == 0
+        assert run("describe", memory, "silkk").exit_code == 0
         assert "each constituent once" in run("describe", memory, "silk", "silk=0.5", "silk=0.5").output
         for wrong, said in (("wool", "came 'wool'"), ("wool=much", "NAME=SHARE"), ("wool=0.7", "sum to one")):
             refused = run("describe", memory, "silk", wrong)

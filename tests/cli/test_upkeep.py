@@ -116,6 +116,7 @@ class TestRetracting:
         with TactileLearner.open(tmp_path / "other", **SETTINGS) as learner:
             learner.observe("d", stream((9, 60)))
             before = learner.digest()
+        assert "--shared once as one touch" in refused("memory", "merge", tmp_path / "other", tmp_path / "p")
         merged = run("memory", "merge", tmp_path / "other", tmp_path / "p", "--shared", "once")
         assert merged.exit_code == 0 and "12 observations came in" in merged.output
         assert "no observation" in refused("memory", "forget", tmp_path / "other", "--source", "robot")

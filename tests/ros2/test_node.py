@@ -154,6 +154,35 @@ def test_a_touch_between_the_services_begin_and_end(spinning, learner):
     assert spinning.call(node, "/scroll_tactile/again").success
 
 
+def test_who_comes_late_is_told_the_last_answer_field_by_field_and_what_was_learned_is_taken_back(spinning, learner):
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import Bool, Float64
+
+    node = spinning.node("scroll_tactile")
+    answers = []
+    kind = "sensor_msgs/msg/JointState"
+    served = TactileNode(node, learner, TOPIC, "position", kind=kind, answered=answers.append)
+    feed(served, shift("b", seed=8)[0])
+    late, told = spinning.node("late"), {}
+    profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for name, of in {"answer": String, "material": String, "probability": Float64, "known": Bool}.items():
+        place = f"/scroll_tactile/{name}"
+        late.create_subscription(of, place, lambda got, name=name: told.update({name: got.data}), profile)
+    spinning.until(lambda: len(told) == 4)
+    last = answers[-1]
+    assert told["material"] == last["material"] and told["probability"] == last["probability"]
+    assert told["known"] is bool(last["known"]) and json.loads(told["answer"]) == json.loads(json.dumps(last))
+    before = learner.digest()
+    node.set_parameters([rclpy.parameter.Parameter("material", value="b")])
+    assert spinning.call(node, "/scroll_tactile/learn").success
+    assert learner.digest() != before
+    reply = spinning.call(node, "/scroll_tactile/undo")
+    assert reply.success and "was taken back" in reply.message
+    assert learner.digest() == before
+    assert not spinning.call(node, "/scroll_tactile/undo").success
+    assert json.loads(spinning.call(node, "/scroll_tactile/materials").message) == learner.materials
+
+
 def test_diagnostics_say_what_was_met(spinning, learner):
     from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 

@@ -48,7 +48,8 @@ def ros2(
 
     To learn the last touch: ros2 param set /scroll_tactile material silk, then ros2 service call /scroll_tactile/learn
     std_srvs/srv/Trigger; likewise undo, forget, materials, again before another touch of the same thing, and begin and
-    end with --contact manual. Answers are on ~/material, ~/probability, ~/novelty and ~/known, too, to be plotted. Options of ROS follow --ros-args.
+    end with --contact manual. Answers are on ~/material, ~/probability, ~/novelty and ~/known, too, to be plotted.
+    Options of ROS follow --ros-args.
     """
     if context.args and context.args[0] != "--ros-args":
         raise InputError(f"there is no option {context.args[0]!r}: see --help. Options of ROS follow --ros-args")

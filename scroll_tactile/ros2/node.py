@@ -41,10 +41,10 @@ class TactileNode:
     the disk no reading is taken, and a sensor at 1 kHz would overrun a queue of five in 5 ms.
 
     Publishes `~/answer`, std_msgs/String with the JSON of an answer (see `Bridge`), when something changed; the same as
-    `~/material`, std_msgs/String, `~/probability` and `~/novelty`, std_msgs/Float64, and `~/known`, std_msgs/Bool, False
-    where it cannot be told: for echo, plots and all that reads no JSON. Those who subscribe later get the last. Once a
-    second what was met, as diagnostic_msgs/DiagnosticArray on `/diagnostics`, or where that package is missing as JSON
-    on `~/diagnostics`.
+    `~/material`, std_msgs/String, `~/probability` and `~/novelty`, std_msgs/Float64, and `~/known`, std_msgs/Bool,
+    False where it cannot be told: for echo, plots and all that reads no JSON. Those who subscribe later get the last.
+    Once a second what was met, as diagnostic_msgs/DiagnosticArray on `/diagnostics`, or where that package is missing
+    as JSON on `~/diagnostics`.
 
     `/diagnostics` says as well when the sensor is no longer the one that learned (see `TactileLearner.health`): ERROR
     for a dead channel, WARN for any other change. Once that is mended, set the parameter `health_after` to the

@@ -98,6 +98,7 @@ class Sample(Generic[T]):
         self.capacity = capacity
         self._keys: dict[str, list[bytes]] = {}
         self._items: dict[tuple[str, bytes], T] = {}
+        self._greatest: tuple[int, bytes, str] | None = None  # what `_last` found, until a key comes or goes
 
     def __len__(self) -> int:
         return len(self._items)
@@ -128,9 +129,11 @@ class Sample(Generic[T]):
             return
         insort(self._keys.setdefault(material, []), key)
         self._items[material, key] = item
+        self._greatest = None
         if len(self) > self.capacity:
             _, _, last = self._last()
             del self._items[last, self._keys[last].pop()]
+            self._greatest = None
 
     def joined(self, held: T, item: T) -> T:
         """What is held of a stream that is added once more."""
@@ -151,6 +154,7 @@ class Sample(Generic[T]):
             self._items.pop((material, key), None)
             self._items.update(items)
             self._keys.update(keys)
+            self._greatest = None
 
         return undo
 
@@ -170,6 +174,7 @@ class Sample(Generic[T]):
                 self._keys.setdefault(material, []).append(key)
             for keys in self._keys.values():
                 keys.sort()
+            self._greatest = None
             return
         for material, key, item in given:
             self.add(material, key, item)
@@ -184,7 +189,10 @@ class Sample(Generic[T]):
         )
 
     def _last(self) -> tuple[int, bytes, str]:
-        return max((len(keys) - 1, keys[-1], material) for material, keys in self._keys.items() if keys)
+        """(rank, key, material) of the item that falls out next: most touches are compared with it, and stay out."""
+        if self._greatest is None:
+            self._greatest = max((len(keys) - 1, keys[-1], material) for material, keys in self._keys.items() if keys)
+        return self._greatest
 
 
 class TouchSample(Sample[SampledTouch]):

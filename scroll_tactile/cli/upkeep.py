@@ -108,7 +108,7 @@ def health(
     if as_json:
         say_json({name: value for name, value in vars(found).items() if name != "grew"})
     elif found.since is None:
-        say(f"[green]well:[/] {shown(in_words(found))}")
+        say(f"{'[green]well:[/]' if found.grew else '[yellow]too few:[/]'} {shown(in_words(found))}")
     else:
         say(f"[red]changed:[/] {shown(in_words(found))}")
         say(shown(advice(found)))

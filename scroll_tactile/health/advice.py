@@ -25,6 +25,8 @@ _ALL = "look whether the skin, the unit, its supply or its temperature is anothe
 
 def in_words(health: Health, name: Callable[[str], str] = str) -> str:
     """One sentence: what changed, and since when. name: how the name of a material is written."""
+    if not health.grew:
+        return "nothing can be told yet: no touch has an earlier one of its material, length and level"
     if health.since is None:
         return f"no change of the sensor is seen in {health.touches} touches and rest readings"
     when = "" if health.time is None else f", {datetime.fromtimestamp(health.time, UTC):%Y-%m-%d %H:%M} UTC"

@@ -208,7 +208,7 @@ def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spin
         asked.append(after)
         if after:
             return Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
-        return Health(7, 0.0, (3,), "dead", 200.0, 0.01, 40, 12, ("a",), ())
+        return Health(7, 0.0, (3,), "dead", 200.0, 0.01, 40, 12, ("a",), ((12, 2.3),))
 
     monkeypatch.setattr(TactileLearner, "health", health)
     node = spinning.node("scroll_tactile")

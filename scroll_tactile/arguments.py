@@ -44,6 +44,11 @@ def _is_share(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < float(value) < 1)
 
 
+def _is_row(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+_ROW = "a row of the journal, a whole number of 0 or more", _is_row
 _PATH = "a path: a string, or what os.PathLike is, that the file system can have", _is_path
 
 _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
@@ -57,6 +62,8 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "embedding": ("an embedding, such as Kernels()", _is_embedding),
     "augmentation": ("an Augmented", lambda value: isinstance(value, Augmented)),
     "unfamiliar": ("a probability from 0 to 1", _is_probability),
+    "after": _ROW,
+    "until": _ROW,
     "bound": ("a probability between 0 and 1", _is_share),
     "risk": ("a share between 0 and 1", _is_share),
     "known": ("True, False, or None for what the prediction says", lambda value: isinstance(value, bool)),

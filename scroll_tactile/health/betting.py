@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.health.channel_numbers import KINDS, UNIT, Numbers
+from scroll_tactile.health.channel_numbers import KINDS, UNIT
 
 __all__ = ["SCORES", "Bets", "Rows", "Scatter", "ranks", "resting_scores", "tie_break"]
 
@@ -43,11 +43,6 @@ class Bets:
         self._shares = shares / total
         self.log = self.log + np.log(total)
 
-    def evidence(self) -> float:
-        """The natural logarithm of the mean martingale."""
-        most = float(self.log.max())
-        return most + float(np.log(np.mean(np.exp(self.log - most))))
-
 
 class Scatter:
     """The inverse of prior + Σ (x − mean of its cell)(x − mean)ᵀ, updated by each touch (Sherman, Morrison 1950)."""
@@ -57,17 +52,15 @@ class Scatter:
         self.inverse: Floats = np.eye(size) / (size * PRIOR**2)
         self.count = 0
 
-    def take(self, row: Numbers, cell: Rows) -> None:
-        """Add a touch (size,) to a cell that has the rows (k, size)."""
-        count = len(cell)
-        if count:
-            self.count += 1
-            away = (row - cell.mean(axis=0)) * (UNIT * np.sqrt(count / (count + 1)))
-            moved = self.inverse @ away
-            self.inverse -= np.outer(moved, moved / (1 + away @ moved))
+    def take(self, away: Floats, among: int) -> None:
+        """Add a touch that lies so far from the mean of the others of its cell, (size,) in logarithms, so many."""
+        self.count += 1
+        taken = away * np.sqrt(among / (among + 1))
+        moved = self.inverse @ taken
+        self.inverse -= np.outer(moved, moved / (1 + taken @ moved))
 
     def without(self, away: Floats, among: npt.NDArray[np.int64]) -> Scatter:
-        """That of the other touches: away are some that were taken (k, size), beside so many of their cells."""
+        """That of the other touches: away and among are those of some that were taken, (k, size) and (k,)."""
         taken = away * np.sqrt(among / (among + 1))[:, None]
         other = Scatter(self.channels)
         other.count = self.count - len(away)

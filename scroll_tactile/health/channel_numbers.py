@@ -15,9 +15,7 @@ __all__ = ["KINDS", "MOST_CHANNELS", "UNIT", "channel_numbers", "from_text", "to
 UNIT = 2.0**-10  # of a natural logarithm: 0.1 %
 FLOOR = 2.0**-10  # of the range: below it a level or a spread is none; a quarter of it for the noise
 KINDS = 3  # numbers of a channel: level, spread, noise
-MOST_CHANNELS = (
-    256  # beyond, a touch is not measured: its numbers grow with the channels, their scatter with its square
-)
+MOST_CHANNELS = 256  # beyond, a touch is not measured: the scatter of its numbers grows with the channels' square
 
 Numbers = npt.NDArray[np.int16]
 

@@ -103,7 +103,7 @@ def _explained(away: Floats, scatter: Scatter, bound: float) -> list[tuple[int, 
     for _ in range(n):
         sizes = (weighted.T @ left) / own
         gains = sizes**2 * own
-        gains[[place for place in range(len(gains)) if place % n in {channel for channel, _, _ in found}]] = 0.0
+        gains.reshape(KINDS, n)[:, [channel for channel, _, _ in found]] = 0.0
         best = int(gains.argmax())
         enough = max(enough, float(gains[best]) * LEAST)
         if gains[best] < enough:

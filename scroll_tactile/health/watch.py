@@ -60,13 +60,14 @@ class Watch:
         length, level = steps.bit_length(), math.floor(int(numbers[-1]) * UNIT / LEVELS)
         cell = (material, length, level) if material else ("", 0, 0)
         rows = self._cells.get(cell, np.empty((0, KINDS * self.channels + 1), np.int16))
-        if material:
-            self._scatter.take(numbers, rows)
         if len(rows):
+            away = (numbers - rows.mean(axis=0)) * UNIT
+            if material:
+                self._scatter.take(away, len(rows))
             everyone = np.concatenate([rows, numbers[None]])
             scores = self._scatter.scores(everyone) if material else resting_scores(everyone, self.channels)
             (self._bets if material else self._rest).take(ranks(scores, tie_break(sequence)))
-            self._recent.append(Deviation(sequence, material, (numbers - rows.mean(axis=0)) * UNIT, len(rows)))
+            self._recent.append(Deviation(sequence, material, away, len(rows)))
             self._judge(sequence)
         self._cells[cell] = _with(rows, numbers)
         self.taken += 1
@@ -104,9 +105,15 @@ class WatchedRows:
     watch: Watch
     last: int
     compacted: int
+    _health: Health | None = None
 
-    def told(self, time_of: Callable[[int], float | None]) -> Health:
-        """What it says. time_of: a row's, in seconds since 1970."""
+    def health(self, time_of: Callable[[int], float | None]) -> Health:
+        """What it says, made anew where a row came that counts. time_of: a row's, in seconds since 1970."""
+        if self._health is None or self._health.touches != self.watch.taken:
+            self._health = self._made(time_of)
+        return self._health
+
+    def _made(self, time_of: Callable[[int], float | None]) -> Health:
         watch, change = self.watch, self.watch.change
         grew = tuple((sequence, evidence / math.log(10)) for sequence, evidence in watch.grew)
         evidence = math.exp(min(watch.evidence, 700.0))

@@ -224,8 +224,9 @@ class LiveSession:
             self._recent.add(rows)
             if event is not None and event.kind == "began":
                 rested = max(3, round(RESTED * self.sensor.rate))
-                before = self._recent.last(event.readings + rested)[: -event.readings or None]
-                self._begin(self._recent.last(event.readings), before if len(before) == rested else None)
+                recent = self._recent.last(rested + event.readings)
+                place = max(0, len(recent) - event.readings)
+                self._begin(recent[place:], recent[:place] if place == rested else None)
         else:
             touch.rows.add(rows)
             if event is None:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy.typing as npt
 
@@ -138,13 +138,13 @@ class MemoryKeeper(ABC):
 
         Raises InputError for values that cannot be, and in a memory without a path; StoreError.
         """
-        require_arguments({"bound": bound})
-        rules = WatchRules(float(bound), _row("after", after), None if until is None else _row("until", until), source)
+        require_arguments({"bound": bound, "after": after}, {"until": until})
+        rules = WatchRules(float(bound), after, until, source)
         ledger = self._ledger
         with ledger.lock:
             store, memory = ledger.require_store("tell how its sensor is"), ledger.memory
             ledger.watched = health_of(store, memory, self.sensor.channels, rules, ledger.watched)
-            return ledger.watched.told(lambda row: next((head.time for head in store.heads(row - 1)), None))
+            return ledger.watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -296,9 +296,3 @@ class MemoryKeeper(ABC):
         """Hex of a SHA-256 of f*'s weights, whether it answers or not; None before a fine-tune."""
         tuned = self.memory.tuned
         return None if tuned is None else tuned.digest()
-
-
-def _row(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise InputError(f"expected {name} as a row of the journal, a whole number of 0 or more; came {value!r}")
-    return value

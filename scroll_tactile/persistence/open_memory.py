@@ -206,8 +206,8 @@ class OpenMemory:
             return True
 
     def _checkpoint_if_due(self) -> None:
-        if self.saves and not self._batching and self._memory.sequence - self._saved >= CHECKPOINT_EVERY:
-            materials = len(self._memory.statistics.materials)  # sorts them all: not for each touch of many materials
+        if self.saves:
+            materials = self._memory.statistics.material_count
             self.checkpoint_in_background(max(CHECKPOINT_EVERY, materials // MATERIALS_PER_ROW))
 
     def checkpoint_in_background(self, rows: int) -> None:

@@ -61,8 +61,7 @@ class Bridge:
     the clock of the stamps before it.
 
     Raises FieldError for a field that is no path, and InputError as `learner.live` does, and with watch as
-    `learner.health` does. Not for several threads at
-    once.
+    `learner.health` does. Not for several threads at once.
     """
 
     def __init__(
@@ -87,7 +86,8 @@ class Bridge:
         self._answer, self._warn = answer, warn
         if watch:
             learner.health()  # or raises: it needs a memory on disk
-        self._watch, self._unlearned = watch, list[LiveTouch]()  # the last touch, until it is learned or another ended
+        self._watch = watch
+        self._unlearned: LiveTouch | None = None  # the last touch, until it is learned or another ended
         self._by: dict[str, Any] = {} if of is None else {"of": of}
         self._pictures = learner.sensor.camera and self.field.text == "data"
         self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
@@ -126,7 +126,7 @@ class Bridge:
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
-        self._unlearned.clear()  # its row tells of its channels, too
+        self._unlearned = None  # its row tells of its channels, too
         if receipt.repeated:
             return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         self._learned.append(receipt)
@@ -191,11 +191,12 @@ class Bridge:
 
     def _sense(self) -> None:
         """Note the last touch for the sensor's health, if its material is as good as certain."""
-        for touch in self._unlearned:
+        touch = self._unlearned
+        if touch is not None and not self._by:  # by an axis, its name is no material
             name = touch.prediction.material
-            if touch.decided and touch.prediction.known and name is not None and not self._by:
+            if touch.decided and touch.prediction.known and name is not None:
                 self.learner.sense(touch.stream, name)
-        self._unlearned.clear()
+        self._unlearned = None
 
     def _reading(self, message: object) -> npt.NDArray[Any]:
         found = picture(message) if self._pictures else None
@@ -232,7 +233,7 @@ class Bridge:
             self._answer(self._ended(touch))
             if self._watch:
                 self._sense()
-                self._unlearned.append(touch)
+                self._unlearned = touch
                 if touch.rest is not None:
                     self.learner.sense(touch.rest)
         if now.contact:

@@ -218,10 +218,10 @@ class _Fields:
         """Publish those that an answer has."""
         if answer.get("material") is None:
             return
+        novelty = answer["novelty"]
+        values = {**answer, "known": bool(answer["known"]), "novelty": math.inf if novelty is None else novelty}
         for name, (kind, publisher) in self._kinds.items():
-            value = answer[name]
-            value = bool(value) if name == "known" else value if value is not None else math.inf
-            publisher.publish(kind(data=value))
+            publisher.publish(kind(data=values[name]))
 
 
 class _Diagnostics:

@@ -59,6 +59,11 @@ class Statistics:
         return {name: counts[place] for name, place in sorted(self._places.items()) if counts[place]}
 
     @property
+    def material_count(self) -> int:
+        """How many materials have observations; `materials` sorts their names."""
+        return int(np.count_nonzero(self._observations))
+
+    @property
     def touches(self) -> int:
         """The number of observations."""
         return int(self._observations.sum())

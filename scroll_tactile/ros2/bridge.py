@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import FieldError, InputError
+from scroll_tactile.errors import FieldError, InputError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
@@ -18,6 +18,7 @@ from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
 from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.signals.ranges import all_clipped
+from store import StoreError
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
@@ -187,16 +188,23 @@ class Bridge:
     def close(self) -> None:
         """End the touch under way, if any; the learner stays open."""
         self.session.close()
-        self._sense()
+        self._note_health(None)
 
-    def _sense(self) -> None:
-        """Note the last touch for the sensor's health, if its material is as good as certain."""
-        touch = self._unlearned
-        if touch is not None and not self._by:  # by an axis, its name is no material
-            name = touch.prediction.material
-            if touch.decided and touch.prediction.known and name is not None:
-                self.learner.sense(touch.stream, name)
-        self._unlearned = None
+    def _note_health(self, ended: LiveTouch | None) -> None:
+        """Note the touch before, if its material is as good as certain, and the rest before the one that ended now.
+
+        A failure, such as a full disk, must not end the session: it is warned of once.
+        """
+        touch, self._unlearned = self._unlearned, ended
+        try:
+            if touch is not None and not self._by:  # by an axis, its name is no material
+                name = touch.prediction.material
+                if touch.decided and touch.prediction.known and name is not None:
+                    self.learner.sense(touch.stream, name)
+            if ended is not None and ended.rest is not None:
+                self.learner.sense(ended.rest)
+        except (ScrollTactileError, StoreError) as error:
+            self._warn_once(error, f"the health of the sensor is not noted: {error}")
 
     def _reading(self, message: object) -> npt.NDArray[Any]:
         found = picture(message) if self._pictures else None
@@ -222,9 +230,13 @@ class Bridge:
 
     def _refuse(self, error: InputError) -> None:
         self.report.refused += 1
+        self._warn_once(error, f"{error}. Further messages like it are left out and counted, without a word")
+
+    def _warn_once(self, error: Exception, text: str) -> None:
+        """Warn of the first error of each kind."""
         if type(error) not in self._warned:
             self._warned.add(type(error))
-            self._warn(f"{error}. Further messages like it are left out and counted, without a word")
+            self._warn(text)
 
     def _publish(self, now: LiveState) -> None:
         """Answer what is new."""
@@ -232,10 +244,7 @@ class Bridge:
         for touch in now.touches:
             self._answer(self._ended(touch))
             if self._watch:
-                self._sense()
-                self._unlearned = touch
-                if touch.rest is not None:
-                    self.learner.sense(touch.rest)
+                self._note_health(touch)
         if now.contact:
             fresh = not before.contact or bool(now.touches)
             if now.decided and (fresh or not before.decided):

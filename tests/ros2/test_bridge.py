@@ -15,6 +15,7 @@ from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner, errors
 from scroll_tactile.ros2 import Bridge
+from store import StoreFullError
 
 ROWS, PLACES = shift("ab")
 
@@ -83,6 +84,19 @@ def test_a_watched_sensor_is_noted_at_rest_and_in_known_touches_that_nobody_lear
         run(made, start=2000.0)
         made.close()
         assert noted() == {"": 4, "a": 2, "b": 1}
+
+
+def test_a_full_disk_keeps_a_watched_sensor_from_being_noted_and_nothing_else(tmp_path, monkeypatch):
+    def full(*_):
+        raise StoreFullError("no space left on the disk")
+
+    with TactileLearner.open(taught(tmp_path / "m", PAD, SMALL)) as own:
+        made, answers, warnings = bridge(source=own, watch=True)
+        monkeypatch.setattr(TactileLearner, "sense", full)
+        run(made)
+        made.close()
+        assert [answer["event"] for answer in answers].count("ended") == 2
+        assert len(warnings) == 1 and "health of the sensor" in warnings[0] and "no space left" in warnings[0]
 
 
 def test_the_first_message_without_the_field_says_what_there_is():

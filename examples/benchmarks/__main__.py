@@ -15,6 +15,7 @@ from examples.benchmarks.health import health
 from examples.benchmarks.interleaved import interleaved
 from examples.benchmarks.live_decision import decisions
 from examples.benchmarks.live_shift import live
+from examples.benchmarks.many_materials import many
 from examples.benchmarks.node_latency import ros2
 from examples.benchmarks.speed import speed
 from examples.benchmarks.vision_speed import vision
@@ -30,7 +31,7 @@ app = typer.Typer(
     help="Measure speed beside error, side by side in one run.",
 )
 BENCHMARKS: tuple[Callable[..., None], ...] = (
-    *(speed, live, decisions, ros2, vision),
+    *(speed, many, live, decisions, ros2, vision),
     *(buffers, interleaved, log, fleet, chips, health),
 )
 for benchmark in BENCHMARKS:

@@ -39,15 +39,20 @@ def checkouts(before: Path | None) -> dict[str, Path]:
 def write_touches(
     folder: Path, sensor: Sensor, touches: Iterable[tuple[str, npt.NDArray[np.float32]]], readings: int
 ) -> Path:
-    """Touches, of so many readings each, into a folder from which a worker reads them one by one."""
+    """Touches, of so many readings each, into a folder from which a worker reads them one by one.
+
+    What an earlier run wrote there is taken as it is: it is described last.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    described = {"sensor": sensor.model_dump(exclude_defaults=True), "readings": readings}
-    (folder / "touches.json").write_text(json.dumps(described))
+    if (folder / "touches.json").exists():
+        return folder
     with (folder / "readings").open("wb") as values, (folder / "materials").open("wb") as names:
         for name, touch in touches:
             assert touch.shape == (readings, sensor.channels)
             values.write(np.ascontiguousarray(touch, np.float32).tobytes())
             names.write(name.encode().ljust(NAME_BYTES, b"\0"))
+    described = {"sensor": sensor.model_dump(exclude_defaults=True), "readings": readings}
+    (folder / "touches.json").write_text(json.dumps(described))
     return folder
 
 

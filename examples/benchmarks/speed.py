@@ -10,9 +10,9 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,9 @@ import torch
 import typer
 
 from examples.benchmarks.checkouts import Worker, checkouts, disk_bytes, in_turns, write_touches
-from examples.benchmarks.speed_touches import SHORT, SKIN, Touch, biotac_touches, name_of, skin_touch, skin_touches
+from examples.benchmarks.many_materials import filled, run_many
+from examples.benchmarks.speed_bench import Bench, Note, Record, Sides, Sizes
+from examples.benchmarks.speed_touches import SHORT, Touch, biotac_touches
 from examples.benchmarks.timing import Timing, timed
 from examples.benchmarks.vision_speed import BareResNet
 from examples.paper.runs.options import Json, Seed
@@ -35,71 +37,8 @@ from scroll_tactile.simulation.scene import Scene
 
 __all__ = ["Sizes", "run_speed", "speed"]
 
-Record = dict[str, Any]
-Note = Callable[[str], object]
-Sides = dict[str, Path]
-
 MEGABYTE = 1e6
 REPLAYED = 255  # observations that no close and no checkpoint follows: one more, and a checkpoint is written
-TOGETHER = 1000  # touches in a batch
-SCENE = 3  # materials
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How much is measured.
-
-    touches: of the everyday memory, asked about `asked` others of each material. pairs: of an observation and a
-    prediction. starts: processes that open it anew.
-    materials: of the large memory, with so many touches `each`; before_materials: of the one that an older checkout is
-    given, too. opening: touches of the memories that are opened; before_opening: the largest for an older checkout.
-    """
-
-    touches: int = 800
-    asked: int = 10
-    pairs: int = 200
-    starts: int = 5
-    materials: int = 10_000
-    before_materials: int = 1_000
-    each: int = 5
-    opening: tuple[int, ...] = (10_000, 100_000)
-    before_opening: int = 10_000
-
-
-@dataclass
-class _Bench:
-    """The records of one run, and what it is done with."""
-
-    sides: Sides
-    folder: Path
-    sizes: Sizes
-    seed: int
-    note: Note
-    records: list[Record] = field(default_factory=list)
-
-    def only_now(self) -> Sides:
-        return {"now": self.sides["now"]}
-
-    def seconds(self, memory: str, case: str, taken: dict[str, list[float]], bar: str = "", **more: Any) -> None:
-        """A record of calls' seconds by side, in milliseconds."""
-        self._add(memory, case, "ms", {name: [1e3 * value for value in values] for name, values in taken.items()}, bar)
-        self.records[-1] |= more
-
-    def size(self, memory: str, case: str, unit: str, taken: dict[str, float], bar: str = "") -> None:
-        """A record of one value a side."""
-        self._add(memory, case, unit, {name: [value] for name, value in taken.items()}, bar)
-
-    def _add(self, memory: str, case: str, unit: str, taken: dict[str, list[float]], bar: str) -> None:
-        record: Record = {"memory": memory, "case": case, "unit": unit, "to_reach": bar}
-        for name, values in taken.items():
-            prefix = "" if name == "now" else f"{name}_"
-            record[f"{prefix}median"] = float(np.median(values))
-            record[f"{prefix}p99"] = float(np.percentile(values, 99)) if len(values) > 1 else None
-            record[f"{prefix}largest"] = max(values)
-            record[f"{prefix}calls"] = len(values)
-        if "before" in taken:
-            record["times"] = record["before_median"] / record["median"]
-        self.records.append(record)
 
 
 def run_speed(
@@ -119,19 +58,19 @@ def run_speed(
     """
     sides = checkouts(before)
     with tempfile.TemporaryDirectory() as folder:
-        bench = _Bench(sides, Path(folder), sizes or Sizes(), seed, note)
+        bench = Bench(sides, Path(folder), sizes or Sizes(), seed, note)
         result = {"bench": "speed", "touches": "simulated" if data is None else "BioTac-20"}
         forward = _everyday(bench, data)
         counts = {bench.sizes.materials: bench.only_now()}
         if before is not None and bench.sizes.before_materials:
             counts[bench.sizes.before_materials] = sides
         for materials, own in counts.items():
-            _many(bench, own, materials)
+            run_many(bench, own, materials)
         _opening(bench)
     return result | {"resnet_forward": forward, "records": bench.records}
 
 
-def _everyday(bench: _Bench, data: Path | None) -> Record:
+def _everyday(bench: Bench, data: Path | None) -> Record:
     """The default learner's memory of twenty materials; returns what a bare forward pass took."""
     train, test = biotac_touches(bench.sizes.touches, bench.sizes.asked, data, bench.seed)
     touches = write_touches(bench.folder / "biotac", sensors.BIOTAC, [*train, *test], len(train[0][1]))
@@ -156,7 +95,7 @@ def _everyday(bench: _Bench, data: Path | None) -> Record:
 REFRESHES = 20
 
 
-def _fill_one_by_one(bench: _Bench, memory: str, touches: Path, number: int) -> None:
+def _fill_one_by_one(bench: Bench, memory: str, touches: Path, number: int) -> None:
     bench.note(f"{memory}: observing")
     taken: dict[str, list[float]] = {name: [] for name in bench.sides}
     with ExitStack() as stack:
@@ -172,7 +111,7 @@ def _fill_one_by_one(bench: _Bench, memory: str, touches: Path, number: int) -> 
     _disk(bench, memory, bench.sides, number, "≤ 16", "≤ 10")
 
 
-def _disk(bench: _Bench, memory: str, sides: Sides, touches: int, whole: str, row: str = "") -> None:
+def _disk(bench: Bench, memory: str, sides: Sides, touches: int, whole: str, row: str = "") -> None:
     paths = {name: bench.folder / name for name in sides}
     taken = {name: disk_bytes(path) / MEGABYTE for name, path in paths.items()}
     bench.size(memory, "disk after closing", "MB", taken, whole)
@@ -185,7 +124,7 @@ def _turn(workers: dict[str, Worker], i: int) -> list[str]:
     return sorted(workers, reverse=i % 2 == 0)
 
 
-def _start(bench: _Bench, memory: str, touches: Path, test: int, stack: ExitStack) -> dict[str, Worker]:
+def _start(bench: Bench, memory: str, touches: Path, test: int, stack: ExitStack) -> dict[str, Worker]:
     """Open and predict in new processes; those that were started last go on."""
     bench.note(f"{memory}: first predictions of {bench.sizes.starts} processes")
     cases = ("import torch", "open", "first predict after opening", "open and first predict")
@@ -222,7 +161,7 @@ def _forward(seed: int, readings: npt.NDArray[np.float32]) -> Callable[[], objec
 
 
 def _predict_again(
-    bench: _Bench,
+    bench: Bench,
     memory: str,
     workers: dict[str, Worker],
     first: int,
@@ -244,7 +183,7 @@ def _predict_again(
     return Timing.of(passes)
 
 
-def _pairs(bench: _Bench, memory: str, workers: dict[str, Worker], first: int, test: int) -> int:
+def _pairs(bench: Bench, memory: str, workers: dict[str, Worker], first: int, test: int) -> int:
     """Observe and predict in turns; returns how often."""
     bench.note(f"{memory}: {bench.sizes.pairs} observations, each with a prediction after it")
     observing: dict[str, list[float]] = {name: [] for name in workers}
@@ -262,7 +201,7 @@ def _pairs(bench: _Bench, memory: str, workers: dict[str, Worker], first: int, t
     return bench.sizes.pairs
 
 
-def _refresh(bench: _Bench, memory: str, touches: Path, workers: dict[str, Worker], first: int, test: int) -> None:
+def _refresh(bench: Bench, memory: str, touches: Path, workers: dict[str, Worker], first: int, test: int) -> None:
     """A reader in another process takes in what a writer observed."""
     bench.note(f"{memory}: a reader beside it")
     refreshing: dict[str, list[float]] = {name: [] for name in workers}
@@ -281,7 +220,7 @@ def _refresh(bench: _Bench, memory: str, touches: Path, workers: dict[str, Worke
     bench.seconds(memory, "its predict after that", predicting)
 
 
-def _open_killed(bench: _Bench, memory: str, touches: Path, touch: int, replayed: int) -> None:
+def _open_killed(bench: Bench, memory: str, touches: Path, touch: int, replayed: int) -> None:
     """Open again what a process left that was ended without a close, and predict."""
     bench.note(f"{memory}: opening after a process that ended without a close")
     opening: dict[str, list[float]] = {name: [] for name in bench.sides}
@@ -295,68 +234,7 @@ def _open_killed(bench: _Bench, memory: str, touches: Path, touch: int, replayed
     bench.seconds(memory, "open so and first predict", predicting)
 
 
-def _many(bench: _Bench, sides: Sides, materials: int) -> None:
-    """A memory of many materials, and a scene of three of them beside a memory of these three alone."""
-    sizes, memory = bench.sizes, f"{materials} materials × {bench.sizes.each} touches (8 channels, 1 s)"
-    total, scene = materials * sizes.each, [name_of(place * materials // SCENE) for place in range(SCENE)]
-    asked = min(200, materials)
-    bench.note(f"{memory}: making the touches")
-    touches = write_touches(bench.folder / "skin", SKIN, skin_touches(bench.seed, materials, sizes.each), SKIN.readings)
-    few = write_touches(
-        bench.folder / "few",
-        SKIN,
-        [(name, skin_touch(bench.seed, int(name[1:]), i)) for i in range(sizes.each) for name in scene],
-        SKIN.readings,
-    )
-    paths = {name: bench.folder / f"{name}-{materials}" for name in sides}
-    alone = {name: bench.folder / f"{name}-alone-{materials}" for name in sides}
-    for name, checkout in sides.items():
-        bench.note(f"{memory}: observing ({name})")
-        _filled(checkout, touches, paths[name], total)
-        _filled(checkout, few, alone[name], SCENE * sizes.each)
-    bars = ("≤ 3000", "≤ 8", "≤ 600") if materials == Sizes.materials else ("", "", "")
-    taken = {name: disk_bytes(path) / MEGABYTE for name, path in paths.items()}
-    bench.size(memory, "disk after closing", "MB", taken, bars[2])
-    bench.note(f"{memory}: predicting")
-    cases = ("open and first predict", "predict", "scene of 3", "these 3 alone", "first scene of 3")
-    times: dict[str, dict[str, list[float]]] = {case: {name: [] for name in sides} for case in cases}
-    held, peak = {}, {}
-    for name, checkout in sides.items():
-        with Worker(checkout, touches) as first:  # a scene is all that this one is ever asked about
-            seconds = first.wall("open", path=str(paths[name]))
-            times["first scene of 3"][name].append(seconds + first.wall("predict", touch=0, scene=scene))
-        with Worker(checkout, touches) as large, Worker(checkout, touches) as small:
-            small.call("open", path=str(alone[name]))
-            small.call("predict", touch=0)
-            seconds = large.wall("open", path=str(paths[name]))
-            times["open and first predict"][name].append(seconds + large.wall("predict", touch=total))
-            for i in range(asked):
-                times["predict"][name].append(large.wall("predict", touch=total + i))
-            for i in range(asked):
-                times["scene of 3"][name].append(large.wall("predict", touch=total + i, scene=scene))
-                times["these 3 alone"][name].append(small.wall("predict", touch=total + i))
-            held[name], peak[name] = large.memory(), large.memory("peak")
-    for case, bar in zip(cases[:2], bars, strict=False):
-        bench.seconds(memory, case, times[case], bar)
-    ratio = np.median(times["scene of 3"]["now"]) / np.median(times["these 3 alone"]["now"])
-    bench.seconds(memory, "predict, scene of 3", times["scene of 3"], "≤ 1.5 of the next", of_alone=float(ratio))
-    bench.seconds(memory, "… a memory of these 3 alone", times["these 3 alone"])
-    bench.seconds(memory, "open and first predict, scene of 3", times["first scene of 3"])
-    bench.size(memory, "memory beyond torch", "MB", held, bars[2])
-    bench.size(memory, "the most it held", "MB", peak)
-
-
-def _filled(checkout: Path, touches: Path, path: Path, total: int) -> None:
-    """A memory of the first touches, made in batches, fitted and closed."""
-    with Worker(checkout, touches) as worker:
-        worker.call("open", path=str(path))
-        for first in range(0, total, TOGETHER):
-            worker.call("fill", first=first, last=min(first + TOGETHER, total))
-        worker.call("settle")  # as `scroll_tactile.learn` does, so that whoever opens the memory reads the fitted model
-        worker.call("close")
-
-
-def _opening(bench: _Bench) -> None:
+def _opening(bench: Bench) -> None:
     """Memories of many short touches: opened after a close, and after a process that ended without one."""
     scene = Scene(sensor=SHORT, seed=bench.seed)
     for number in bench.sizes.opening:
@@ -367,11 +245,11 @@ def _opening(bench: _Bench) -> None:
             (name, np.array(scene.touch(name, i // len(scene.materials)).readings))
             for i, name in ((i, scene.materials[i % len(scene.materials)]) for i in range(number + REPLAYED))
         )
-        touches = write_touches(bench.folder / "short", SHORT, made, SHORT.readings)
-        own = _Bench(sides, bench.folder / f"short-{number}", bench.sizes, bench.seed, bench.note, bench.records)
+        touches = write_touches(bench.folder / f"touches-{number}", SHORT, made, SHORT.readings)
+        own = Bench(sides, bench.folder / f"short-{number}", bench.sizes, bench.seed, bench.note, bench.records)
         taken: dict[str, list[float]] = {name: [] for name in sides}
         for name, checkout in sides.items():
-            _filled(checkout, touches, own.folder / name, number)
+            filled(checkout, touches, own.folder / name, number)
             for _ in range(bench.sizes.starts):
                 with Worker(checkout, touches) as worker:
                     taken[name].append(worker.wall("open", path=str(own.folder / name)))

@@ -66,6 +66,8 @@ class _Calls:
                 return lambda: learner.predict(readings, scene=take.get("scene")).material
             case "fill":
                 return lambda: self._fill(take["first"], take["last"])
+            case "learned":
+                return lambda: str(sum(learner.materials.values()))
             case "refresh" | "settle" | "close":
                 plain: Callable[[], Any] = getattr(learner, name)
                 return plain

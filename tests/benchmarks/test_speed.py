@@ -14,9 +14,10 @@ from commands import refused, run
 
 import scroll_tactile
 from examples.benchmarks import checkouts as sides_of
-from examples.benchmarks import speed
+from examples.benchmarks import many_materials, speed
 from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
-from examples.benchmarks.speed import Sizes, run_speed
+from examples.benchmarks.speed import run_speed
+from examples.benchmarks.speed_bench import Sizes
 from examples.benchmarks.speed_touches import SKIN
 from examples.benchmarks.timing import CLOCKS, Timing, take_turns
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
@@ -81,8 +82,8 @@ def measured(tmp_path_factory):
     """Every case, tiny, with this checkout beside itself."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed, "checkouts", lambda before: {"now": before, "before": before})
-        patch.setattr(speed, "Worker", Beside)
-        patch.setattr(sides_of, "Worker", Beside)
+        for module in (speed, many_materials, sides_of):
+            patch.setattr(module, "Worker", Beside)
         patch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 64)
         patch.setattr(speed, "REPLAYED", 6)
         patch.setattr(speed, "REFRESHES", 2)

@@ -191,12 +191,12 @@ def read_sensor(text: str) -> Sensor:
 
     Raises InputError for an unknown name, a file that is not there, or fields that do not fit together.
     """
-    usual = known()
-    if text in usual:
-        return usual[text]
+    presets = known()
+    if text in presets:
+        return presets[text]
     path = Path(text)
     if not path.is_file():
-        raise InputError(f"expected a sensor, one of {', '.join(usual)}, or a JSON file of its fields; came {text!r}")
+        raise InputError(f"expected a sensor, one of {', '.join(presets)}, or a JSON file of its fields; came {text!r}")
     try:
         return Sensor.model_validate_json(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:  # pydantic's errors are ValueErrors, of a line for each field

@@ -40,8 +40,8 @@ __all__ = [
     "groups_by_dilation",
 ]
 
-SHORTEST = 12  # columns; a shorter image is continued by its mirror image
-SHORT = 32  # columns
+SHORTEST = 12  # steps; a shorter image is continued by its mirror image
+SHORT = 32  # steps
 # The share of triangle features in short windows: with it the first 0.3 s of BioTac's touches are right in 87 %,
 # without in 64 %. Wider windows have none: there they cost a tenth of a point.
 SHARE_IN_SHORT = 0.3
@@ -49,7 +49,7 @@ REACH = 0.6  # of a window: a dilated kernel that spans more has too few positio
 LEAST_FEATURES: Final = 64
 MOST_FEATURES: Final = 8192  # the shortest windows have one dilation, whose bank has 378 kernels of 24 thresholds
 DEFAULT_SEED = 1  # measured with the seeds 0 to 5: BioTac-20 98.6 to 99.2 %, RoboSkin-20 97.6 to 98.3 %
-MOST_COLUMNS = 2048  # of a whole image convolved at once; longer ones are read window by window
+MOST_STEPS = 2048  # of a whole image convolved at once; longer ones are read window by window
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Kernels:
     def embed(self, image: npt.NDArray[np.float32], width: int | None = None) -> npt.NDArray[np.float32]:
         """Features in [0, 1], float32 of shape (d,), of a tactile image of shape (C, T) in [-1, 1].
 
-        width: the width of window that the image stands for, its own columns unless given.
+        width: the width of window that the image stands for, its own steps unless given.
         """
         _require_image(image)
         width = image.shape[1] if width is None else width
@@ -149,7 +149,7 @@ class Kernels:
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
     ) -> dict[int, npt.NDArray[np.float32]]:
-        """Embed windows of an image at once: width → first columns, to width → features (windows, d).
+        """Embed windows of an image at once: width → first steps, to width → features (windows, d).
 
         Each row is what `embed` gives for the window alone, to the bit: one convolution serves all windows,
         and integers do not care how they are summed. A window may be wider than the image and begin at 0: then
@@ -157,8 +157,8 @@ class Kernels:
         width, continued by its mirror image.
         """
         _require_image(image)
-        columns = image.shape[1]
-        if columns > MOST_COLUMNS and any(width < columns for width in windows):
+        steps = image.shape[1]
+        if steps > MOST_STEPS and any(width < steps for width in windows):
             return {width: self._one_by_one(image, width, starts) for width, starts in windows.items()}
         return self._embedded(to_levels(image), windows)[0]
 
@@ -183,7 +183,7 @@ class Kernels:
     ) -> dict[int, list[tuple[npt.NDArray[np.integer], int]]]:
         """What the proportions of windows are made of, for each width dilation by dilation: (counts, places).
 
-        levels: whole numbers in ±LEVELS, float32 of shape (C, T). windows: width → first columns; T is at least 12 and
+        levels: whole numbers in ±LEVELS, float32 of shape (C, T). windows: width → first steps; T is at least 12 and
         0.65 of every width. counts: at how many of the places each threshold is exceeded, shape (windows, features).
         """
         widths = {width: tuple(starts) for width, starts in windows.items()}
@@ -217,8 +217,8 @@ class Kernels:
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], competing: int | None = None
     ) -> tuple[dict[int, npt.NDArray[np.float32]], list[npt.NDArray[np.float32]]]:
         """Features of windows, and those of competing kernels; see `_read`."""
-        columns = levels.shape[1]
-        whole = {w: tuple(starts) for w, starts in windows.items() if _suffices(min(w, columns), w)}
+        steps = levels.shape[1]
+        whole = {w: tuple(starts) for w, starts in windows.items() if _suffices(min(w, steps), w)}
         features, proportions = self._read(levels, whole, competing) if whole or competing else ({}, [])
         for width, starts in windows.items():
             if width not in whole:
@@ -267,12 +267,12 @@ def _require_image(image: npt.NDArray[np.float32]) -> None:
         raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
 
 
-def _suffices(columns: int, width: int) -> bool:
-    return columns >= SHORTEST and columns >= ENOUGH * width
+def _suffices(steps: int, width: int) -> bool:
+    return steps >= SHORTEST and steps >= ENOUGH * width
 
 
-def _mirrored(levels: npt.NDArray[np.float32], columns: int) -> npt.NDArray[np.float32]:
-    return np.pad(levels, ((0, 0), (0, columns - levels.shape[1])), mode="symmetric")
+def _mirrored(levels: npt.NDArray[np.float32], steps: int) -> npt.NDArray[np.float32]:
+    return np.pad(levels, ((0, 0), (0, steps - levels.shape[1])), mode="symmetric")
 
 
 def _dilations(width: int) -> list[int]:
@@ -296,7 +296,7 @@ def _parts(
     widths: tuple[tuple[int, tuple[int, ...]], ...],
     competing: int | None,
 ) -> list[Part]:
-    """What is counted of each dilation: for windows, by width their first columns, and for an image that competes."""
+    """What is counted of each dilation: for windows, by width their first steps, and for an image that competes."""
     shares = {width: _shares(channels, _thresholded(dimension, width), width) for width, _ in widths}
     contests = _contests(dimension, competing)
     parts = []

@@ -75,13 +75,13 @@ class Backbone(nn.Module):
     def put(self, tensors: Mapping[str, npt.NDArray[np.float32]]) -> None:
         """Replace tensors by those that `tensors` returned. Raises MismatchError for others."""
         parameters = dict(self.named_parameters())
-        strange = [
+        others = [
             name
             for name, tensor in tensors.items()
             if name not in parameters or tuple(parameters[name].shape) != tensor.shape
         ]
-        if strange:
-            raise MismatchError(f"f* trained {strange[:5]}, which this network does not have so: fine-tune again")
+        if others:
+            raise MismatchError(f"f* trained {others[:5]}, which this network does not have so: fine-tune again")
         with torch.no_grad():
             for name, tensor in tensors.items():
                 parameters[name].copy_(torch.from_numpy(tensor))

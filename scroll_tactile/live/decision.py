@@ -1,19 +1,19 @@
 """When a prediction is made within a touch, and when it is safe to act on.
 
-A touch is decided at the first moment at which its prediction is known and as probable as `sure`, or as strange as
-`strange`. Both are set by touches left out, run through all moments (see `prediction.moment_table`): the novelty that
-none of them comes near, and the least probability above which, with every higher one, so few of n are
-decided wrongly that
+A touch is decided at the first moment at which its prediction is known and its probability is at least `sure`, or at
+which its novelty is at least `least_new`. Held-out touches, run through all moments (see `prediction.moment_table`),
+set both. `least_new` is a novelty that none of them comes near. `sure` is the least probability for which, as for every
+higher one, few enough of the n held-out touches are decided wrongly:
 
     (W + M) / 2 n + √(risk (1 − risk) / n) ≤ risk,
 
-W those that are, M how many it should be by their probabilities. These are calibrated at each moment, and a posterior
-keeps what it says wherever one stops; but they do not see how touches err together, and the count alone is as coarse as
-1 / n. Touches left out are not all there are: hence one standard error. So few cannot vouch for a risk of 0.01, and
-then most are decided as whole touches, of which a probability of 1 − risk is enough.
+W the wrong decisions, M how many there should be by their probabilities. The probabilities are calibrated at each
+moment, and a posterior keeps its meaning wherever one stops; but they do not show how touches err together, and the
+count alone is as coarse as 1 / n. The held-out touches are a sample: hence one standard error. So few cannot vouch for
+a risk of 0.01; most touches are then decided when they are complete, at a probability of 1 − risk.
 
-A touch of a thing that was touched before begins with what that said, and `together` is the least probability for it:
-the same, of each touch left out behind another of its material, and no less than `sure`.
+A touch of a thing that was touched before begins with the probabilities of the earlier touch. `together` is the least
+probability for it: found in the same way from each held-out touch behind another of its material, and at least `sure`.
 """
 
 from __future__ import annotations
@@ -36,37 +36,37 @@ FloatArray = npt.NDArray[np.float64]
 
 LEAST, MOST = 0.5, 0.999  # of `sure`: what is more likely wrong than right is acted on by nobody
 STEP = 0.005
-KNOWN = 0.95  # of touches left out: what is stranger is not acted on
-BEYOND = 2.0  # times the most novelty of touches left out
+KNOWN = 0.95  # of held-out touches: no touch of larger novelty is acted on
+BEYOND = 2.0  # times the largest novelty of held-out touches
 
 
 @dataclass(frozen=True)
 class DecisionRule:
     """When to predict, and when to act.
 
-    moments: at which a prediction is made, in columns, ascending; after the last only at the touch's end. risk: the
+    moments: at which a prediction is made, in steps, ascending; after the last only at the touch's end. risk: the
     share of wrong answers among those decided. sure: the probability at which a known touch is decided; together: that
-    of several of one thing. strange: the novelty at which a touch is decided to be of nothing that was observed.
+    of several of one thing. least_new: the novelty at which a touch is decided to be of nothing that was observed.
     """
 
     moments: tuple[int, ...]
     risk: float
     sure: float
     together: float
-    strange: float
+    least_new: float
 
-    def decided(self, prediction: Prediction, columns: int, *, several: bool = False) -> bool:
-        """Whether it is safe to act on the prediction for the first `columns` of a touch, or for all of it.
+    def decided(self, prediction: Prediction, steps: int, *, several: bool = False) -> bool:
+        """Whether it is safe to act on the prediction for the first `steps` of a touch, or for all of it.
 
         On `prediction.material`, but where it is not known on its being new. several: whether the
         prediction weighs other touches of the same thing with it.
         """
-        if columns < self.moments[0]:
+        if steps < self.moments[0]:
             return False
         if prediction.known is not False:
-            sure, whole = self.together if several else self.sure, columns >= self.moments[-1]
+            sure, whole = self.together if several else self.sure, steps >= self.moments[-1]
             return prediction.probability >= (min(sure, 1 - self.risk) if whole else sure)
-        return prediction.novelty >= self.strange
+        return prediction.novelty >= self.least_new
 
 
 def decision_rule(model: Model, risk: float) -> DecisionRule:
@@ -78,47 +78,47 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     if not 0 < risk < 1:
         raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
     least = max(1, min(model.least, model.longest))
-    said = None if model.fusion is None else model.fusion.trajectories
-    if model.fusion is None or said is None or len(said.targets) < FEWEST or not said.novelty.size:
+    held_out = None if model.fusion is None else model.fusion.trajectories
+    if model.fusion is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
         return DecisionRule((least,), risk, 1 - risk, 1 - risk, 2 * UNMEASURED)
     moments = model.fusion.moments[:-1]
-    usual = np.array([np.quantile(m.novelties, KNOWN) if len(m.novelties) else np.inf for m in moments])
-    sure = _least_sure_of(said, said.novelty <= usual, risk)
-    pairs, known = in_pairs(said, usual, model.dependence)
+    thresholds = np.array([np.quantile(m.novelties, KNOWN) if len(m.novelties) else np.inf for m in moments])
+    sure = _least_sure_of(held_out, held_out.novelty <= thresholds, risk)
+    pairs, known = in_pairs(held_out, thresholds, model.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
-    strange = max(BEYOND * float(np.nanmax(said.novelty)), UNMEASURED)
-    return DecisionRule((*(moment.steps for moment in moments), least), risk, sure, max(sure, together), strange)
+    least_new = max(BEYOND * float(np.nanmax(held_out.novelty)), UNMEASURED)
+    return DecisionRule((*(moment.steps for moment in moments), least), risk, sure, max(sure, together), least_new)
 
 
-def _least_sure_of(said: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:
-    chances = said.chances
-    right = chances.argmax(axis=2) == said.targets[:, None]
+def _least_sure_of(trajectories: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:
+    chances = trajectories.chances
+    right = chances.argmax(axis=2) == trajectories.targets[:, None]
     return least_sure(np.where(known, chances.max(axis=2), np.nan), right, risk)
 
 
 def in_pairs(
-    said: Trajectories, usual: FloatArray, dependence: Dependence
+    trajectories: Trajectories, thresholds: FloatArray, dependence: Dependence
 ) -> tuple[Trajectories, npt.NDArray[np.bool_]]:
-    """What is said of touches left out behind another of their material, at each moment, and whether it is known.
+    """The probabilities and novelties of held-out touches behind another of their material, and whether each is known.
 
-    usual: the most novelty of a known touch at each moment. What comes first counts as at its last moment.
+    thresholds: the largest novelty of a known touch at each moment. The first touch counts as at its last moment.
     """
-    reached = [np.flatnonzero(~np.isnan(of)).tolist() for of in said.novelty]
+    reached = [np.flatnonzero(~np.isnan(of)).tolist() for of in trajectories.novelty]
     pairs: list[tuple[int, int]] = []
-    for target in sorted(set(said.targets.tolist())):
-        own = [i for i in np.flatnonzero(said.targets == target).tolist() if reached[i]]
+    for target in sorted(set(trajectories.targets.tolist())):
+        own = [i for i in np.flatnonzero(trajectories.targets == target).tolist() if reached[i]]
         pairs += zip(own, [*own[1:], *own[:1]], strict=True) if len(own) > 1 else ()
-    chances = np.full((len(pairs), *said.chances.shape[1:]), np.nan)
-    novelty = np.full((len(pairs), said.novelty.shape[1]), np.nan)
+    chances = np.full((len(pairs), *trajectories.chances.shape[1:]), np.nan)
+    novelty = np.full((len(pairs), trajectories.novelty.shape[1]), np.nan)
     known = np.zeros(novelty.shape, dtype=np.bool_)
     for row, (first, second) in enumerate(pairs):
         last = reached[first][-1]
         for moment in reached[second]:
             both = (first, last), (second, moment)
-            chances[row, moment] = dependence.probability([said.chances[at] for at in both])
-            novelty[row, moment] = dependence.standard([said.novelty[at] for at in both])
-            known[row, moment] = novelty[row, moment] <= (usual[last] + usual[moment]) / 2
-    return Trajectories(chances, novelty, said.targets[[second for _, second in pairs]]), known
+            chances[row, moment] = dependence.probability([trajectories.chances[at] for at in both])
+            novelty[row, moment] = dependence.standard([trajectories.novelty[at] for at in both])
+            known[row, moment] = novelty[row, moment] <= (thresholds[last] + thresholds[moment]) / 2
+    return Trajectories(chances, novelty, trajectories.targets[[second for _, second in pairs]]), known
 
 
 def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -> float:

@@ -286,7 +286,7 @@ class LiveSession:
         for moment in [*rule.moments, image.shape[1]]:
             stream = self._extractor.stream(low + (high - low) * (image[:, : max(2, moment)].T + 1) / 2)
             encoded = self._extractor.encode(
-                stream, model.longest, lambda columns: model.scales_for(model.names, columns), cache
+                stream, model.longest, lambda steps: model.scales_for(model.names, steps), cache
             )
             self._predictor.answer_of(model, self._extractor, model.names, [encoded])
 

@@ -134,7 +134,7 @@ class Conformal:
         self._materials = sorted({material for material, _ in self._touches})
         place = {material: i for i, material in enumerate(self._materials)}
         self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
-        self._asked: tuple[Sequence[str], npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
+        self._located: tuple[Sequence[str], npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
 
     def copy(self) -> Conformal:
         """Another of the same touches: what comes to it does not come to this one."""
@@ -153,13 +153,13 @@ class Conformal:
 
         Those of the last list are cached: it may be of all that a memory has.
         """
-        asked = self._asked  # any thread may replace it
-        if asked is None or asked[0] is not candidates:
+        located = self._located  # any thread may replace it
+        if located is None or located[0] is not candidates:
             swap = len(candidates) < len(self._materials)
             found = _common(candidates, self._materials) if swap else _common(self._materials, candidates)
             rows, among = found[::-1] if swap else found
-            self._asked = asked = candidates, rows, among
-        return asked[1:]
+            self._located = located = candidates, rows, among
+        return located[1:]
 
     def p_values(self, levels: LevelArray) -> dict[str, Typicality]:
         """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""

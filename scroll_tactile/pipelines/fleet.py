@@ -100,11 +100,13 @@ def learn(
     place = Path(destination).absolute()
     found, missing = expand([os.fspath(source) for source in sources], patience)
     report = FleetReport(refused=missing)
-    asked = RecipeRequest.of(sensor, embedding, augmentation, {"exemplars": exemplars, "kept_touches": kept_touches})
+    requested = RecipeRequest.of(
+        sensor, embedding, augmentation, {"exemplars": exemplars, "kept_touches": kept_touches}
+    )
     folder = place.with_name(place.name + ".fleet")
     with ExitStack() as stack:
         stack.enter_context(alone_in(folder, place))
-        into = Destination(place, asked, options or SourceOptions(), patience, stack, report, descriptions)
+        into = Destination(place, requested, options or SourceOptions(), patience, stack, report, descriptions)
         if into.learned and not (folder / NOTES).exists() and not add:
             raise InputError(
                 f"{place} is there already, and not by a run of this kind: take another folder, or add=True to "
@@ -205,8 +207,8 @@ class _Run:
             logger.warning("%s; its sources are learned again", error)
             self._again(step, 1, error)
             return False
-        said = [Refused(str(head.attributes[SOURCE]), why) for head, why in refused]
-        self._report.refused += [*made.refused, *said]
+        refusals = [Refused(str(head.attributes[SOURCE]), why) for head, why in refused]
+        self._report.refused += [*made.refused, *refusals]
         step.failed = {*made.failed, *(step.source_of(head.sequence) for head, _ in refused)}
         return True
 

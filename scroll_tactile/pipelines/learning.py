@@ -261,12 +261,12 @@ def _measured(name: str, answered: Sequence[Answered]) -> dict[str, Any] | None:
         for each in answered
         if name in each.touch.values and name in each.estimates
     ]
-    said = [(true, own.value, own.low, own.high) for true, own in pairs if own.value is not None]
+    estimated = [(true, own.value, own.low, own.high) for true, own in pairs if own.value is not None]
     if not pairs:
         return None
-    figures = interval_figures(*np.array(said, dtype=np.float64).T) if said else {}
+    figures = interval_figures(*np.array(estimated, dtype=np.float64).T) if estimated else {}
     first, missing = pairs[0][1], next((own.missing for _, own in pairs if own.value is None), "")
-    counted = {"touches": len(said), "without": len(pairs) - len(said), "missing": missing}
+    counted = {"touches": len(estimated), "without": len(pairs) - len(estimated), "missing": missing}
     return counted | {"risk": first.risk, "unit": first.unit} | figures
 
 

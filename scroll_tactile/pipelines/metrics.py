@@ -44,7 +44,7 @@ def calibration_error(probability: npt.ArrayLike, right: npt.ArrayLike, bins: in
 
 
 def interval_figures(
-    truth: npt.ArrayLike, said: npt.ArrayLike, low: npt.ArrayLike, high: npt.ArrayLike
+    truth: npt.ArrayLike, estimates: npt.ArrayLike, low: npt.ArrayLike, high: npt.ArrayLike
 ) -> dict[str, float | None]:
     """How good N numbers with intervals are, all of shape (N,) and in one unit.
 
@@ -54,7 +54,7 @@ def interval_figures(
 
     Raises InputError where N differs or is 0.
     """
-    true, value, below, above = (np.asarray(one, dtype=np.float64) for one in (truth, said, low, high))
+    true, value, below, above = (np.asarray(one, dtype=np.float64) for one in (truth, estimates, low, high))
     for other in (value, below, above):
         _require_pairs(len(true), len(other))
     spread = float(np.square(true - true.mean()).sum())

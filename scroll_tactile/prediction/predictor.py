@@ -342,12 +342,12 @@ def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) ->
 
 
 def _scales_for(
-    asked: Sequence[tuple[Model, Sequence[str]]], beside: Composer | Estimator
+    queries: Sequence[tuple[Model, Sequence[str]]], beside: Composer | Estimator
 ) -> Callable[[int], Sequence[Scale]]:
     """Steps → the scales of a touch that models read to choose among candidates, and what rests on it beside them."""
 
     def scales_for(steps: int) -> list[Scale]:
-        judging = (model.scales_for(candidates, steps) for model, candidates in asked if candidates)
+        judging = (model.scales_for(candidates, steps) for model, candidates in queries if candidates)
         return sorted({*beside.scales_for(steps), *(scale for own in judging for scale in own)})
 
     return scales_for
@@ -373,10 +373,10 @@ def estimates_of(
     new material.
     """
     as_known = prediction.known is True if known is None else known
-    strange = set(prediction.unusual)
+    unusual = set(prediction.unusual)
     if encoded is not None and estimator.stage(encoded.steps) < estimator.last:
-        strange.discard("shorter")  # than complete touches: its heads are of touches as they were at its milestone
-    inside = prediction.known is not False and not strange
+        unusual.discard("shorter")  # than complete touches: its heads are of touches as they were at its milestone
+    inside = prediction.known is not False and not unusual
     if encoded is None:
         found = estimator.estimate(wanted, {}, 0, risk, known=as_known)
     else:

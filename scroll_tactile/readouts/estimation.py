@@ -117,8 +117,8 @@ class Estimator:
             raise AnnotationError(
                 "no quantity was declared: declare one (learner.declare), and observe touches with it"
             )
-        if strange := sorted(set(names or ()) - self.quantities.keys()):
-            raise AnnotationError(f"expected quantities out of {sorted(self.quantities)}; came {strange[:5]}")
+        if undeclared := sorted(set(names or ()) - self.quantities.keys()):
+            raise AnnotationError(f"expected quantities out of {sorted(self.quantities)}; came {undeclared[:5]}")
         return sorted(self.quantities) if names is None else list(dict.fromkeys(names))
 
     def estimate(
@@ -182,8 +182,8 @@ class Estimator:
 
 def value_of(annotations: Annotations, quantity: Quantity) -> float | None:
     """The value that a touch has of a quantity; the mean where it was observed several times, None without any."""
-    told = [(dict(annotation.values).get(quantity.name), copies) for annotation, copies in annotations]
-    found = [(quantity.value(steps), copies) for steps, copies in told if steps is not None]
+    steps_of = [(dict(annotation.values).get(quantity.name), copies) for annotation, copies in annotations]
+    found = [(quantity.value(steps), copies) for steps, copies in steps_of if steps is not None]
     count = sum(copies for _, copies in found)
     return math.fsum(value * copies for value, copies in found) / count if found else None
 

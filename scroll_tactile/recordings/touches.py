@@ -77,7 +77,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
     Raises InputError for a recording without episodes, without the requested label or with an empty one, for intervals
     of which none is of this file or which lie outside it, and for spans that a function gives outside the recording.
     """
-    told: Sequence[Interval] = ()
+    intervals: Sequence[Interval] = ()
     if isinstance(cut, str):
         if cut not in ("whole", "episodes"):
             raise InputError(f"expected cut 'whole', 'episodes', intervals or a function; came {cut!r}")
@@ -90,8 +90,8 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
             if not 0 <= span.begin < span.end <= len(recording):
                 raise InputError(f"a cut gave readings {span.begin} to {span.end} of {len(recording)}")
     else:
-        told = [interval for interval in cut if _same(interval.file, recording.source)]
-        spans = _of_intervals(recording, told, cut)
+        intervals = [interval for interval in cut if _same(interval.file, recording.source)]
+        spans = _of_intervals(recording, intervals, cut)
     return tuple(
         Touch(
             recording.source,
@@ -100,7 +100,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
             recording.readings[span.begin : span.end],
             recording.times[span.begin : span.end],
             _label(recording, span, label),
-            *((told[i].values, told[i].labels) if told else ()),
+            *((intervals[i].values, intervals[i].labels) if intervals else ()),
         )
         for i, span in enumerate(spans)
     )

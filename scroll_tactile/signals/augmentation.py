@@ -64,7 +64,7 @@ def crop(image: Image, start: int, steps: int) -> Image:
     """
     _require_image(image)
     if start < 0 or steps < 1 or start + steps > image.shape[-1]:
-        raise InputError(f"expected a stretch of the image's {image.shape[-1]} columns; came {steps} from {start} on")
+        raise InputError(f"expected a stretch of the image's {image.shape[-1]} steps; came {steps} from {start} on")
     return np.ascontiguousarray(image[..., start : start + steps])
 
 
@@ -95,7 +95,7 @@ def fit(image: Image, steps: int) -> Image:
     """
     _require_image(image)
     if steps < 1:
-        raise InputError(f"expected 1 column or more to fit an image to; came {steps}")
+        raise InputError(f"expected 1 step or more to fit an image to; came {steps}")
     length = image.shape[-1]
     places = np.arange(steps) % (2 * length)
     return np.ascontiguousarray(image[..., np.minimum(places, 2 * length - 1 - places)])
@@ -233,6 +233,6 @@ def augment(image: Image, rng: np.random.Generator, *, steps: int | None = None)
 def _require_image(image: Image) -> None:
     if image.ndim < 2 or image.dtype != np.float32 or 0 in image.shape:
         raise InputError(
-            "expected a tactile image, float32 of shape (C, T) with a column or more, or a batch of them; "
+            "expected a tactile image, float32 of shape (C, T) with a step or more, or a batch of them; "
             f"came {image.dtype} of shape {image.shape}. See tactile_image"
         )

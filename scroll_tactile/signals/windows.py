@@ -171,11 +171,11 @@ def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = 
     chosen: dict[int, list[int]] = {}
     for width in fitting(length, widths, partial=partial):
         begin = extent[width]
-        apart = width // 2 if width == widths[0] else 1
+        spacing = width // 2 if width == widths[0] else 1
         places: list[int] = []
         for place, start in enumerate(begin):
             inside = start + width <= length or start == 0
-            if inside and (not places or start >= begin[places[-1]] + apart):
+            if inside and (not places or start >= begin[places[-1]] + spacing):
                 places.append(place)
         chosen[width] = places
     return chosen

@@ -38,10 +38,10 @@ class Annotation:
         labels that cannot be names.
         """
         numbers, names = _mapping("values", values), _mapping("labels", labels)
-        if strange := sorted(map(str, numbers.keys() - quantities.keys())):
+        if undeclared := sorted(map(str, numbers.keys() - quantities.keys())):
             raise AnnotationError(
-                f"expected values of declared quantities, out of {sorted(quantities)}; came {strange[:5]}: declare it "
-                f"first, as '{strange[0]} [UNIT] LOW..HIGH step RESOLUTION', by memory declare, learner.declare, "
+                f"expected values of declared quantities, out of {sorted(quantities)}; came {undeclared[:5]}: declare "
+                f"it first, as '{undeclared[0]} [UNIT] LOW..HIGH step RESOLUTION', by memory declare, learner.declare, "
                 "or in the heading of its column"
             )
         if len(names) > MOST_AXES:
@@ -66,8 +66,8 @@ class Annotation:
 
     def number(self, material: str, key: bytes) -> int:
         """A whole number of 256 bits that stands for this annotation of this touch."""
-        told = json.dumps([material, key.hex(), self.values, self.labels]).encode()
-        return int.from_bytes(hashlib.sha256(told).digest(), "little")
+        described = json.dumps([material, key.hex(), self.values, self.labels]).encode()
+        return int.from_bytes(hashlib.sha256(described).digest(), "little")
 
     def shown(self, quantities: Mapping[str, Quantity]) -> str:
         """In words, for messages."""

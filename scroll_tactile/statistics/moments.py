@@ -327,6 +327,6 @@ def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArra
     with one_thread():
         for first in range(0, len(counts), 1024):
             block = counts[first : first + 1024, None]
-            apart = (sums[first : first + 1024] - block * mean).astype(np.float64)
-            apart /= np.sqrt(block)
-            rounded += apart.T @ apart
+            deviations = (sums[first : first + 1024] - block * mean).astype(np.float64)
+            deviations /= np.sqrt(block)
+            rounded += deviations.T @ deviations

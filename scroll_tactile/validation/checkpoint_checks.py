@@ -280,8 +280,8 @@ def _check_finite(field: str, values: npt.NDArray[np.floating]) -> None:
 def _names(field: str, values: Any, among: list[str] | None = None) -> list[str]:
     expect(isinstance(values, list), field, "names of materials", values)
     names = [name(field, value) for value in values]
-    strange = [] if among is None else sorted(set(names) - set(among))
-    expect(not strange, field, "materials that were observed", strange)
+    unknown = [] if among is None else sorted(set(names) - set(among))
+    expect(not unknown, field, "materials that were observed", unknown)
     return names
 
 

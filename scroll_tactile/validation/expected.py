@@ -1,4 +1,4 @@
-"""What is expected of values that come from a disk, and of a journal's rows; and how what came instead is told."""
+"""What is expected of values that come from a disk, and of a journal's rows; and how what came instead is stored."""
 
 from __future__ import annotations
 
@@ -299,9 +299,9 @@ def check_annotation(field: str, attributes: Mapping[str, Any]) -> None:
     """Raise Unexpected for values or labels of a touch that `observe` would not keep; field: where they lie."""
     for what, most in ((VALUES, MOST_QUANTITIES), (LABELS, MOST_AXES)):
         if what in attributes:
-            told = attributes[what]
-            expect(isinstance(told, dict) and 0 < len(told) <= most, field + what, f"1 to {most} by name", told)
-            for named, value in told.items():
+            stored = attributes[what]
+            expect(isinstance(stored, dict) and 0 < len(stored) <= most, field + what, f"1 to {most} by name", stored)
+            for named, value in stored.items():
                 name(field + what, named)
                 whole(field + what, value, 0, MOST_STEPS) if what == VALUES else name(field + what, value)
 

@@ -312,9 +312,9 @@ def wrong_retractions(path: Path, heads: Sequence[Head]) -> Iterator[DamageError
         if head.kind != RETRACT:
             continue
         gone = unspanned(head.attributes["sequences"])
-        if strange := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
+        if others := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
             yield DamageError(
-                f"row {head.sequence} of {path} retracts {strange[:5]}, which are no observations, or retracted before",
+                f"row {head.sequence} of {path} retracts {others[:5]}, which are no observations, or retracted before",
                 path=path,
                 sequence=head.sequence,
             )

@@ -73,25 +73,25 @@ def _check_sums(arrays: Arrays, pairs: Any, quantities: Mapping[str, Quantity], 
         expect(sound, "quantity-sums", f"sums of 1 to {most} values of {quantity!r}", (count, total, squares))
 
 
-def _axes(told: Any) -> dict[str, list[str]]:
+def _axes(stored: Any) -> dict[str, list[str]]:
     """Axis → its labels."""
-    expect(isinstance(told, list) and len(told) <= MOST_AXES, "targets.axes", f"at most {MOST_AXES} axes", told)
-    for each in told:
+    expect(isinstance(stored, list) and len(stored) <= MOST_AXES, "targets.axes", f"at most {MOST_AXES} axes", stored)
+    for each in stored:
         whole_ = isinstance(each, list) and len(each) == 2 and isinstance(each[1], list)
         expect(whole_, "targets.axes", "an axis and its labels", each)
         names = [name("targets.axes", own) for own in (each[0], *each[1])][1:]
         expect(len(set(names)) == len(names) > 0, "targets.axes", "different labels", names)
-    axes: dict[str, list[str]] = dict(told)
-    expect(len(axes) == len(told), "targets.axes", "different axes", told)
+    axes: dict[str, list[str]] = dict(stored)
+    expect(len(axes) == len(stored), "targets.axes", "different axes", stored)
     return axes
 
 
 def _check_annotations(
-    field: str, told: Any, copies: Sequence[int], quantities: Mapping[str, Quantity], axes: Mapping[str, list[str]]
+    field: str, stored: Any, copies: Sequence[int], quantities: Mapping[str, Quantity], axes: Mapping[str, list[str]]
 ) -> int:
     """How many observations of the touches of a sample were annotated; copies: at most so many of each."""
-    expect(isinstance(told, list) and len(told) == len(copies), field, "one of each touch", told)
-    for of, most in zip(told, copies, strict=True):
+    expect(isinstance(stored, list) and len(stored) == len(copies), field, "one of each touch", stored)
+    for of, most in zip(stored, copies, strict=True):
         pairs = isinstance(of, list) and all(isinstance(each, list) and len(each) == 2 for each in of)
         expect(pairs, field, "annotations, each with the observations that had it", of)
         for attributes, count in of:
@@ -104,4 +104,4 @@ def _check_annotations(
             for axis, label in attributes.get(LABELS, {}).items():
                 expect(label in axes.get(axis, ()), field, "labels that touches have", attributes)
         expect(sum(count for _, count in of) <= most, field, f"at most {most} observations", of)
-    return sum(count for of in told for _, count in of)
+    return sum(count for of in stored for _, count in of)

@@ -108,7 +108,7 @@ def test_a_risk_is_a_share(learner, risk):
 
 
 def test_a_rule_says_known_where_it_is_sure_and_new_where_it_is_strange():
-    rule = DecisionRule((5, 10), 0.05, sure=0.97, together=0.98, strange=6.0)
+    rule = DecisionRule((5, 10), 0.05, sure=0.97, together=0.98, least_new=6.0)
     known = {probability: Prediction("oak", probability, (), 0.0, True, 1.0) for probability in (0.94, 0.96, 0.97)}
     new = {novelty: Prediction("oak", 0.99, (), novelty, False, 1.0) for novelty in (5.9, 6.0)}
     assert [rule.decided(known[p], 5) for p in known] == [False, False, True]

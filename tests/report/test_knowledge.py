@@ -78,10 +78,10 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
 
 def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
     key = SCENE.touch(NAMES[0], 0, seconds=1.0).key
-    _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.05, sure=0.0, together=0.0, strange=0.0))
+    _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.05, sure=0.0, together=0.0, least_new=0.0))
     assert found[0].seconds == (0.1, 0.3, 0.5, 1.0)
     assert found[0].decided == 0
-    _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.0, sure=1.1, together=1.1, strange=1e9))
+    _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.0, sure=1.1, together=1.1, least_new=1e9))
     assert found[0].decided is None
 
 
@@ -98,12 +98,12 @@ def test_a_few_touches_of_different_materials_are_chosen(learner):
 def test_how_soon_answers_come_is_counted(learner):
     model = learner.model()
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
-    counted = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, together=0.0, strange=0.0), 0.05)
+    counted = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, together=0.0, least_new=0.0), 0.05)
     assert counted.decided == (1.0,) * len(counted.seconds)
     assert counted.median == counted.seconds[0]
     assert len(set(counted.wrong)) == 1
     assert counted.wrong[0] >= 1 - counted.right[0] - 1e-9
-    never = soon(model, extractor, DecisionRule((1,), 0.0, sure=1.1, together=1.1, strange=1e9), 0.05)
+    never = soon(model, extractor, DecisionRule((1,), 0.0, sure=1.1, together=1.1, least_new=1e9), 0.05)
     assert never.decided == never.wrong == (0.0,) * len(counted.seconds)
     assert never.median is None
     assert never.right == counted.right

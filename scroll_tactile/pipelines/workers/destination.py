@@ -63,7 +63,7 @@ class Destination:
     def __init__(
         self,
         place: Path,
-        asked: RecipeRequest,
+        requested: RecipeRequest,
         options: SourceOptions,
         patience: float | None,
         stack: ExitStack,
@@ -73,12 +73,12 @@ class Destination:
         self._place, self._stack, self._report, self._descriptions = place, stack, report, descriptions
         self.learner: TactileLearner | None = None
         if place.exists():
-            self.learner = stack.enter_context(TactileLearner.open(place, **asked.arguments))
+            self.learner = stack.enter_context(TactileLearner.open(place, **requested.arguments))
             hush(self.learner)
         there = {} if self.learner is None else self.learner.quantities
         for quantity in options.declared:
             require_declarable(there, quantity)
-        recipe = asked.recipe() if self.learner is None else self.learner._recipe
+        recipe = requested.recipe() if self.learner is None else self.learner._recipe
         self.making = Making(recipe, options, patience, tuple(there.values()))
         self.learned = self.learner is not None and bool(self.learner.observations())
         self._made = self.learner is None

@@ -1,4 +1,4 @@
-"""`rerun-importer-scroll-tactile`: what Rerun starts for a file or folder that it does not know, to write it as its own.
+"""`rerun-importer-scroll-tactile`: what Rerun starts for a file or folder that it does not know, to write it for it.
 
 Rerun starts every executable on PATH with this beginning for a folder and for each file in it, all at once, so what is
 not ours has to be known before anything is imported. Rerun reads `.mcap` itself and asks nobody; of such a bag it is
@@ -13,12 +13,11 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from scroll_tactile.learner import TactileLearner
-
-# ruff: noqa: PTH  # pathlib takes as long to import as all of this
 
 __all__ = ["INCOMPATIBLE", "MEMORY", "main"]
 
@@ -37,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     chosen = _parser().parse_known_args(arguments)[0]
     memory = chosen.memory or os.environ.get(MEMORY) or None
     named = bool(memory or chosen.topic or chosen.field or chosen.preset)
-    kind, chosen.path = _kind(chosen.path, chosen.application_id or "")
+    kind, chosen.path = _kind(chosen.path, chosen.application_id or "", named)
     if kind == "inside":
         sys.exit(0)  # shown with its memory: an error for each of its files would bury that
     if kind == "" or (kind == "readings" and not named):
@@ -48,11 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="rerun-importer-scroll-tactile",
+        allow_abbrev=False,
         description="Show a memory, or a recording of touches, in Rerun, which starts this for a path that it is to "
         "open. By hand: rerun-importer-scroll-tactile PATH | rerun -",
         epilog=f"Rerun gives no options of its user on: for those, ${MEMORY} names the memory.",
     )
-    parser.add_argument("path", help="the folder of a memory, or a recording")
+    parser.add_argument("path", type=Path, help="the folder of a memory, or a recording")
     parser.add_argument("--memory", help=f"the memory that answers to a recording's touches; else ${MEMORY}")
     parser.add_argument("--topic", help="of a recording: which topic")
     parser.add_argument("--field", help="of a recording: where its numbers are")
@@ -63,45 +63,43 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _kind(path: str, application: str) -> tuple[Kind, str]:
+def _kind(path: Path, application: str, named: bool) -> tuple[Kind, Path]:
     """What there is to show, and where: a "memory", a "bag", which names its types, "readings", which do not; else "".
 
     "inside": it is a part of what is shown already, as Rerun opened the folder around it; it calls the application by
-    what it opened.
+    what it opened. named: whether a memory or readings were named, without which readings are not shown.
     """
-    if os.path.isdir(path):
+    if path.is_dir():
         return _folder(path), path
-    if not os.path.isfile(path):  # neither a pipe nor a device
+    if not path.is_file():  # neither a pipe nor a device
         return "", path
-    folder = os.path.abspath(path)
-    for _ in range(DEEPEST):
-        folder = os.path.dirname(folder)
+    for folder in path.absolute().parents[:DEEPEST]:
         kind = _folder(folder)
-        if kind and _stem(folder) == application != _stem(path):
+        if (kind == "bag" or (kind and named)) and _stem(folder) == application != _stem(path):
             return "inside", folder
         if kind == "memory":
-            return ("memory", folder) if os.path.basename(path) == CURRENT else ("inside", folder)
-    name = path.lower()
+            return ("memory", folder) if path.name == CURRENT else ("inside", folder)
+    name = path.name.lower()
     return "bag" if name.endswith(BAGS) else "readings" if name.endswith(FILES) else "", path
 
 
-def _folder(path: str) -> Kind:
-    found = next((name for name in FOLDERS if os.path.isfile(os.path.join(path, name))), None)
+def _folder(path: Path) -> Kind:
+    found = next((name for name in FOLDERS if (path / name).is_file()), None)
     return "memory" if _is_memory(path) else "" if found is None else "bag" if found == FOLDERS[0] else "readings"
 
 
-def _stem(path: str) -> str:
+def _stem(path: Path) -> str:
     """What Rerun calls the application that it opens a path for."""
-    return os.path.splitext(os.path.basename(path.rstrip(os.sep)))[0].replace(".", "_")
+    return path.stem.replace(".", "_")
 
 
-def _is_memory(folder: str) -> bool:
+def _is_memory(folder: Path) -> bool:
     """Whether a folder is a memory's; databases have a file of this name, too."""
-    place = os.path.join(folder, CURRENT)
+    place = folder / CURRENT
     try:
-        if not os.path.isfile(place):  # neither a pipe nor a device
+        if not place.is_file():
             return False
-        with open(place, "rb") as file:
+        with place.open("rb") as file:
             return file.read(len(BEGINNING)) == BEGINNING
     except OSError:
         return False
@@ -122,7 +120,7 @@ def _import(chosen: argparse.Namespace, kind: Kind, memory: str | None, named: b
     except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
         print(f"rerun-importer-scroll-tactile: {error}", file=sys.stderr)
         others = isinstance(error, ChannelCountError | FieldError) and not (chosen.topic or chosen.field)
-        return INCOMPATIBLE if others or not named and kind == "bag" else 1
+        return INCOMPATIBLE if others or (kind == "bag" and not named) else 1
     return 0
 
 
@@ -148,14 +146,12 @@ def _recording(chosen: argparse.Namespace, memory: str | None) -> None:
     stream.flush()
 
 
-def _opened(path: str) -> TactileLearner:
+def _opened(path: Path) -> TactileLearner:
     """A memory to read, whatever its embedding."""
-    from pathlib import Path
-
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.memory.identity import absent_embedding
 
-    return TactileLearner.open(path, embedding=absent_embedding(Path(path)), mode="read")
+    return TactileLearner.open(path, embedding=absent_embedding(path), mode="read")
 
 
 def _stream(chosen: argparse.Namespace) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,7 @@ class _MemoryLog:
         """All of it; what takes longest comes last."""
         left = [("Tensor", "touch", "touch"), ("TextDocument", "about", "about"), ("TextLog", "events", "events")]
         right = [
-            ("TimeSeries", "probability of its own name, held out", "held_out"),
+            ("Share", "probability of its own name, held out", "held_out"),
             ("TimeSeries", "novelty, held out", "novelty"),
             ("TimeSeries", "touches", "count"),
             ("TimeSeries", "evidence that the sensor changed, power of ten", "health"),
@@ -74,21 +73,20 @@ class _MemoryLog:
 
     def _counts(self) -> None:
         """How many touches of each material there were after each row."""
-        counts: Counter[str] = Counter()
-        points: dict[str, tuple[list[int], list[float], list[int]]] = {}
+        points: dict[str, list[tuple[int, float]]] = {}
         for row in self.rows.values():
             if row.material in self.names:
-                counts[row.material] += 1
-                own = points.setdefault(row.material, ([], [], []))
-                for column, value in zip(own, (row.sequence, row.time, counts[row.material]), strict=True):
-                    column.append(value)  # type: ignore[arg-type]
-        for name, (sequences, times, own_counts) in points.items():
+                points.setdefault(row.material, []).append((row.sequence, row.time))
+        for name, own in points.items():
+            sequences, times = zip(*own, strict=True)
             columns = [
                 self.rr.TimeColumn(OBSERVATION, sequence=sequences),
                 self.rr.TimeColumn(OBSERVED, timestamp=times),
             ]
-            scalars = self.rr.Scalars.columns(scalars=np.array(own_counts, dtype=np.float64))
-            self.stream.send_columns(self._path(entity("count", name)), columns, scalars)
+            path = self._path(entity("count", name))
+            self.stream.log(path, self.rr.SeriesLines(interpolation_mode="StepAfter"), static=True)
+            counts = self.rr.Scalars.columns(scalars=np.arange(1.0, len(own) + 1))
+            self.stream.send_columns(path, columns, counts)
 
     def _kept(self) -> None:
         for place, touch in enumerate(self.facts.kept, start=1):

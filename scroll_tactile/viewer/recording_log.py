@@ -36,7 +36,9 @@ def read_for(path: str | PathLike[str], sensor: Sensor | None, **chosen: Any) ->
         fitting = [entry for entry in contents.entries if _fits(entry.shape, entry.kind, sensor)]
         if not fitting:
             whose = "a known sensor" if sensor is None else f"sensor {sensor.name!r}, shape {sensor.shape}"
-            raise FieldError(f"expected readings of {whose}; none of what is there has them: give topic and field. {contents}")
+            raise FieldError(
+                f"expected readings of {whose}; none of what is there has them: give topic and field. {contents}"
+            )
         chosen = {"topic": fitting[0].topic, "field": fitting[0].field or None}
     recording = read(path, **chosen)
     if sensor is None:
@@ -67,9 +69,9 @@ def _sensor_of(recording: Recording, preset: str | None) -> Sensor:
         return Sensor(name="camera", rate=rate, unit="counts", duration=1.0, **frames)
     seen = readings[np.isfinite(readings)].astype(np.float64)
     low, high = (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
-    ends = {"low": low, "high": high if high > low else low + 1.0}
-    channels = int(np.prod(readings.shape[1:]))
-    return Sensor(name="seen", channels=channels, rate=rate, unit="", duration=4.0, non_finite="missing", **ends)
+    high, channels = high if high > low else low + 1.0, int(np.prod(readings.shape[1:]))
+    of_any: dict[str, Any] = {"unit": "", "duration": 4.0, "non_finite": "missing"}
+    return Sensor(name="seen", channels=channels, rate=rate, low=low, high=high, **of_any)
 
 
 def log_recording(

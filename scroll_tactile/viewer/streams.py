@@ -19,6 +19,7 @@ __all__ = ["APPLICATION", "VIEWER", "entity", "in_words", "layout", "rerun", "st
 APPLICATION = "scroll-tactile"
 VIEWER = "viewer"  # what names the one that runs on this machine
 ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
+View = tuple[str, str, str]  # its kind, its name, and the path of what it shows; of kind "Share" lines from 0 to 1
 ANSWERS_WITHIN = 2.0  # seconds: a viewer that is there takes milliseconds
 
 
@@ -73,20 +74,23 @@ def _require_viewer(address: str) -> None:
         ) from None
 
 
-def layout(prefix: str, left: Sequence[tuple[str, str, str]], right: Sequence[tuple[str, str, str]], time: str) -> Any:
-    """A blueprint of two columns. left, right: kind of view, name, and entity below the prefix. time: its timeline."""
+def layout(prefix: str, left: Sequence[View], right: Sequence[View], time: str) -> Any:
+    """A blueprint of two columns. prefix: of all entities. time: the timeline that it begins with."""
     rrb = importlib.import_module("rerun.blueprint")
+    more: dict[str, dict[str, Any]] = {
+        "Tensor": {"view_fit": "fill"},
+        "Share": {"axis_y": rrb.ScalarAxis(range=(0, 1))},
+    }
 
-    def column(views: Sequence[tuple[str, str, str]]) -> Any:
-        root = f"/{prefix}" if prefix else ""
-        return rrb.Vertical(
-            *(getattr(rrb, f"{kind}View")(origin=f"{root}/{path}", name=name) for kind, name, path in views)
-        )
+    def column(views: Sequence[View]) -> Any:
+        made = []
+        for kind, name, path in views:
+            view = getattr(rrb, "TimeSeriesView" if kind == "Share" else f"{kind}View")
+            made.append(view(origin=f"/{prefix}/{path}" if prefix else f"/{path}", name=name, **more.get(kind, {})))
+        return rrb.Vertical(*made)
 
-    panel = rrb.TimePanel(timeline=time, expanded=False)
-    return rrb.Blueprint(
-        rrb.Horizontal(column(left), column(right)), rrb.BlueprintPanel(expanded=False), panel, collapse_panels=False
-    )
+    panels = rrb.BlueprintPanel(expanded=False), rrb.SelectionPanel(expanded=False), rrb.TimePanel(timeline=time)
+    return rrb.Blueprint(rrb.Horizontal(column(left), column(right)), *panels)
 
 
 def in_words(prediction: Prediction) -> str:

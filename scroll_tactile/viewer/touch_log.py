@@ -45,12 +45,14 @@ class TouchLog:
         if sensor.camera:
             left[1] = ("Spatial2D", "readings", "readings")
         right = [
-            ("TimeSeries", "probability", "answer/probability"),
+            ("Share", "probability", "answer/probability"),
             ("TimeSeries", "novelty", "answer/novelty"),
             ("TimeSeries", "level", "level"),
-            ("TimeSeries", "contact", "contact"),
+            ("Share", "contact", "contact"),
         ]
         stream.send_blueprint(layout(prefix, left, right, TIME))
+        steps = self._rr.SeriesLines(interpolation_mode="StepAfter")
+        stream.log(self._path("contact"), steps, static=True)
 
     def take(self, reading: Rows, at: float) -> None:
         """A reading of the sensor, at a time in seconds."""
@@ -134,7 +136,10 @@ class TouchLog:
         rows, times = np.stack(self._rows).astype(np.float32), np.array(self._times)
         self._rows, self._times = [], []
         low, high = self._sensor.limits
-        level = np.nanmean(((rows - low) / (high - low)).reshape(len(rows), -1), axis=1)
+        shares, read = (rows - low) / (high - low), np.isfinite(rows)
+        level = np.where(read, shares, 0).reshape(len(rows), -1).sum(axis=1) / np.maximum(
+            read.reshape(len(rows), -1).sum(axis=1), 1
+        )
         if self._sensor.camera:
             shown: Any = self._rr.Image(np.clip(scaled_down(rows, *FRAME)[0], 0, 255).astype(np.uint8))
         else:

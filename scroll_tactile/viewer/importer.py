@@ -12,7 +12,8 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -75,7 +76,7 @@ def _kind(path: Path, application: str, named: bool) -> tuple[Kind, Path]:
         return "", path
     for folder in path.absolute().parents[:DEEPEST]:
         kind = _folder(folder)
-        if (kind == "bag" or (kind and named)) and _stem(folder) == application != _stem(path):
+        if (kind in ("memory", "bag") or (kind and named)) and _stem(folder) == application != _stem(path):
             return "inside", folder
         if kind == "memory":
             return ("memory", folder) if path.name == CURRENT else ("inside", folder)
@@ -127,10 +128,8 @@ def _import(chosen: argparse.Namespace, kind: Kind, memory: str | None, named: b
 def _memory(chosen: argparse.Namespace) -> None:
     from scroll_tactile.viewer.memory_log import log_memory
 
-    with _opened(chosen.path) as learner:
-        stream = _stream(chosen)
+    with _opened(chosen.path) as learner, _stream(chosen) as stream:
         log_memory(stream, learner, chosen.entity_path_prefix.strip("/"))
-        stream.flush()
 
 
 def _recording(chosen: argparse.Namespace, memory: str | None) -> None:
@@ -140,10 +139,8 @@ def _recording(chosen: argparse.Namespace, memory: str | None) -> None:
     where: dict[str, Any] = {"topic": chosen.topic, "field": chosen.field, "preset": chosen.preset}
     learner = None if memory is None else TactileLearner.open(memory, mode="read")
     recording, sensor = read_for(chosen.path, None if learner is None else learner.sensor, **where)
-    stream = _stream(chosen)
-    with learner or TactileLearner(sensor=sensor) as player:
+    with learner or TactileLearner(sensor=sensor) as player, _stream(chosen) as stream:
         log_recording(stream, recording, player, chosen.entity_path_prefix.strip("/"))
-    stream.flush()
 
 
 def _opened(path: Path) -> TactileLearner:
@@ -154,10 +151,13 @@ def _opened(path: Path) -> TactileLearner:
     return TactileLearner.open(path, embedding=absent_embedding(path), mode="read")
 
 
-def _stream(chosen: argparse.Namespace) -> Any:
+@contextmanager
+def _stream(chosen: argparse.Namespace) -> Iterator[Any]:
     """A stream of Rerun on the standard output, under the names that it asked for."""
     from scroll_tactile.viewer.streams import APPLICATION, rerun
 
     stream = rerun().RecordingStream(chosen.application_id or APPLICATION, recording_id=chosen.recording_id)
     stream.stdout()
-    return stream
+    yield stream
+    stream.flush()
+    stream.disconnect()

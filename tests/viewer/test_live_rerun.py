@@ -1,6 +1,7 @@
 """`scroll-tactile live --rerun`: a file, a viewer that listens, and what cannot be."""
 
 import json
+import signal
 import socket
 import subprocess
 import sys
@@ -27,7 +28,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("live")
     random = np.random.default_rng(1)
     with TactileLearner.open(place / "memory", sensor=PAD, embedding=SMALL) as learner:
-        learner.declare(Quantity("force", "N", 0, 10, 0.01))
+        learner.declare(Quantity(name="force", unit="N", low=0.0, high=10.0, resolution=0.01))
         for repetition in range(6):
             for material in "abc":
                 learner.observe(material, slide(material, 50, random), values={"force": 1.0 + repetition})
@@ -68,17 +69,26 @@ def test_a_viewer_that_listens_gets_it(folder, tmp_path):
     viewer = [sys.executable, "-m", "rerun", "--save", tmp_path / "got.rrd", "--port", port, "--bind", "127.0.0.1"]
     with subprocess.Popen([*map(str, viewer)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
         try:
-            for _ in range(600):
-                with socket.socket() as tried:
-                    if tried.connect_ex(("127.0.0.1", port)) == 0:
-                        break
-                time.sleep(0.1)
+            _wait_for(lambda: _listens(port))
             result = run(*words)
             assert result.exit_code == 0, result.output
-            process.wait(120)  # it ends when the stream does
+            _wait_for(lambda: len(tensors(rows(tmp_path / "got.rrd"), "/touch")) == 3)
+            process.send_signal(signal.SIGINT)
+            process.wait(60)
         finally:
             process.kill()
     assert len(tensors(rows(tmp_path / "got.rrd"), "/touch")) == 3
+
+
+def _listens(port):
+    with socket.socket() as tried:
+        return tried.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _wait_for(holds, seconds=60):
+    until = time.monotonic() + seconds
+    while not holds() and time.monotonic() < until:
+        time.sleep(0.2)
 
 
 @pytest.mark.parametrize("target", ["picture.png", "nowhere/out.rrd", "http://host", "", "rerun+http://host:x/proxy"])

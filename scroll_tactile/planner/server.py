@@ -141,7 +141,7 @@ class _Tools:
         """A file in the served folder, wherever its links lead. Raises InputError for any other."""
         if self._files is None:
             raise InputError("no folder of recordings is served: start with --files FOLDER, or give readings")
-        place = (self._files / file).resolve()
+        place = self._files if "\0" in file else (self._files / file).resolve()
         if not place.is_relative_to(self._files) or not place.is_file() or place.stat().st_size > LARGEST_FILE:
             raise InputError(
                 f"expected a file in the served folder, of at most {LARGEST_FILE >> 20} MB; came {file!r:.80}"

@@ -92,7 +92,9 @@ def test_what_cannot_be_is_a_tools_error_that_says_what_to_do(folder):
         *files,
     ]
     _, answers = talk(folder, "--files", folder / "files", calls=calls)
-    told = ["one of them", "(T, 2)", "Were values lost", "nothing", "readings", "most", "observe"] + ["in the served folder"] * 5
+    told = ["one of them", "(T, 2)", "Were values lost", "nothing", "readings", "most", "observe"] + [
+        "in the served folder"
+    ] * 5
     for (name, arguments), answer, words in zip(calls, answers, told, strict=True):
         assert isinstance(answer, str) and words in answer, (name, arguments, answer)
         assert str(folder) not in answer

@@ -10,7 +10,7 @@ from scroll_tactile import __version__, native
 from scroll_tactile.cli.bulk import evaluate, fleet, learn
 from scroll_tactile.cli.everyday import compose, describe, inspect, observe, predict
 from scroll_tactile.cli.replay import live
-from scroll_tactile.cli.robot import PASSED_ON, ros2
+from scroll_tactile.cli.robot import PASSED_ON, mcp, ros2
 from scroll_tactile.cli.showing import demo, report
 from scroll_tactile.cli.terminal import Commands
 from scroll_tactile.cli.upkeep import memory
@@ -42,7 +42,7 @@ def main(
     """Take the options that belong to no command."""
 
 
-for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report):
+for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report, mcp):
     app.command()(command)
 app.command(context_settings=PASSED_ON)(ros2)
 app.add_typer(memory, name="memory")

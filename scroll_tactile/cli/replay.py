@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.results import Estimate
+    from scroll_tactile.sensors import Sensor
+    from scroll_tactile.viewer.touch_log import TouchLog
 
 __all__ = ["live"]
 
@@ -48,12 +50,20 @@ def live(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
     of: Axis = None,
+    rerun: Annotated[
+        str | None,
+        typer.Option(
+            help="Show it in Rerun, too: 'viewer', the one that runs here; the address of another, such as "
+            "rerun+http://robot:9876/proxy; or a new file that ends with .rrd.",
+            metavar="VIEWER|ADDRESS|FILE",
+        ),
+    ] = None,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
     from scroll_tactile.recordings.recording import places
 
     screen = console()
-    with opened(memory, mode="read") as learner:
+    with opened(memory, mode="read") as learner, _in_rerun(rerun, learner.sensor) as log:
         shape = learner.sensor.shape
         session = learner.live(risk=risk, contact="manual" if touch else "auto", of=of)
         growing = Live(console=screen, auto_refresh=False, transient=True)
@@ -65,12 +75,36 @@ def live(
             for count, row in enumerate(_rows(file, timed), start=1):
                 reading, time = (row[1:], float(row[0])) if timed else (row, None)
                 reading = reading if columns is None else reading[places(columns, reading.size)]
-                now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)
+                reading = reading.reshape(shape) if reading.size == learner.sensor.channels else reading
+                now = session.push(reading, time)
                 at = count / learner.sensor.rate if time is None else time
                 before = _shown(before, now, at, as_json, growing)
+                if log is not None:
+                    log.take(reading, at)
+                    log.show(now, at)
             if touch:
-                _shown(before, session.end(), at, as_json, growing)
+                now = session.end()
+                _shown(before, now, at, as_json, growing)
+                if log is not None:
+                    log.show(now, at)
         _summed_up(session.report, as_json)
+
+
+@contextmanager
+def _in_rerun(target: str | None, sensor: Sensor) -> Iterator[TouchLog | None]:
+    """What writes to Rerun; None where nobody asked for it."""
+    if target is None:
+        yield None
+        return
+    from scroll_tactile.viewer.streams import stream_to
+    from scroll_tactile.viewer.touch_log import TouchLog
+
+    with stream_to(target) as stream:
+        log = TouchLog(stream, sensor)
+        try:
+            yield log
+        finally:
+            log.close()
 
 
 def _rows(file: Path, timed: bool = False) -> Iterator[npt.NDArray[np.float64]]:

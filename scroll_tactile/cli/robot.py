@@ -1,4 +1,4 @@
-"""`scroll-tactile ros2`: a memory as a ROS 2 node."""
+"""`scroll-tactile ros2` and `mcp`: a memory as a ROS 2 node, and as tools for planners."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal, cast
 
 import typer
 
-from scroll_tactile.cli.options import Axis, sensor_for
+from scroll_tactile.cli.options import Axis, MemoryFolder, sensor_for
 from scroll_tactile.cli.terminal import opened, say, shown
 from scroll_tactile.errors import InputError
 
-__all__ = ["PASSED_ON", "ros2"]
+__all__ = ["PASSED_ON", "mcp", "ros2"]
 
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """What the command is made with, so that --ros-args and what follows reach ROS."""
@@ -72,6 +72,25 @@ def ros2(
         count = len(learner.materials)
     counted = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
     say(f"{shown(memory)}: {count} materials. {counted}")
+
+
+def mcp(
+    memory: MemoryFolder,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="Let it observe and retract, too; without it the memory stays as it is.")
+    ] = False,
+    files: Annotated[
+        Path | None, typer.Option(help="A folder whose recordings it may name in place of readings.")
+    ] = None,
+) -> None:
+    """Serve a memory to a planner over standard input and output, by the Model Context Protocol, until it hangs up.
+
+    Its tools: what_is_felt, what_is_known, what_to_touch_again; with --learn observe and retract.
+    """
+    from scroll_tactile.planner.server import serve
+
+    with opened(memory, mode="write" if learn else "read") as learner:
+        serve(learner, learn=learn, files=files)
 
 
 def _place(topic: str | None, field: str | None, preset: str | None) -> tuple[str, str]:

@@ -23,7 +23,7 @@ from scroll_tactile.cli import INTERRUPTED
 from scroll_tactile.cli.wording import has_option, in_options, typed
 from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, plain_cell, printable
 from scroll_tactile.results import Estimate, Prediction
-from store import NotAStoreError, Store, StoreError
+from store import NotAStoreError, StoreError
 
 if TYPE_CHECKING:
     from scroll_tactile.learner import TactileLearner
@@ -166,13 +166,11 @@ def _no_memory(path: Path) -> InputError:
 def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:
     """A memory of any embedding, for all that needs none: showing, retracting, merging, compacting, exporting."""
     from scroll_tactile.learner import TactileLearner
-    from scroll_tactile.memory.identity import AbsentEmbedding, Identity
+    from scroll_tactile.memory.identity import absent_embedding
 
     if not path.exists():
         raise _no_memory(path)
-    with Store.open(path, mode="read") as store:
-        identity = Identity.read(store)
-    return TactileLearner.open(path, embedding=AbsentEmbedding(identity, path), mode=mode)
+    return TactileLearner.open(path, embedding=absent_embedding(path), mode=mode)
 
 
 def percent(share: float) -> str:

@@ -31,7 +31,7 @@ from scroll_tactile.signals.windows import COMPETING, ScaleKind
 from scroll_tactile.statistics.grid import BITS
 from store import DamageError, Store
 
-__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identity"]
+__all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identity", "absent_embedding"]
 LARGEST_DIMENSION = 2**14  # of an embedding: a second moment of more takes over a GiB a scale
 MOST_STREAMS = 2**31
 WIDEST = 2**31  # of a sensor at once, or in one channel of a touch
@@ -319,6 +319,12 @@ class AbsentEmbedding:
     ) -> tuple[Mapping[int, npt.NDArray[np.floating]], npt.NDArray[np.floating]]:
         """As the embedding does. Raises EmbeddingMismatchError where only its user can make it."""
         return embed_competing(self._made, image, windows, width)
+
+
+def absent_embedding(path: Path) -> AbsentEmbedding:
+    """The embedding with which a memory is opened whatever its own is. Raises StoreError where there is none."""
+    with Store.open(path, mode="read") as store:
+        return AbsentEmbedding(Identity.read(store), path)
 
 
 def _is_exact(configuration: Mapping[str, Any]) -> bool:

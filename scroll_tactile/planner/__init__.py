@@ -1,0 +1,1 @@
+"""A memory as tools for planners, over the Model Context Protocol."""

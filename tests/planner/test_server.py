@@ -1,0 +1,141 @@
+"""`scroll-tactile mcp`, a real process, and the client of the protocol's own package."""
+
+import sys
+from pathlib import Path
+
+import anyio
+import numpy as np
+import pytest
+from commands import refused
+from live_touches import slide
+from touches import PAD, SMALL
+
+from scroll_tactile import Quantity, TactileLearner
+from scroll_tactile.errors import InputError
+from scroll_tactile.planner import server
+
+pytest.importorskip("mcp", reason="the extra mcp is not installed")
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place, random = tmp_path_factory.mktemp("planner"), np.random.default_rng(1)
+    with TactileLearner.open(place / "memory", sensor=PAD, embedding=SMALL) as learner:
+        learner.declare(Quantity(name="force", unit="N", low=0.0, high=10.0, resolution=0.01))
+        learner.describe("a", {"cotton": 1.0})
+        for repetition in range(8):
+            for material in "abc" if repetition < 3 else "ab":
+                learner.observe(material, slide(material, 50, random), values={"force": 1.0 + repetition})
+    (place / "files" / "day").mkdir(parents=True)
+    np.save(place / "files" / "day" / "t.npy", slide("b", 50, np.random.default_rng(5)))
+    np.save(place / "outside.npy", slide("b", 50, random))
+    (place / "files" / "link.npy").symlink_to(place / "outside.npy")
+    return place
+
+
+def talk(folder, *options, calls=()):
+    """The names of the tools, and what each call gives: its content, or the text of its error."""
+    from mcp.client.client import Client
+    from mcp.client.stdio import StdioServerParameters, stdio_client
+
+    words = ["-m", "scroll_tactile.cli", "mcp", str(folder / "memory"), *map(str, options)]
+    process = StdioServerParameters(command=sys.executable, args=words, env={"PYTHONPATH": str(ROOT)})
+
+    async def session():
+        async with Client(stdio_client(process)) as client:
+            names = [tool.name for tool in (await client.list_tools()).tools]
+            results = [await client.call_tool(name, arguments) for name, arguments in calls]
+        return names, results
+
+    names, results = anyio.run(session)
+    return names, [each.content[0].text if each.is_error else each.structured_content for each in results]
+
+
+def test_what_is_felt_known_and_to_be_touched_again(folder):
+    touch = slide("b", 50, np.random.default_rng(5))
+    calls = [
+        ("what_is_felt", {"readings": touch.tolist()}),
+        ("what_is_felt", {"file": "day/t.npy"}),
+        ("what_is_felt", {"readings": touch.tolist(), "scene": ["a", "c"]}),
+        ("what_is_known", {}),
+        ("what_is_known", {"material": "a"}),
+        ("what_to_touch_again", {}),
+    ]
+    names, answers = talk(folder, "--files", folder / "files", calls=calls)
+    assert names == ["what_is_felt", "what_is_known", "what_to_touch_again"]
+    with TactileLearner.open(folder / "memory", mode="read") as learner:
+        expected, force = learner.predict(touch), learner.estimate(touch)["force"]
+    felt, of_file, within, known, one, again = answers
+    assert (felt["material"], felt["probability"], felt["known"]) == ("b", expected.probability, expected.known)
+    assert felt["quantities"]["force"]["value"] == pytest.approx(force.value)
+    assert of_file == felt
+    assert set(within["ranking"]) == {"a", "c"}
+    assert known["materials"] == {"a": 8, "b": 8, "c": 3} and known["quantities"] == {"force": "N"}
+    assert known["sensor"]["channels"] == 2 and "no change of the sensor" in known["health"]
+    assert one == {"touches": 8, "description": {"cotton": 1.0}}
+    assert [each["material"] for each in again["result"]] == ["c"]
+    assert "touched 3 times only" in again["result"][0]["why"]
+
+
+def test_what_cannot_be_is_a_tools_error_that_says_what_to_do(folder):
+    files = [("what_is_felt", {"file": name}) for name in ("../outside.npy", "link.npy", "day", "/dev/zero", "a\0b")]
+    calls = [
+        ("what_is_felt", {}),
+        ("what_is_felt", {"readings": [[0.1, 0.2, 0.3]] * 5}),
+        ("what_is_felt", {"readings": [[0.1, 0.2], [0.1]]}),
+        ("what_is_felt", {"readings": [[0.5, 0.5]] * 4, "scene": ["nothing"]}),
+        ("what_is_felt", {"readings": "no numbers"}),
+        ("what_to_touch_again", {"most": 10**9}),
+        ("observe", {"material": "d", "readings": [[0.5, 0.5]] * 9}),
+        *files,
+    ]
+    _, answers = talk(folder, "--files", folder / "files", calls=calls)
+    told = ["one of them", "(T, 2)", "Were values lost", "nothing", "readings", "most", "observe"] + [
+        "in the served folder"
+    ] * 5
+    for (name, arguments), answer, words in zip(calls, answers, told, strict=True):
+        assert isinstance(answer, str) and words in answer, (name, arguments, answer)
+        assert str(folder) not in answer
+
+
+def test_only_with_learn_it_observes_and_retracts(folder, tmp_path):
+    with TactileLearner.open(tmp_path / "memory", sensor=PAD, embedding=SMALL) as learner:
+        before = learner.digest()
+    readings = slide("a", 50, np.random.default_rng(9)).tolist()
+    names, answers = talk(
+        tmp_path,
+        "--learn",
+        calls=[
+            ("observe", {"material": "silk", "readings": readings}),
+            ("observe", {"material": "silk", "readings": readings}),
+            ("what_is_known", {"material": "silk"}),
+            ("retract", {"observation": 1}),
+            ("retract", {"observation": 1}),
+            ("what_is_felt", {"file": "t.npy"}),
+        ],
+    )
+    assert names[3:] == ["observe", "retract"]
+    learned, repeated, known, gone, again, file = answers
+    assert learned == {"observation": 1, "material": "silk", "repeated": False} and repeated["repeated"]
+    assert known["touches"] == 1 and gone == {"retracted": 1}
+    assert "retracted" in again and "--files" in file
+    with TactileLearner.open(tmp_path / "memory", mode="read") as learner:
+        assert learner.digest() == before and learner.materials == {}
+
+
+def test_a_call_is_bounded(folder, monkeypatch):
+    monkeypatch.setattr(server, "MOST_VALUES", 10)
+    monkeypatch.setattr(server, "LARGEST_FILE", 10)
+    with TactileLearner.open(folder / "memory", mode="read") as learner:
+        tools = server._Tools(learner, folder / "files")
+        with pytest.raises(InputError, match="at most 10 numbers"):
+            tools.what_is_felt([[0.0, 1.0]] * 6)
+        with pytest.raises(InputError, match="expected a file"):
+            tools.what_is_felt(file="day/t.npy")
+
+
+def test_what_cannot_be_served_is_one_red_line(folder):
+    assert "expected a folder" in refused("mcp", folder / "memory", "--files", folder / "nothing")
+    assert "no memory" in refused("mcp", folder / "nothing")

@@ -213,6 +213,10 @@ class LeRobot(Source):
         annotations = {text: self._column_of(batch, *own) for text, own in reading.annotating.items()}
         return Block(values, {clock: times}, counters, numbers.get("episode_index"), annotations)
 
+    def column(self) -> str:
+        """The column that the field names. Raises FieldError where there is none, listing what there is."""
+        return self._column()[0]
+
     def _column(self) -> tuple[str, str]:
         if self.request.field is None:
             raise FieldError(f"expected a field to read\n{self.contents()}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.options import Axis, Columns, MemoryFolder
+from scroll_tactile.cli.options import Axis, Clock, Columns, Field, MemoryFolder, Preset, Topic
 from scroll_tactile.cli.terminal import console, estimate_text, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
+    from scroll_tactile.live.session import LiveSession
+    from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
     from scroll_tactile.results import Estimate
 
 __all__ = ["live"]
@@ -35,8 +37,8 @@ def live(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A .npy or .csv file of readings, a row each; or - for lines of comma-separated numbers on the "
-            "standard input, as they come.",
+            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of comma-separated numbers on "
+            "the standard input, as they come.",
             show_default=False,
         ),
     ],
@@ -48,52 +50,88 @@ def live(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
     of: Axis = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write answers, contacts and states into a new .mcap, at the recording's times: to be opened beside a "
+            "bag. Those lie by its own log where you give --clock log."
+        ),
+    ] = None,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
     from scroll_tactile.recordings.recording import places
 
     screen = console()
+    rows = _rows(file, timed, {"preset": preset, "topic": topic, "field": field, "clock": clock})
+    if columns is not None:
+        rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
     with opened(memory, mode="read") as learner:
-        shape = learner.sensor.shape
         session = learner.live(risk=risk, contact="manual" if touch else "auto", of=of)
         growing = Live(console=screen, auto_refresh=False, transient=True)
-        with session, growing if screen.is_terminal and not as_json else nullcontext():
-            if touch:
-                session.begin()
+        with _log(mcap) as log, session, growing if screen.is_terminal and not as_json else nullcontext():
             before: LiveState | None = None
-            at = 0.0
-            for count, row in enumerate(_rows(file, timed), start=1):
-                reading, time = (row[1:], float(row[0])) if timed else (row, None)
-                reading = reading if columns is None else reading[places(columns, reading.size)]
-                now = session.push(reading.reshape(shape) if reading.size == learner.sensor.channels else reading, time)
-                at = count / learner.sensor.rate if time is None else time
+            for now, at in _states(session, rows, touch):
                 before = _shown(before, now, at, as_json, growing)
-            if touch:
-                _shown(before, session.end(), at, as_json, growing)
+                if log is not None:
+                    log.note(now, at)
         _summed_up(session.report, as_json)
+    if mcap is not None and not as_json:
+        say(f"written: {shown(mcap)}")
 
 
-def _rows(file: Path, timed: bool = False) -> Iterator[npt.NDArray[np.float64]]:
-    """Readings, one after the other; timed: with their times before them."""
+def _states(
+    session: LiveSession, rows: Iterator[tuple[float | None, npt.NDArray[np.float64]]], touch: bool
+) -> Iterator[tuple[LiveState, float]]:
+    """What the session says after each reading, and when; touch: all of them are one."""
+    sensor, at = session.sensor, 0.0
+    if touch:
+        session.begin()
+    for count, (time, reading) in enumerate(rows, start=1):
+        at = count / sensor.rate if time is None else time
+        yield session.push(reading.reshape(sensor.shape) if reading.size == sensor.channels else reading, time), at
+    if touch:
+        yield session.end(), at
+
+
+def _log(path: Path | None) -> AbstractContextManager[AnswerLog | None]:
+    if path is None:
+        return nullcontext()
+    from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
+
+    return AnswerLog(path)
+
+
+def _rows(
+    file: Path, timed: bool = False, where: Mapping[str, str | None] | None = None
+) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+    """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
     import numpy as np
 
     from scroll_tactile.recordings import read
 
     if str(file) != "-":
-        recording = read(file)
-        named = timed and recording.report.clock is not None  # a table names its times; elsewhere they come first
-        for time, reading in zip(recording.times, recording.readings, strict=True):
-            yield np.concatenate([[time], reading]) if named else reading
+        recording = read(file, **(where or {}))
+        own = recording.report.clock is not None and (timed or recording.topic is not None)
+        for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
+            yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
         return
     for number, line in enumerate(sys.stdin, start=1):
         if not line.strip():
             continue
         try:
-            yield np.array([float(cell) for cell in line.split(",")])
+            yield _parted(np.array([float(cell) for cell in line.split(",")]), timed)
         except ValueError:
             raise InputError(
                 f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
             ) from None
+
+
+def _parted(row: npt.NDArray[np.float64], timed: bool) -> tuple[float | None, npt.NDArray[np.float64]]:
+    return (float(row[0]), row[1:]) if timed else (None, row)
 
 
 def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, growing: Live) -> LiveState:

@@ -116,7 +116,7 @@ def annotate(
     plan |= {"field": field, "columns": columns, "clock": clock, "replace": replace}
     work = target.with_name(target.name + WORK)
     with alone_in(work, target):
-        run = _Run(source, target, work, RunFile(work / RECORD, plan), made)
+        run = _Rewritten(source, target, work, RunFile(work / RECORD, plan), made)
         try:
             if "moving" not in run.record.notes:
                 run.prepare(in_place=in_place, replace=replace)
@@ -154,7 +154,7 @@ def _target(dataset: Path, output: str | os.PathLike[str] | None, in_place: bool
     return target
 
 
-class _Run:
+class _Rewritten:
     """One annotation: what is read, the folder it becomes, the one it is made in, its record, and the columns."""
 
     def __init__(self, source: LeRobot, target: Path, work: Path, record: RunFile, made: TouchColumns) -> None:
@@ -272,8 +272,8 @@ def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
     found = list(dict.fromkeys([*wanted, *there]))
     if found and not replace:
         raise InputError(
-            f"{source.address} has {found[0]!r} already: replace=True answers anew (events of others stay), "
-            "forms= leaves numbers or language as they are"
+            f"{source.address} has {found[0]!r} already: replace=True answers anew, and leaves the events of others; "
+            "forms= without numbers, or language, leaves those alone"
         )
     if source.column() in found:
         raise InputError(f"{source.column()!r} are answers, and no readings: give another field=")

@@ -117,8 +117,8 @@ def _checked(kind: Any) -> Any:
     names = tuple(inner.field(place).name for place in range(inner.num_fields))
     if names != _FIELDS:
         raise FieldError(
-            f"column {EVENTS!r} has lists of {', '.join(names) or inner!s:.80}; expected {', '.join(_FIELDS)}: leave "
-            "it alone by forms=('numbers',)"
+            f"column {EVENTS!r} has lists of {', '.join(names) or inner!s:.80}; expected {', '.join(_FIELDS)}: forms= "
+            "without language leaves it alone"
         )
     return kind
 

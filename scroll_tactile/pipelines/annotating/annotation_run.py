@@ -261,15 +261,14 @@ def _frames(
 def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
     """The columns that give way. Raises InputError where there are some without replace, or of somebody else."""
     ours = [name for name, about in source.features.items() if _is_ours(about)]
-    wanted = [name for name in ours if made.language if name == EVENTS]
-    wanted += [name for name in ours if made.numbers if name != EVENTS]
+    wanted = [name for name in ours if (made.language if name == EVENTS else made.numbers)]
     there = [name for name in made.features if name in source.features]
     if strangers := [name for name in there if name not in ours and name != EVENTS]:
         raise InputError(
             f"{source.address} has a feature {strangers[0]!r} that no annotation wrote: rename one of them, or leave "
             "numbers out"
         )
-    found = list(dict.fromkeys([*wanted, *there]))
+    found = sorted({*wanted, *there}, key=lambda name: (name == EVENTS, name))
     if found and not replace:
         raise InputError(
             f"{source.address} has {found[0]!r} already: replace=True answers anew, and leaves the events of others; "

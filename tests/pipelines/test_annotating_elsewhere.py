@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from commands import refused, run
-from faults.recording_attacks import ATTACKS, RAN
+from faults.recording_attacks import ATTACKS, RAN, SECRET
 from live_touches import slide
 from robot_sets import FIELD, robot_set, whole
 from touches import PAD, SMALL
@@ -58,7 +58,8 @@ def test_lerobot_itself_reads_the_answers(tip, episodes, tmp_path, form):
     output = annotate(learner, folder, output=tmp_path / "out", field=column).output
     reads = Path(__file__).with_name("lerobot_reads.py")
     alone = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "cache"), "PATH": os.environ["PATH"]}
-    said = subprocess.run([python, reads, output, column], capture_output=True, text=True, timeout=300, env=alone)
+    how = {"capture_output": True, "text": True, "timeout": 300}
+    said = subprocess.run([python, reads, output, column], check=False, env=alone, **how)
     assert said.returncode == 0, said.stderr[-3000:]
     found, table = json.loads(said.stdout), whole(output)
     assert found["kinds"]["observation.touch.material"] == "torch.int64"
@@ -87,12 +88,16 @@ def test_a_set_of_others_is_equal_but_for_the_new_columns(tip, tmp_path):
 
 @pytest.mark.parametrize("name", [name for name in ATTACKS if name.startswith("R7 lerobot")])
 def test_a_set_that_was_made_to_harm_is_refused(tip, tmp_path, name):
-    (tmp_path / "watched").mkdir()
-    path, options = ATTACKS[name](tmp_path, tmp_path / "watched")
+    for place in ("in", "elsewhere"):
+        (tmp_path / place).mkdir()
+    secret = tmp_path / "elsewhere" / "secret"
+    secret.write_bytes(bytes([SECRET]) * 4096)
+    path, options = ATTACKS[name](tmp_path / "in", secret)
     before = pa.default_memory_pool().max_memory()
     with pytest.raises(InputError):
         annotate(tip, path, output=tmp_path / "out", field=options["field"])
-    assert not (tmp_path / "out").exists() and not (tmp_path / "out.annotating").exists() and not RAN
+    assert not (tmp_path / "elsewhere" / RAN).exists()
+    assert not (tmp_path / "out").exists() and not (tmp_path / "out.annotating").exists()
     assert pa.default_memory_pool().max_memory() < max(before, 1 << 30)
 
 
@@ -138,19 +143,20 @@ def test_links_out_of_a_set_are_not_followed(episodes, tmp_path):
     }.items():
         folder = robot_set(tmp_path / f"set {len(place)}", episodes)
         change(folder / place)
-        with pytest.raises(RecordingError, match="leads out|is a FIFO|is a link to a folder"):
+        with pytest.raises(RecordingError, match=r"leads out|is a FIFO|is a link to a folder"):
             annotate(live_touches.learner(), folder, field="pad")
 
 
-class TestCommand:
-    @pytest.fixture(scope="class")
-    def memory(self, tmp_path_factory):
-        folder, random = tmp_path_factory.mktemp("memory") / "memory", np.random.default_rng(1)
-        with TactileLearner.open(folder, sensor=PAD, embedding=SMALL) as learner:
-            for i in range(18):
-                learner.observe("abc"[i % 3], slide("abc"[i % 3], 50, random))
-        return folder
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory):
+    folder, random = tmp_path_factory.mktemp("memory") / "memory", np.random.default_rng(1)
+    with TactileLearner.open(folder, sensor=PAD, embedding=SMALL) as learner:
+        for i in range(18):
+            learner.observe("abc"[i % 3], slide("abc"[i % 3], 50, random))
+    return folder
 
+
+class TestCommand:
     def test_it_writes_what_the_function_does(self, memory, episodes, tmp_path):
         folder = robot_set(tmp_path / "set", episodes)
         result = run("annotate", folder, "--memory", memory, "--field", "pad")

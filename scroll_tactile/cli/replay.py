@@ -106,7 +106,7 @@ def _log(path: Path | None) -> AbstractContextManager[AnswerLog | None]:
 
 
 def _rows(
-    file: Path, timed: bool = False, where: Mapping[str, str | None] | None = None
+    file: Path, timed: bool = False, where: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
     """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
     import numpy as np

@@ -155,7 +155,8 @@ def test_a_log_is_new_open_and_has_times(tmp_path, monkeypatch):
         AnswerLog(tmp_path / "a.mcap")
     with pytest.raises(InputError, match="cannot be written: No such file"):
         AnswerLog(tmp_path / "none" / "a.mcap")
-    monkeypatch.setattr(answer_log, "open", lambda *_: Path("/dev/full").open("wb"), raising=False)
+    full = Path("/dev/full").open("wb")  # noqa: SIM115
+    monkeypatch.setattr(answer_log, "open", lambda *_: full, raising=False)
     with pytest.raises(InputError, match=r"b.mcap cannot be written: No space left"):
         AnswerLog(tmp_path / "b.mcap").note(state, 0.0)
 

@@ -21,6 +21,8 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
+    from scroll_tactile.pipelines.annotating.annotation_run import Annotated, annotate
+    from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
     from scroll_tactile.pipelines.fleet import FleetReport, learn
     from scroll_tactile.pipelines.sources import SourceOptions
     from scroll_tactile.quantities import Quantity
@@ -45,6 +47,8 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.testing.learner_checks import check_learner
 
 __all__ = [
+    "Annotated",
+    "AnswerLog",
     "Augmented",
     "Candidates",
     "Capabilities",
@@ -78,6 +82,7 @@ __all__ = [
     "TactileLearner",
     "Vision",
     "__version__",
+    "annotate",
     "check_embedding",
     "check_learner",
     "errors",
@@ -87,10 +92,12 @@ __all__ = [
     "write_firmware",
 ]
 
-__version__ = "0.14.0"
+__version__ = "0.15.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
+    "Annotated": "pipelines.annotating.annotation_run",
+    "AnswerLog": "pipelines.annotating.answer_log",
     "Augmented": "signals.copies",
     "Candidates": "results",
     "Capabilities": "embeddings.protocol",
@@ -123,6 +130,7 @@ _MODULES = {
     "Stream": "signals.stream",
     "TactileLearner": "learner",
     "Vision": "embeddings.vision",
+    "annotate": "pipelines.annotating.annotation_run",
     "check_embedding": "testing.embedding_checks",
     "check_learner": "testing.learner_checks",
     "learn": "pipelines.fleet",

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from scroll_tactile import __version__, native
+from scroll_tactile.cli.annotation import annotate
 from scroll_tactile.cli.bulk import evaluate, fleet, learn
 from scroll_tactile.cli.everyday import compose, describe, inspect, observe, predict
 from scroll_tactile.cli.replay import live
@@ -42,7 +43,8 @@ def main(
     """Take the options that belong to no command."""
 
 
-for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report, mcp):
+COMMANDS = (demo, observe, learn, fleet, predict, evaluate, annotate, live, inspect, describe, compose, report, mcp)
+for command in COMMANDS:
     app.command()(command)
 app.command(context_settings=PASSED_ON)(ros2)
 app.add_typer(memory, name="memory")

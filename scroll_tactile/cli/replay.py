@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +13,7 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.options import Axis, Columns, MemoryFolder
+from scroll_tactile.cli.options import Axis, Clock, Columns, Field, MemoryFolder, Preset, Topic
 from scroll_tactile.cli.terminal import console, estimate_text, opened, percent, say, say_json, shown, verdict
 from scroll_tactile.errors import InputError
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
+    from scroll_tactile.live.session import LiveSession
+    from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
     from scroll_tactile.results import Estimate
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.viewer.touch_log import TouchLog
@@ -37,8 +39,8 @@ def live(
     file: Annotated[
         Path,
         typer.Argument(
-            help="A .npy or .csv file of readings, a row each; or - for lines of comma-separated numbers on the "
-            "standard input, as they come.",
+            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of comma-separated numbers on "
+            "the standard input, as they come.",
             show_default=False,
         ),
     ],
@@ -50,6 +52,17 @@ def live(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
     of: Axis = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write answers, contacts and states into a new .mcap, at the recording's times: to be opened beside a "
+            "bag. Those lie by its own log where you give --clock log."
+        ),
+    ] = None,
     rerun: Annotated[
         str | None,
         typer.Option(
@@ -63,36 +76,53 @@ def live(
     from scroll_tactile.recordings.recording import places
 
     screen = console()
-    with opened(memory, mode="read") as learner, _in_rerun(rerun, learner.sensor) as log:
-        shape = learner.sensor.shape
+    rows = _rows(file, timed, {"preset": preset, "topic": topic, "field": field, "clock": clock})
+    if columns is not None:
+        rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
+    with opened(memory, mode="read") as learner, _in_rerun(rerun, learner.sensor) as shown_there:
         session = learner.live(risk=risk, contact="manual" if touch else "auto", of=of)
         growing = Live(console=screen, auto_refresh=False, transient=True)
-        with session, growing if screen.is_terminal and not as_json else nullcontext():
-            if touch:
-                session.begin()
+        with _log(mcap) as log, session, growing if screen.is_terminal and not as_json else nullcontext():
             before: LiveState | None = None
-            at = 0.0
-            for count, row in enumerate(_rows(file, timed), start=1):
-                reading, time = (row[1:], float(row[0])) if timed else (row, None)
-                reading = reading if columns is None else reading[places(columns, reading.size)]
-                reading = reading.reshape(shape) if reading.size == learner.sensor.channels else reading
-                now = session.push(reading, time)
-                at = count / learner.sensor.rate if time is None else time
+            for reading, now, at in _states(session, rows, touch):
                 before = _shown(before, now, at, as_json, growing)
                 if log is not None:
-                    log.take(reading, at)
-                    log.show(now, at)
-            if touch:
-                now = session.end()
-                _shown(before, now, at, as_json, growing)
-                if log is not None:
-                    log.show(now, at)
+                    log.note(now, at)
+                if shown_there is not None:
+                    if reading is not None:
+                        shown_there.take(reading, at)
+                    shown_there.show(now, at)
         _summed_up(session.report, as_json)
+    if mcap is not None and not as_json:
+        say(f"written: {shown(mcap)}")
+
+
+def _states(
+    session: LiveSession, rows: Iterator[tuple[float | None, npt.NDArray[np.float64]]], touch: bool
+) -> Iterator[tuple[npt.NDArray[np.float64] | None, LiveState, float]]:
+    """Each reading, the state after it, and when; None and the state at the end, where all of them are one touch."""
+    sensor, at = session.sensor, 0.0
+    if touch:
+        session.begin()
+    for count, (time, reading) in enumerate(rows, start=1):
+        at = count / sensor.rate if time is None else time
+        reading = reading.reshape(sensor.shape) if reading.size == sensor.channels else reading
+        yield reading, session.push(reading, time), at
+    if touch:
+        yield None, session.end(), at
+
+
+def _log(path: Path | None) -> AbstractContextManager[AnswerLog | None]:
+    if path is None:
+        return nullcontext()
+    from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
+
+    return AnswerLog(path)
 
 
 @contextmanager
 def _in_rerun(target: str | None, sensor: Sensor) -> Iterator[TouchLog | None]:
-    """What writes to Rerun; None where nobody asked for it."""
+    """What writes to Rerun; None without a target."""
     if target is None:
         yield None
         return
@@ -107,27 +137,33 @@ def _in_rerun(target: str | None, sensor: Sensor) -> Iterator[TouchLog | None]:
             log.close()
 
 
-def _rows(file: Path, timed: bool = False) -> Iterator[npt.NDArray[np.float64]]:
-    """Readings, one after the other; timed: with their times before them."""
+def _rows(
+    file: Path, timed: bool = False, where: Mapping[str, Any] | None = None
+) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+    """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
     import numpy as np
 
     from scroll_tactile.recordings import read
 
     if str(file) != "-":
-        recording = read(file)
-        named = timed and recording.report.clock is not None  # a table names its times; elsewhere they come first
-        for time, reading in zip(recording.times, recording.readings, strict=True):
-            yield np.concatenate([[time], reading]) if named else reading
+        recording = read(file, **(where or {}))
+        own = recording.report.clock is not None and (timed or recording.topic is not None)
+        for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
+            yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
         return
     for number, line in enumerate(sys.stdin, start=1):
         if not line.strip():
             continue
         try:
-            yield np.array([float(cell) for cell in line.split(",")])
+            yield _parted(np.array([float(cell) for cell in line.split(",")]), timed)
         except ValueError:
             raise InputError(
                 f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
             ) from None
+
+
+def _parted(row: npt.NDArray[np.float64], timed: bool) -> tuple[float | None, npt.NDArray[np.float64]]:
+    return (float(row[0]), row[1:]) if timed else (None, row)
 
 
 def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, growing: Live) -> LiveState:

@@ -15,6 +15,7 @@ __all__ = ["has_option", "in_options", "typed"]
 _ARGUMENTS = (
     *("topic", "field", "clock", "columns", "preset", "rate", "labels", "decimal", "definitions"),  # of `read`
     *("annotate", "again", "material", "by", "intervals", "cut", "sensor", "add", "source", "scene", "risk"),
+    *("output", "in_place", "replace", "forms"),  # of `annotate`
 )
 _RENAMED = {"material": "label", "by": "label_by", "intervals": "labels", "labels": "label_topic"}
 _TEXT = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""  # as repr writes one

@@ -34,6 +34,7 @@ __all__ = [
     "contact_spans",
     "find_sources",
     "has_touches",
+    "readings_of",
     "source_touches",
     "stored_source",
 ]
@@ -124,7 +125,7 @@ def contact_spans(learner: TactileLearner, recording: Recording) -> list[tuple[i
     """
     sensor, rest = learner.sensor, capabilities_of(learner.embedding).rest
     detector = PressDetector(sensor, rest) if sensor.camera else ContactDetector(sensor, FALSE_CONTACTS)
-    rows = _readings_of(sensor, recording)
+    rows = readings_of(sensor, recording)
     before = round(REST_FOLLOWED * sensor.rate) if isinstance(rest, str) else 0
     spans: list[tuple[int, int]] = []
     for first, last in pairwise([0, *(gap.index for gap in recording.report.gaps), len(rows)]):
@@ -157,7 +158,7 @@ def _contacts(detector: ContactDetector | PressDetector, rows: npt.NDArray[Any])
         yield began, len(rows)
 
 
-def _readings_of(sensor: Sensor, recording: Recording) -> npt.NDArray[Any]:
+def readings_of(sensor: Sensor, recording: Recording) -> npt.NDArray[Any]:
     """The readings as this sensor's. Raises ChannelCountError for another's."""
     if recording.readings[:1].size != sensor.channels:
         recording.stream(sensor)

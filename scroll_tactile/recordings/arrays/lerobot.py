@@ -6,8 +6,9 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,23 @@ _BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_inde
 def is_lerobot(path: Path) -> bool:
     """Whether a folder is a LeRobot data set."""
     return (path / "meta" / "info.json").is_file()
+
+
+class _Reading(NamedTuple):
+    """What is read of each file.
+
+    key, rest: the column with the readings, and the index behind it. tasks: by their number. annotating: by heading,
+    see `_annotating`. required, columns: what there must be, and what is read where it is there. labels: texts of it.
+    """
+
+    key: str
+    rest: str
+    clock: str
+    tasks: dict[int, str]
+    annotating: dict[str, tuple[str, str, Heading]]
+    required: list[str]
+    columns: list[str]
+    labels: list[str]
 
 
 class LeRobot(Source):
@@ -72,27 +90,32 @@ class LeRobot(Source):
     def blocks(self) -> Iterator[Block]:
         """The readings of the column, file after file."""
         self.budget = Budget(self.address)
+        for path in self.files():
+            yield from self.blocks_of(path)
+
+    def blocks_of(self, path: Path) -> Iterator[Block]:
+        """The readings of the column in one of the files; they count towards the budget."""
+        reading = self._reading
+        with self.opened(path, reading.columns, reading.labels) as file:
+            there = [name for name in reading.columns if name in file.schema_arrow.names]
+            for name in reading.required:
+                if name not in there:
+                    raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
+            for name in there:
+                self._require_numbers(file.schema_arrow.field(name).type, name, texts=name in reading.labels)
+            for batch in file.iter_batches(batch_size=rows_of(self._width(reading.key)), columns=there):
+                if batch.num_rows:
+                    yield self._block(batch, reading)
+
+    @cached_property
+    def _reading(self) -> _Reading:
         key, rest = self._column()
         clock = self.request.clock or "timestamp"
-        tasks = self._tasks()
         annotating = {text: self._annotating(text) for text in self.request.annotate}
         required = list(dict.fromkeys([key, clock, *(own for own, *_ in annotating.values())]))
-        columns = list(dict.fromkeys([*required, *_BOOKKEEPING]))
         labels = [own for own, _, heading in annotating.values() if heading.unit is None]
-        width = self._width(key)
-        for path in self._files():
-            with self._opened(path, columns, labels) as file:
-                there = [name for name in columns if name in file.schema_arrow.names]
-                for name in required:
-                    if name not in there:
-                        raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
-                for name in there:
-                    self._require_numbers(file.schema_arrow.field(name).type, name, texts=name in labels)
-                for batch in file.iter_batches(batch_size=rows_of(width), columns=there):
-                    if batch.num_rows:
-                        block = self._block(batch, key, rest, clock, tasks)
-                        block.annotations |= {text: self._column_of(batch, *own) for text, own in annotating.items()}
-                        yield block
+        columns = list(dict.fromkeys([*required, *_BOOKKEEPING]))
+        return _Reading(key, rest, clock, self._tasks(), annotating, required, columns, labels)
 
     def _width(self, key: str) -> int:
         """The bytes of a reading of a column, as the data set describes it."""
@@ -141,7 +164,7 @@ class LeRobot(Source):
         names = ["" if math.isnan(number) else str(number) for number in rows[:, 0].tolist()]
         return np.array([name.removesuffix(".0") for name in names], object)
 
-    def _opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
+    def opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
 
         texts: the columns of which each text is to be in memory once, and not once for every row that has it.
@@ -173,8 +196,9 @@ class LeRobot(Source):
                 table[name] += values
         return table
 
-    def _block(self, batch: Any, key: str, rest: str, clock: str, tasks: dict[int, str]) -> Block:
-        values = select(floats(self._rows(batch.column(key), key)), rest, self.field())
+    def _block(self, batch: Any, reading: _Reading) -> Block:
+        values = select(floats(self._rows(batch.column(reading.key), reading.key)), reading.rest, self.field())
+        clock, tasks = reading.clock, reading.tasks
         times = self._rows(batch.column(clock), clock).astype(np.float64).reshape(batch.num_rows, -1)[:, 0]
         numbers = {}
         for name in ("episode_index", "frame_index", "task_index"):
@@ -186,7 +210,12 @@ class LeRobot(Source):
             if int(task) in tasks:
                 self.names.setdefault(int(episode), tasks[int(task)])
         counters = {"message": numbers["frame_index"]} if "frame_index" in numbers else {}
-        return Block(values, {clock: times}, counters, numbers.get("episode_index"))
+        annotations = {text: self._column_of(batch, *own) for text, own in reading.annotating.items()}
+        return Block(values, {clock: times}, counters, numbers.get("episode_index"), annotations)
+
+    def column(self) -> str:
+        """The column that the field names. Raises FieldError where there is none, listing what there is."""
+        return self._column()[0]
 
     def _column(self) -> tuple[str, str]:
         if self.request.field is None:
@@ -233,12 +262,12 @@ class LeRobot(Source):
     def _ragged(self, name: str) -> None:
         raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
 
-    def _files(self) -> list[Path]:
+    def files(self) -> list[Path]:
         """The parquet files that the episodes are in; raises RecordingError where one is missing."""
         listed: dict[tuple[int, int], None] = {}
         columns = ["data/chunk_index", "data/file_index"]
         for path in sorted((self.path / "meta" / "episodes").glob("**/*.parquet")):
-            with self._opened(path, columns) as file:
+            with self.opened(path, columns) as file:
                 table = self._table(file, columns)
             listed |= dict.fromkeys(zip(table["data/chunk_index"], table["data/file_index"], strict=True))
         pattern = str(self.info["data_path"])
@@ -262,7 +291,7 @@ class LeRobot(Source):
         if not path.is_file():
             self.notes.append("the tasks are missing, meta/tasks.parquet: episodes have no name")
             return {}
-        with self._opened(path, None) as file:
+        with self.opened(path, None) as file:
             # pandas writes an index without a name under one of its own
             name = next((name for name in file.schema_arrow.names if name != "task_index"), None)
             table = self._table(file, ["task_index"], name)

@@ -1,0 +1,300 @@
+"""A LeRobot data set with what a memory answers at each of its frames: written anew, or in its place."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.arguments import require_arguments, silent
+from scroll_tactile.errors import FieldError, InputError, RecordingError, printable
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.annotating.frame_answers import Cut, Episodes
+from scroll_tactile.pipelines.annotating.rewriting import (
+    copy_others,
+    names_in,
+    statistics_in,
+    wanted_statistics,
+    write_data,
+    write_metadata,
+)
+from scroll_tactile.pipelines.annotating.touch_columns import EVENTS, WRITER, TouchColumns
+from scroll_tactile.pipelines.learning import Progress
+from scroll_tactile.pipelines.runfile import RunFile, alone_in
+from scroll_tactile.pipelines.sources import readings_of
+from scroll_tactile.recordings import Recording, Report
+from scroll_tactile.recordings.arrays.lerobot import LeRobot, is_lerobot
+from scroll_tactile.recordings.blocks import Request, guarded
+from scroll_tactile.recordings.recording import only_columns
+
+__all__ = ["Annotated", "annotate"]
+
+RECORD = "annotation.json"
+WORK = ".annotating"  # behind the name of the folder that is made, of the folder in which it is made
+
+
+@dataclass(frozen=True)
+class Annotated:
+    """What annotating a data set did.
+
+    output: its folder. episodes, frames: that it has. answered: frames with an answer. touches: that were found in it.
+    events: frames with one. left_out: frames without readings that a session takes, NaN or infinite. kept: where an
+    annotation in place keeps `meta/` as it was; None of a new folder.
+    """
+
+    output: Path
+    episodes: int
+    frames: int
+    answered: int
+    touches: int
+    events: int
+    left_out: int = 0
+    kept: Path | None = None
+
+
+def annotate(
+    learner: TactileLearner,
+    dataset: str | os.PathLike[str],
+    *,
+    output: str | os.PathLike[str] | None = None,
+    in_place: bool = False,
+    replace: bool = False,
+    forms: Sequence[str] = ("numbers", "language"),
+    field: str | None = None,
+    columns: str | None = None,
+    clock: str | None = None,
+    cut: Cut = "episodes",
+    risk: float = 0.05,
+    scene: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> Annotated:
+    """Write what a memory answers at each frame of a LeRobotDataset v3 beside what the robot recorded there.
+
+    What stands at a frame is what a live session would have answered after it, and no more: a policy that is trained on
+    it sees what the robot will know then. At the last frame of a touch it is the answer to the whole touch.
+
+    - `observation.touch.material`, int64: the place of the name in `info.materials` of the feature in meta/info.json;
+      −1 without an answer. `.probability`, float32: 0 without one. `.known`, int64: 1 learned, 0 never observed, −1
+      where that cannot be told. `observation.touch.<quantity>`, float32 (3,), of each declared one: value, low and high
+      of its interval; without an estimate the middle and the ends of its range.
+    - `language_events`: on the frame where a touch is decided, or ends undecided or revised, a row such as "felt: oak,
+      0.97, decided", of role "tool" and style "interjection"; null on others.
+
+    Features, statistics and those of each episode are added. All else is copied as it is, videos as second names of
+    the same files where the disk allows that. Equal memories give equal columns. An interrupted call is resumed by the
+    same one, file by file; the new folder is there only once it is whole.
+
+    learner: the memory; it is settled, and stays as it is. dataset: its folder. output: a new one; without it
+    `<dataset>-annotated`. in_place: change the data set itself, and keep a copy of `meta/` in `meta.before`. replace:
+    answers that are there already give way; rows of others in `language_events` stay. forms: "numbers", "language", or
+    both.
+    field, columns, clock: as of `recordings.read`, field being a column of readings of the learner's sensor. cut:
+    "episodes" takes each as one touch; "contact" finds touches in them, which then begin with two seconds at rest.
+    risk, scene: as of `TactileLearner.live`. progress: called with (what is being done, files done, files in all).
+
+    Raises InputError for a memory that holds nothing, an output that is there, or cannot be written; RecordingError and
+    FieldError for a data set that is not whole, or not v3; ChannelCountError for another sensor's; LockedError where
+    another call is at work there.
+    """
+    require_arguments({"path": dataset, "risk": risk}, {"progress": progress})
+    if not learner.materials:
+        raise InputError("expected a memory that has observed something; this one is empty, and would answer nothing")
+    source, target = _opened(dataset, field, clock), _target(Path(dataset), output, in_place)
+    learner.settle()
+    how: dict[str, Any] = {"cut": cut, "risk": risk, "scene": None if scene is None else sorted(scene)}
+    episodes = Episodes(learner, **how)
+    about = {"memory": learner.digest(), **how}
+    made = TouchColumns(episodes.names, episodes.quantities, forms, about)
+    plan = about | {"dataset": str(source.path.resolve()), "target": str(target.resolve()), "forms": sorted(forms)}
+    plan |= {"field": field, "columns": columns, "clock": clock, "replace": replace}
+    work = target.with_name(target.name + WORK)
+    with alone_in(work, target):
+        run = _Rewritten(source, target, work, RunFile(work / RECORD, plan), made)
+        try:
+            if "moving" not in run.record.notes:
+                run.prepare(in_place=in_place, replace=replace)
+                run.write(episodes, columns, progress)
+            return run.finish()
+        except BaseException:
+            if "done" not in run.record.notes:  # what is refused leaves nothing
+                shutil.rmtree(work, ignore_errors=True)
+            raise
+
+
+def _opened(dataset: str | os.PathLike[str], field: str | None, clock: str | None) -> LeRobot:
+    path = Path(dataset)
+    if not is_lerobot(path):
+        what = "there is no meta/info.json in it" if path.is_dir() else "it is no folder of this machine"
+        raise RecordingError(f"expected the folder of a LeRobot data set; came {path}: {what}")
+    with guarded(str(path)):
+        source = LeRobot(path, str(path), Request(field=field, clock=clock))
+        source.column()
+    return source
+
+
+def _target(dataset: Path, output: str | os.PathLike[str] | None, in_place: bool) -> Path:
+    """The folder that is made or changed. Raises InputError for one that cannot be."""
+    if in_place:
+        if output is not None:
+            raise InputError("give output= or in_place=True: in place the data set itself is changed")
+        return dataset.resolve()
+    whole = dataset.resolve()
+    target = whole.with_name(whole.name + "-annotated") if output is None else Path(output)
+    if target.resolve().is_relative_to(whole):
+        raise InputError(f"{target} lies in the data set that is read: take a folder outside, or in_place=True")
+    if target.exists():
+        raise InputError(f"{target} is there already: take another output=, or move it away")
+    return target
+
+
+class _Rewritten:
+    """One annotation: what is read, the folder it becomes, the one it is made in, its record, and the columns."""
+
+    def __init__(self, source: LeRobot, target: Path, work: Path, record: RunFile, made: TouchColumns) -> None:
+        self.source, self.target, self.work, self.record, self.made = source, target, work, record, made
+
+    def prepare(self, *, in_place: bool, replace: bool) -> None:
+        """Look at what is there, before anything is written. Raises InputError for what was changed meanwhile."""
+        with guarded(self.source.address):
+            self.names = names_in(self.source)
+            self.dropped = _dropped(self.source, self.made, replace)
+            state = _state_of(self.source.path)
+        self.in_place = in_place
+        if self.record.notes.setdefault("source", state) != state:
+            raise InputError(
+                f"{self.source.address} has changed since this annotation began: remove {self.work} to begin anew"
+            )
+        self.record.note("source", state)
+
+    def write(self, episodes: Episodes, columns: str | None, progress: Progress) -> None:
+        """Write what is not written yet, and note what then has to be moved."""
+        for number, name in enumerate(self.names):
+            progress(f"answering {printable(Path(name).name)}", number, len(self.names))
+            if name not in self.record.notes.get("done", {}) or not (self.work / name).is_file():
+                self._annotated(name, episodes, columns)
+        progress("statistics", len(self.names), len(self.names))
+        with guarded(self.source.address):
+            wanted = wanted_statistics(self.source, self.source.column())
+            of_episodes = statistics_in(self.work, self.names, self.made, wanted)
+            written = write_metadata(self.source, self.work, self.made, of_episodes, self.dropped)
+            if not self.in_place:
+                copy_others(self.source, self.work, [*self.names, *written])
+        self.record.note("summary", _summary(self.record.notes["done"], len(of_episodes)))
+        self.record.note("moving", [*self.names, *written] if self.in_place else [])
+
+    def _annotated(self, name: str, episodes: Episodes, columns: str | None) -> None:
+        with guarded(self.source.address):
+            frames = _frames(self.source, name, columns)
+        readings, times, numbers = readings_of(episodes.sensor, frames[0]), *frames[1:]
+        found = episodes.answered(readings, times, numbers)
+        with guarded(self.source.address):
+            write_data(self.source, name, self.work / name, self.made, found, self.dropped)
+        counted = {
+            "frames": len(times),
+            "answered": int((found.material >= 0).sum()),
+            "touches": found.touches,
+            "events": len(found.events),
+            "left_out": found.left_out,
+        }
+        self.record.note("done", self.record.notes.get("done", {}) | {name: counted})
+
+    def finish(self) -> Annotated:
+        """Put what was written in its place."""
+        moving, summary = self.record.notes["moving"], self.record.notes["summary"]
+        kept = None
+        try:
+            if moving:
+                kept = self.target / self._kept()
+                for name in moving:  # info.json is the last
+                    if (self.work / name).exists():
+                        (self.work / name).replace(self.target / name)
+                shutil.rmtree(self.work)
+            else:
+                self.work.rename(self.target)
+                (self.target / RECORD).unlink()
+        except OSError as error:
+            raise InputError(
+                f"{error.filename or self.target} cannot be put in its place: {error.strerror}. All is written in "
+                f"{self.work}: mend that, and start the same again"
+            ) from error
+        return Annotated(self.target, **summary, kept=kept)
+
+    def _kept(self) -> str:
+        """The name of the folder that keeps `meta/` as it was; it is copied once."""
+        if "kept" not in self.record.notes:
+            names = ["meta.before", *(f"meta.before-{number}" for number in range(2, 1000))]
+            name = next(name for name in names if not (self.target / name).exists())
+            draft = self.work / "meta.kept"
+            shutil.rmtree(draft, ignore_errors=True)
+            shutil.copytree(self.target / "meta", draft)
+            draft.replace(self.target / name)
+            self.record.note("kept", name)
+        return str(self.record.notes["kept"])
+
+
+def _frames(
+    source: LeRobot, name: str, columns: str | None
+) -> tuple[Recording, npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """The readings of a file as a recording, their times, and which episode each is of."""
+    blocks = []
+    for block in source.blocks_of(source.path / name):
+        source.budget.give(block.readings.nbytes)
+        if block.episodes is None:
+            raise FieldError(f"{name} of {source.address} has no column 'episode_index'")
+        blocks.append(block)
+    if not blocks:
+        raise RecordingError(f"{name} of {source.address} has no frames: remove it, or write it again")
+    times = np.concatenate([next(iter(block.clocks.values())) for block in blocks])
+    readings, report = np.concatenate([block.readings for block in blocks]), Report(len(times), source.request.clock)
+    recording = Recording(f"{source.address}/{name}", None, source.field(), readings, times, (), report)
+    numbers = np.concatenate([block.episodes for block in blocks if block.episodes is not None])
+    return recording if columns is None else only_columns(recording, columns), times, numbers
+
+
+def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
+    """The columns that give way. Raises InputError where there are some without replace, or of somebody else."""
+    ours = [name for name, about in source.features.items() if _is_ours(about)]
+    wanted = [name for name in ours if (made.language if name == EVENTS else made.numbers)]
+    there = [name for name in made.features if name in source.features]
+    if strangers := [name for name in there if name not in ours and name != EVENTS]:
+        raise InputError(
+            f"{source.address} has a feature {strangers[0]!r} that no annotation wrote: rename one of them, or leave "
+            "numbers out"
+        )
+    found = sorted({*wanted, *there}, key=lambda name: (name == EVENTS, name))
+    if found and not replace:
+        raise InputError(
+            f"{source.address} has {found[0]!r} already: replace=True answers anew, and leaves the events of others; "
+            "forms= without numbers, or language, leaves those alone"
+        )
+    if source.column() in found:
+        raise InputError(f"{source.column()!r} are answers, and no readings: give another field=")
+    return found
+
+
+def _is_ours(about: Any) -> bool:
+    info = about.get("info") if isinstance(about, dict) else None
+    return isinstance(info, dict) and info.get("written by") == WRITER
+
+
+def _state_of(folder: Path) -> str:
+    """A hash of which files a data set's frames and metadata are in, of their sizes and dates."""
+    found = hashlib.sha256()
+    for path in sorted([*(folder / "data").glob("**/*"), *(folder / "meta").glob("**/*")]):
+        if path.is_file():
+            about = path.stat()
+            found.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\n".encode())
+    return found.hexdigest()
+
+
+def _summary(done: dict[str, dict[str, int]], episodes: int) -> dict[str, int]:
+    """What all files together have."""
+    counted = {name: sum(of[name] for of in done.values()) for name in ("frames", "answered", "touches", "events")}
+    return {"episodes": episodes, **counted, "left_out": sum(of["left_out"] for of in done.values())}

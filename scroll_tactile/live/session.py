@@ -60,8 +60,7 @@ class LiveSession:
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
         if not 0 < false_contacts < math.inf:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
-        if not 0 < risk < 1:
-            raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
+        _require_risk(risk)
         self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
         self.sensor = sensor = predictor.recipe.sensor
         self._rest: Rest = capabilities_of(self._extractor.embedding).rest
@@ -160,6 +159,25 @@ class LiveSession:
                 "between two touches"
             )
         self._again = True
+
+    def adjust(self, *, risk: float, scene: Sequence[str] | None) -> None:
+        """Decide by another risk, and among the materials of another scene, from the next touch on.
+
+        A risk that is new to the memory's model is measured first, which may take seconds. Raises InputError for a risk
+        that is none, for an empty scene, and after `close`; UnknownMaterialError for a scene that names a material
+        never observed. Then nothing has changed.
+        """
+        self._require_open()
+        _require_risk(risk)
+        model = self._predictor.frozen().model
+        candidates_of(scene, model.names, model.known)
+        before, self._risk = self._risk, risk
+        try:
+            self._rule(model)
+        except BaseException:
+            self._risk = before
+            raise
+        self._scene = scene
 
     def close(self) -> None:
         """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
@@ -335,6 +353,11 @@ class LiveSession:
         last = ended[-1]
         said = last.prediction, last.decided, True, ended, last.estimates, self._settled
         return LiveState(False, last.stream.seconds, *said)
+
+
+def _require_risk(risk: float) -> None:
+    if not 0 < risk < 1:
+        raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
 
 
 def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:

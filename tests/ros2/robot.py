@@ -1,8 +1,13 @@
 """A small robot: a memory of a pad, messages of its readings, and a process that publishes them."""
 
+import os
+import signal
+import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from live_touches import shift, slide
@@ -10,6 +15,7 @@ from live_touches import shift, slide
 from scroll_tactile import TactileLearner
 
 TOPIC = "/finger/tactile"
+ROBOT = Path(__file__)
 
 
 @dataclass
@@ -71,6 +77,36 @@ def publish(topic, count, rate, every):
         publisher.publish(message)
     time.sleep(0.5)
     rclpy.shutdown()
+
+
+@contextmanager
+def publishing(count, rate, every=1):
+    words = [sys.executable, ROBOT, TOPIC, str(count), str(rate), str(every)]
+    paths = os.pathsep.join([str(ROBOT.parents[1]), *sys.path])
+    with subprocess.Popen(list(map(str, words)), env=os.environ | {"PYTHONPATH": paths}) as process:
+        yield process
+        process.wait(60)
+    assert process.returncode == 0
+
+
+@contextmanager
+def command(*words, **options):
+    """A process that is killed at the end, where it has not ended before."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROBOT.parents[2]), *sys.path])}
+    line = list(map(str, [sys.executable, *words]))
+    with subprocess.Popen(line, env=environment, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended_by_ctrl_c(process):
+    """What a process wrote, where ctrl-C ended it in order."""
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    return output
 
 
 if __name__ == "__main__":

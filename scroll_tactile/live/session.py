@@ -71,8 +71,11 @@ class LiveSession:
         self._manual = contact == "manual"
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
-            found = PressDetector(sensor, self._rest) if sensor.camera else ContactDetector(sensor, false_contacts)
-            self._detector = found
+            self._detector = (
+                PressDetector(sensor, self._rest)
+                if sensor.camera
+                else ContactDetector(sensor, false_contacts, self._touched)
+            )
         self.report = LiveReport(learning=not self._manual and not sensor.camera)
         self._clock = Clock(sensor.rate, self.report)
         self._dtype = np.dtype(np.float32 if sensor.camera else np.float64)
@@ -237,7 +240,7 @@ class LiveSession:
         touch = self._under_way
         self._came += len(rows)
         if self._detector is not None:
-            self.report.learning = self._detector.learning
+            self.report.learning, self.report.restless = self._detector.learning, self._detector.restless
         if touch is None:
             self._recent.add(rows)
             if event is not None and event.kind == "began":
@@ -256,6 +259,11 @@ class LiveSession:
             self.report.relearned += 1
             self._leave(touch)
             self._recent.clear()
+
+    def _touched(self, rows: Array) -> bool:
+        """Whether the memory knows what came while rest was to be learned: then it is a touch."""
+        model = self._predictor.frozen().model
+        return bool(model.names) and self._predictor.predict((rows,), None).known is True
 
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""

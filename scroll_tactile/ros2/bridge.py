@@ -51,9 +51,9 @@ class Bridge:
     """A live session of a learner, fed with messages.
 
     field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact, of,
-    scene: see `learner.live`. watch: note the sensor at rest before each touch, and touches that were decided and are known,
-    for `learner.health`: some hundred bytes each. answer: called with each answer, when something changed. warn: called
-    with each kind of fault once.
+    scene: see `learner.live`. watch: note the sensor at rest before each touch, and touches that were decided and are
+    known, for `learner.health`: some hundred bytes each. answer: called with each answer, when something changed. warn:
+    called with each kind of fault once.
 
     An answer has event ("began", "prediction", "decided", "ended", "brief" for a contact too short for a touch, or
     "paused" for a touch that `pause` ended), stamp (of the reading after which it is given), contact, seconds (since

@@ -34,7 +34,7 @@ class TactileNode:
     Topics; those who subscribe later get the last of each:
 
     - `~/answer`, std_msgs/String: an answer as JSON (see `Bridge`), when something changed.
-    - `~/status`, diagnostic_msgs/DiagnosticArray: the same by name, with a header: the stamp of the touch's last reading.
+    - `~/status`, diagnostic_msgs/DiagnosticArray: the same by name; its header has the stamp of the last reading.
     - `~/material`, std_msgs/String; `~/probability`, `~/novelty`, std_msgs/Float64; `~/known`, std_msgs/Bool, False
       where it cannot be told: for plots, and all that reads one number.
     - `~/tactile_answer`, scroll_tactile_msgs/TactileAnswer, with a header, where that package was built

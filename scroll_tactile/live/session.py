@@ -261,9 +261,10 @@ class LiveSession:
             self._recent.clear()
 
     def _touched(self, rows: Array) -> bool:
-        """Whether the memory knows what came while rest was to be learned: then it is a touch."""
+        """Whether the memory knows what came while rest was to be learned, in parts no longer than what it learned."""
         model = self._predictor.frozen().model
-        return bool(model.names) and self._predictor.predict((rows,), None).known is True
+        parts = np.array_split(rows, -(-len(rows) // max(1, model.longest))) if model.names else []
+        return bool(parts) and all(self._predictor.predict((part,), None).known is True for part in parts)
 
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""

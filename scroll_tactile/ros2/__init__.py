@@ -10,7 +10,8 @@ import importlib
 import typing
 
 if typing.TYPE_CHECKING:
-    from scroll_tactile.ros2.bridge import Answer, Bridge, BridgeReport
+    from scroll_tactile.ros2.answers import Answer
+    from scroll_tactile.ros2.bridge import Bridge, BridgeReport
     from scroll_tactile.ros2.interfaces import Quality
     from scroll_tactile.ros2.listening import Listener
     from scroll_tactile.ros2.node import TactileNode
@@ -20,7 +21,7 @@ __all__ = ["Answer", "Bridge", "BridgeReport", "Listener", "Quality", "TactileNo
 
 # Imported on first use: a topic should be heard before the libraries behind a learner are there.
 _MODULES = {
-    "Answer": "bridge",
+    "Answer": "answers",
     "Bridge": "bridge",
     "BridgeReport": "bridge",
     "Listener": "listening",

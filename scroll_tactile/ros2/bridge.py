@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -17,7 +17,8 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
-from scroll_tactile.results import Estimate, Prediction, Receipt
+from scroll_tactile.results import Receipt
+from scroll_tactile.ros2.answers import Answer, answer_of, ended, under_way
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.ranges import all_clipped
 from scroll_tactile.signals.stream import Stream
@@ -25,11 +26,7 @@ from store import StoreError
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
-Answer = Mapping[str, Any]
-"""What JSON can hold; see `Bridge`."""
-
 RESTLESS = "the sensor is not at rest, or something touches it: nothing is found until it is left alone for two seconds"
-RANKED = 5  # materials of an answer's ranking
 _FILE = re.compile(r"\w[\w.-]{0,99}", re.ASCII)  # a name that leads to no other folder
 
 
@@ -145,7 +142,7 @@ class Bridge:
         self.close()
         self._touch, self.paused = self.touch, True
         if self.state.contact:
-            self._answer(self._now("paused", self.state._replace(contact=False)))
+            self._say("paused", self.state._replace(contact=False))
         self.state = LiveState()
 
     def resume(self) -> None:
@@ -233,7 +230,7 @@ class Bridge:
         scene, axis = self._how["scene"], self._how["of"]
         prediction = self.learner.predict(touch, scene=scene, of=axis)
         said = {"event": "predicted", "stamp": self.stamp, "contact": self.state.contact, "seconds": touch.seconds}
-        return json.dumps(said | self._by | _answer_of(prediction, {}))
+        return json.dumps(said | self._by | answer_of(prediction, {}))
 
     def materials(self) -> str:
         """The materials with their observations, as JSON."""
@@ -330,37 +327,17 @@ class Bridge:
         """Answer what is new."""
         before, self.state = self.state, now
         for touch in now.touches:
-            self._answer(self._ended(touch))
+            self._answer(ended(touch, self.stamp, self._by))
             if self._watch:
                 self._note_health(touch)
         if now.contact:
             fresh = not before.contact or bool(now.touches)
             if now.decided and (fresh or not before.decided):
-                self._answer(self._now("decided", now))
+                self._say("decided", now)
             elif fresh or now.prediction is not before.prediction:
-                self._answer(self._now("began" if fresh else "prediction", now))
+                self._say("began" if fresh else "prediction", now)
         elif before.contact and not now.touches:
-            self._answer(self._now("brief", now))
+            self._say("brief", now)
 
-    def _now(self, event: str, now: LiveState) -> Answer:
-        answer = {} if now.prediction is None else _answer_of(now.prediction, now.estimates)
-        here = {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
-        return {"event": event, "stamp": self.stamp} | self._by | here | answer
-
-    def _ended(self, touch: LiveTouch) -> Answer:
-        over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
-        over |= {"touches": 1 + len(touch.earlier)}
-        return {"event": "ended", "stamp": self.stamp} | self._by | over | _answer_of(touch.prediction, touch.estimates)
-
-
-def _answer_of(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    measured = {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
-    return (
-        prediction.as_json()
-        | measured
-        | {
-            "unusual": prediction.unusual,
-            "candidates": prediction.candidates(),
-            "ranking": prediction.ranking[:RANKED],
-        }
-    )
+    def _say(self, event: str, now: LiveState) -> None:
+        self._answer(under_way(event, now, self.stamp, self._by))

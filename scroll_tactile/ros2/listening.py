@@ -89,7 +89,7 @@ class Listener:
         silent = time.monotonic() - self.received
         count = self.node.count_publishers(self.topic)
         if not count:
-            topics = [name for name, _ in self.node.get_topic_names_and_types()]
+            topics = [name for name, _ in self.node.get_topic_names_and_types() if name != self.topic]  # heard here
             return f"no reading for {silent:.0f} s: nobody publishes {self.topic}{nearest(self.topic, topics)}"
         about = self.node.get_publishers_info_by_topic(self.topic)
         kinds = sorted({each.topic_type for each in about})

@@ -3,6 +3,7 @@
 import json
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import launching
@@ -58,6 +59,15 @@ class Remote:
         message = rclpy.Parameter(name, value=value).to_parameter_msg()
         [result] = self.ask(SetParameters, "set_parameters", parameters=[message]).results
         return "" if result.successful else result.reason or "no reason"
+
+    def touched(self, material, seconds=120):
+        """Wait until the last touch was one of a material, whatever was published before anybody subscribed."""
+        end = time.monotonic() + seconds
+        while True:
+            reply = self.call("predict")
+            if reply.success and json.loads(reply.message)["material"] == material:
+                return
+            assert time.monotonic() < end, reply.message
 
     def ended(self):
         return [answer for answer in self.answers if answer["event"] == "ended"]
@@ -116,7 +126,7 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
     remote = Remote(spinning)
     remote.listen()
     with publishing(500, 250), node_command(own) as process:
-        spinning.until(lambda: len(remote.ended()) == 2, 120)
+        remote.touched("b")
         reply = remote.call("learn", "felt")
         assert reply.success and "learned as observation" in reply.message
         remote.answers.clear()
@@ -143,9 +153,7 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
 
 def test_every_reading_since_the_topic_was_heard_is_counted(spinning, own):
     with publishing(500, 250), node_command(own) as process:
-        remote = Remote(spinning)
-        remote.listen()
-        spinning.until(lambda: len(remote.ended()) == 2, 120)
+        Remote(spinning).touched("b")
         output = ended_by_ctrl_c(process)
     assert "messages: 500" in output and "dropped" not in output
 

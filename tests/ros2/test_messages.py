@@ -2,6 +2,7 @@
 
 import json
 import math
+import runpy
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -215,6 +216,43 @@ def test_the_service_of_the_message_package_has_what_the_node_fills():
     assert [field for field, _ in types["a/msg/Response"][1]] == ["success", "message", "observation"]
     cmake = (MESSAGES / "CMakeLists.txt").read_text()
     assert all(f'"{path.relative_to(MESSAGES)}"' in cmake for path in MESSAGES.glob("*/*.*"))
+
+
+def test_over_rosbridge_a_process_of_another_python_answers_and_learns(memory, tmp_path, monkeypatch):
+    """With a double of roslibpy; messages come as dictionaries, as JSON has them."""
+    places = {}
+
+    class Place:
+        def __init__(self, client, name, kind, **more):
+            places[name], self.sent = self, []
+
+        def advertise(self, call=None):
+            self.call = call
+
+        def subscribe(self, call):
+            self.call = call
+
+        def publish(self, message):
+            self.sent.append(json.loads(message["data"]))
+
+    double = ModuleType("roslibpy")
+    double.Topic = double.Service = Place
+    double.Message = double.Ros = dict
+    monkeypatch.setitem(sys.modules, "roslibpy", double)
+    example = runpy.run_path(str(MESSAGES.parent / "rosbridge.py"))
+    with TactileLearner.open(memory, mode="read") as source:
+        source.backup(tmp_path / "own")
+    with TactileLearner.open(tmp_path / "own") as own:
+        beside = example["Beside"](None, own, TOPIC, "sensor_msgs/JointState", "position")
+        beside.learn({"load_namespace": "felt"}, early := {})
+        assert not early["success"] and "none has ended yet" in early["message"]
+        for i, row in enumerate(shift("ab", seed=7)[0]):
+            stamp = {"sec": 1000 + i // 50, "nanosec": (i % 50) * 20_000_000}
+            places[TOPIC].call({"header": {"stamp": stamp, "frame_id": ""}, "position": row.tolist(), "name": []})
+        sent = places["/scroll_tactile/answer"].sent
+        assert [answer["material"] for answer in sent if answer["event"] == "ended"] == ["a", "b"]
+        places["/scroll_tactile/learn"].call({"load_namespace": "felt"}, done := {})
+        assert done["success"] and own.materials["felt"] == 1
 
 
 def test_a_session_that_was_recorded_is_learned_from_again(spinning, memory, tmp_path):

@@ -39,20 +39,27 @@ class Listener:
         self.node, self.kind, self._quality = node, kind, quality or Quality()
         self._quality.profile("")  # or raises
         self.topic = node.resolve_topic_name(topic)
-        self.received = self._reported = time.monotonic()
+        self.received = self._reported = 0.0
         self._patience = MISSED
         self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
         self._takers: list[Taker] = []
         self._waiting: deque[tuple[Any, Mapping[str, Any]]] = deque()
         self._left_out = 0  # of what waited
+        self._looking: Any = None
+        self._timer: Any = None
         self.subscription: Any = None
-        message = None if kind is None else interface(kind)
-        self._looking = self._timer = None
-        if message is not None:
-            self._subscribe(message)
+        self.start()
+
+    def start(self) -> None:
+        """Hear the topic, as from the beginning on, after `stop`. Nothing happens where it is heard."""
+        if self._timer is not None:
+            return
+        if self.kind is not None:
+            self._subscribe(interface(self.kind))
         elif not self._look():
-            self._looking = node.create_timer(LOOKED, self._look)
-        self._timer = node.create_timer(1.0, self._each_second)
+            self._looking = self.node.create_timer(LOOKED, self._look)
+        self.received, self._reported, self._numbers = time.monotonic(), time.monotonic(), {}
+        self._timer = self.node.create_timer(1.0, self._each_second)
 
     def give(self, taker: Taker) -> None:
         """Give messages to a taker, too; the first gets those that wait."""
@@ -75,7 +82,7 @@ class Listener:
             self._waiting.popleft()
             self._left_out += 1
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """Hear no more; what waited is gone."""
         for timer in filter(None, (self._looking, self._timer)):
             self.node.destroy_timer(timer)

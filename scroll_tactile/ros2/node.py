@@ -83,6 +83,8 @@ class TactileNode:
         self.node, self.finger, self.active = node, finger, False
         self._own = listener is None  # heard from here on: what comes meanwhile waits
         self.listener = Listener(node, topic, kind, quality) if listener is None else listener
+        if self._own and not active:
+            self.listener.stop()
         self._log, self._answered = node.get_logger(), answered
         declare(node, DYNAMIC, {"risk": risk, "scene": list(scene or ()) or ""})
         how: dict[str, Any] = {"contact": contact, "of": of, "watch": watch, **self._wanted({})}
@@ -102,6 +104,8 @@ class TactileNode:
             if self.bridge.paused:
                 self.bridge.resume()
             self.active = True
+            if self._own:
+                self.listener.start()
             self.listener.give(self._take)
 
     def deactivate(self) -> None:
@@ -109,6 +113,8 @@ class TactileNode:
         if self.active:
             self.active = False
             self.listener.leave(self._take)
+            if self._own:
+                self.listener.stop()
             self.bridge.pause()
 
     def receive(self, message: Any, about: Mapping[str, Any]) -> None:
@@ -125,8 +131,6 @@ class TactileNode:
             self.node.destroy_service(service)
         for publisher in [*self._answers.publishers, self._diagnostics.publisher]:
             self.node.destroy_publisher(publisher)
-        if self._own:
-            self.listener.close()
 
     def _offered(self) -> list[Any]:
         """The services."""

@@ -60,8 +60,11 @@ class _Served:
             new_sensor(Path(self.value("memory")), self.value("sensor"), self.value("preset"))
         kind = self.value("type") or None
         quality = Quality(*(self.value(f"qos.{name}") for name in ("reliability", "durability", "depth")))
-        for topic in {finger.topic for finger in fingers} - self._listeners.keys():
-            self._listeners[topic] = Listener(self.node, topic, kind, quality)
+        for topic in {finger.topic for finger in fingers}:
+            if topic in self._listeners:
+                self._listeners[topic].start()
+            else:
+                self._listeners[topic] = Listener(self.node, topic, kind, quality)
         return fingers
 
     def open(self) -> None:
@@ -102,17 +105,18 @@ class _Served:
         """Take no more readings; touches under way end. What was not yet taken is gone."""
         for finger in self.fingers:
             finger.deactivate()
-        while self._listeners:
-            self._listeners.popitem()[1].close()
+        for listener in self._listeners.values():
+            listener.stop()
 
     def clean_up(self) -> None:
         """Let all go, the memory, too; a second call does nothing."""
         self.deactivate()
         for finger in self.fingers:
             for name, count in finger.bridge.status().items():
-                self.met[name] = self.met.get(name, 0) + count
+                before = self.met.get(name, 0)
+                self.met[name] = bool(before or count) if isinstance(count, bool) else before + count
             finger.close()
-        self.fingers = []
+        self.fingers, self._listeners = [], {}
         learner, self.learner = self.learner, None
         if learner is not None:
             self.met["materials"] = len(learner.materials)

@@ -110,7 +110,11 @@ def test_a_manager_takes_the_node_through_its_states_and_parameters_are_checked(
             spinning.until(lambda: len(remote.ended()) == 2, 120)
         assert json.loads(remote.call("predict").message)["material"] == "b"
         assert remote.go("deactivate") and remote.state() == "inactive"
+        spinning.until(lambda: not remote.node.count_subscribers(TOPIC))
         assert remote.call("learn", "felt").success  # what was touched before
+        assert remote.go("activate")
+        spinning.until(lambda: remote.node.count_subscribers(TOPIC))
+        assert remote.go("deactivate")
         assert remote.go("cleanup") and remote.state() == "unconfigured"
         with TactileLearner.open(own) as opened:  # it lets the memory go
             assert opened.materials["felt"] == 1

@@ -134,7 +134,7 @@ def test_fingers_of_one_message_have_answers_and_services_of_their_own(spinning)
     assert {pair.key: pair.value for pair in state.values}["probability"] == str(last["probability"])
     for finger in fingers.values():
         finger.close()
-    listener.close()
+    listener.stop()
     assert not [name for name, _ in node.get_service_names_and_types() if name.startswith("/hand/thumb")]
 
 

@@ -3,7 +3,7 @@
 With ROS 2 sourced:  python examples/ros2_node.py MEMORY /rh/tactile 'tactiles[0].electrodes'
 
 It waits for the topic. To tell it what it touched last:
-    ros2 param set /hand material silk && ros2 service call /hand/learn std_srvs/srv/Trigger
+    ros2 service call /hand/learn diagnostic_msgs/srv/AddDiagnostics "{load_namespace: silk}"
 """
 
 import sys

@@ -79,7 +79,7 @@ class LiveReport:
     otherwise. truncated: that went on beyond what is kept of a touch. brief: contacts too
     short for a touch. relearned: how often the sensor turned out to be much quieter than what was learned as its rest:
     it was touched from the first reading on, and that touch was not found. learning: whether rest is still being
-    learned; nothing is found until then.
+    learned; nothing is found until then. restless: whether it is not learned yet because what came is no rest.
     """
 
     readings: int = 0
@@ -99,3 +99,4 @@ class LiveReport:
     brief: int = 0
     relearned: int = 0
     learning: bool = False
+    restless: bool = False

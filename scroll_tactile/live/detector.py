@@ -12,11 +12,16 @@ Two things end what is no contact: a level that moved, where for a second nothin
 than any touch (reported as "still"); and a rest that was none. Where the sensor turns out eight times as quiet as it,
 something touched it from the first reading on; where a contact outlasts any touch before ten seconds of rest were seen,
 its noise was not yet known. Then rest is learned anew.
+
+What comes first is learned as rest only if it is one: not where something begins or ends in it (`Rest.unrest`), nor
+where the memory knows it as a touch. Until then the latest stretch counts, and after as long as a level may take to
+move the quietest: a sensor that is never at rest is one all the same.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -51,11 +56,21 @@ class Event:
 
 
 class ContactDetector:
-    """Finds contacts in readings at the sensor's rate. false_contacts: an hour that may be at rest."""
+    """Finds contacts in readings at the sensor's rate.
+
+    false_contacts: an hour that may be at rest. touched: whether readings (k, n) are known as a touch; without it none
+    are. restless: whether what came so far was no rest.
+    """
 
     prefix: npt.NDArray[np.float64] | None = None  # what stands before a touch's readings
 
-    def __init__(self, sensor: Sensor, false_contacts: float) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        false_contacts: float,
+        touched: Callable[[npt.NDArray[np.float64]], bool] = lambda rows: False,
+    ) -> None:
+        self._touched = touched
         self._rest = Rest(sensor, false_contacts)
         self._long = round(max(LONG, 4 * sensor.duration) * sensor.rate)
         self._block = np.empty((self._rest.block, sensor.channels))
@@ -63,9 +78,10 @@ class ContactDetector:
         quiet = max(FEWEST_QUIET, round(QUIET * sensor.rate))
         self._last = np.empty((quiet, sensor.channels))  # readings of a contact, in a ring
         self._last_aways, self._last_distances = np.empty_like(self._last), [0.0] * quiet
-        self._learned: list[npt.NDArray[np.float64]] = []
-        self._count = 0  # readings that are being learned
-        self.learning, self.contact = True, False
+        self._learned: deque[npt.NDArray[np.float64]] = deque(maxlen=self._rest.needed // self._rest.block)
+        self._filled = self._waited = 0  # readings of the block that is being learned; that came before it was
+        self._quietest: tuple[float, npt.NDArray[np.float64]] | None = None
+        self.learning, self.restless, self.contact = True, False, False
         self._anew()
 
     def _anew(self) -> None:
@@ -105,13 +121,30 @@ class ContactDetector:
         return taken, None
 
     def _learn(self, numbers: npt.NDArray[np.float64]) -> int:
-        used = min(len(numbers), self._rest.needed - self._count)
-        self._learned.append(numbers[:used])
-        self._count += used
-        if self._count == self._rest.needed:
-            self._rest.learn(np.concatenate(self._learned))
-            self._learned, self._count, self.learning = [], 0, False
+        block = self._rest.block
+        used = min(len(numbers), block - self._filled)
+        self._block[self._filled : self._filled + used] = numbers[:used]
+        self._filled += used
+        if self._filled == block:
+            self._filled, self._waited = 0, self._waited + block
+            self._learned.append(self._block.copy())
+            if len(self._learned) == self._learned.maxlen:
+                self._judge(np.concatenate(self._learned))
         return used
+
+    def _judge(self, stretch: npt.NDArray[np.float64]) -> None:
+        """Learn a stretch as rest if it is one, or the quietest so far where none has come for long."""
+        unrest = self._rest.unrest(stretch)
+        self.restless = unrest > 1 or self._touched(self._rest.readings(stretch))
+        if self.restless:
+            if self._quietest is None or unrest < self._quietest[0]:
+                self._quietest = unrest, stretch
+            if self._waited < self._long:
+                return
+            stretch = self._quietest[1]
+        self._rest.learn(stretch)
+        self._learned.clear()
+        self._quietest, self.learning, self.restless = None, False, False
 
     def _quiet(self, distances: list[float]) -> tuple[int, Event | None]:
         kappa, alarm = self._rest.kappa, self._rest.alarm

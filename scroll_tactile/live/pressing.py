@@ -27,7 +27,7 @@ class PressDetector:
     Raises InputError where there is no resting image, so that every frame counts.
     """
 
-    learning = False
+    learning = restless = False
 
     def __init__(self, sensor: Sensor, rest: Rest) -> None:
         if rest is None:

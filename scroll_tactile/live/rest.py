@@ -42,6 +42,8 @@ MOST_BLOCKS = 2**11  # then all sums are halved: noise changes in days
 WIDER = 4.0  # times the variance of normal noise's d², that is assumed of it
 MOST = 2.0  # times the mean d², that a block counts for
 APART = 3.0  # standard deviations of d² that κ lies beyond its mean
+LOUDER = 8.0  # times the median block's scatter, that no block of a rest has
+JUMP = 64.0  # times what white noise would make of them, that blocks' means may scatter by: noise hums and drifts
 
 
 class Rest:
@@ -86,12 +88,26 @@ class Rest:
         far = float(total @ total) / (count * UNITS) ** 2
         return far, (math.fsum(distances) / count - far) * count / (count - 1)
 
+    def readings(self, numbers: Whole) -> npt.NDArray[np.float64]:
+        """Whole numbers (k, n) as the readings that they stand for."""
+        return self._low + numbers / self._scale
+
+    def unrest(self, numbers: Whole) -> float:
+        """How far from a rest readings are, a whole number of blocks of them; above 1 they are none.
+
+        In a rest no block scatters many times as the median one does, and blocks' means lie where noise brings them;
+        both fail where a touch begins or ends, not within one at a steady speed.
+        """
+        blocks = numbers.reshape(-1, self.block, self.channels)
+        own = blocks.var(axis=1, ddof=1) + _floor(numbers)
+        usual = np.median(own, axis=0)
+        louder = float((own / usual).mean(axis=1).max())
+        jump = float((self.block * blocks.mean(axis=1).var(axis=0, ddof=1) / usual).mean())
+        return max(louder / LOUDER, jump / JUMP)
+
     def learn(self, numbers: Whole) -> None:
         """Begin with readings at rest, a whole number of blocks of them: what was learned before is gone."""
-        steps = np.abs(np.diff(numbers, axis=0))
-        moving = [float(np.median(column[column > 0])) for column in steps.T if column.any()]
-        # Of the channels, not of each: one that hardly ever moves at rest is not known for it.
-        self._floor = max(float(np.median(moving)) if moving else LEVELS / 1024, 1.0) ** 2
+        self._floor = _floor(numbers)
         self._scatter[:] = 0
         self._levels.clear()
         self._blocks = self.measured = 0
@@ -168,6 +184,14 @@ class Rest:
         self.mean, self.kappa = mean, mean + APART * math.sqrt(spread)
         self.alarm = self._log_run / _rate(mean, spread, self.kappa)
         self.inner, self.near = mean + 3 * math.sqrt(spread / block), mean / 2
+
+
+def _floor(numbers: Whole) -> float:
+    """The square of what a usual channel changes by from one reading to the next, where it changes."""
+    steps = np.abs(np.diff(numbers, axis=0))
+    moving = [float(np.median(column[column > 0])) for column in steps.T if column.any()]
+    # Of the channels, not of each: one that hardly ever moves at rest is not known for it.
+    return max(float(np.median(moving)) if moving else LEVELS / 1024, 1.0) ** 2
 
 
 def _rate(mean: float, variance: float, kappa: float) -> float:

@@ -60,8 +60,7 @@ class LiveSession:
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
         if not 0 < false_contacts < math.inf:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
-        if not 0 < risk < 1:
-            raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
+        _require_risk(risk)
         self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
         self.sensor = sensor = predictor.recipe.sensor
         self._rest: Rest = capabilities_of(self._extractor.embedding).rest
@@ -72,8 +71,11 @@ class LiveSession:
         self._manual = contact == "manual"
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
-            found = PressDetector(sensor, self._rest) if sensor.camera else ContactDetector(sensor, false_contacts)
-            self._detector = found
+            self._detector = (
+                PressDetector(sensor, self._rest)
+                if sensor.camera
+                else ContactDetector(sensor, false_contacts, self._touched)
+            )
         self.report = LiveReport(learning=not self._manual and not sensor.camera)
         self._clock = Clock(sensor.rate, self.report)
         self._dtype = np.dtype(np.float32 if sensor.camera else np.float64)
@@ -161,6 +163,25 @@ class LiveSession:
             )
         self._again = True
 
+    def adjust(self, *, risk: float, scene: Sequence[str] | None) -> None:
+        """Decide by another risk, and among the materials of another scene, from the next touch on.
+
+        A risk that is new to the memory's model is measured first, which may take seconds. Raises InputError for a risk
+        that is none, for an empty scene, and after `close`; UnknownMaterialError for a scene that names a material
+        never observed. Then nothing has changed.
+        """
+        self._require_open()
+        _require_risk(risk)
+        model = self._predictor.frozen().model
+        candidates_of(scene, model.names, model.known)
+        before, self._risk = self._risk, risk
+        try:
+            self._rule(model)
+        except BaseException:
+            self._risk = before
+            raise
+        self._scene = scene
+
     def close(self) -> None:
         """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
         if self._closed:
@@ -219,7 +240,7 @@ class LiveSession:
         touch = self._under_way
         self._came += len(rows)
         if self._detector is not None:
-            self.report.learning = self._detector.learning
+            self.report.learning, self.report.restless = self._detector.learning, self._detector.restless
         if touch is None:
             self._recent.add(rows)
             if event is not None and event.kind == "began":
@@ -238,6 +259,12 @@ class LiveSession:
             self.report.relearned += 1
             self._leave(touch)
             self._recent.clear()
+
+    def _touched(self, rows: Array) -> bool:
+        """Whether the memory knows what came while rest was to be learned, in parts no longer than what it learned."""
+        model = self._predictor.frozen().model
+        parts = np.array_split(rows, -(-len(rows) // max(1, model.longest))) if model.names else []
+        return bool(parts) and all(self._predictor.predict((part,), None).known is True for part in parts)
 
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""
@@ -335,6 +362,11 @@ class LiveSession:
         last = ended[-1]
         said = last.prediction, last.decided, True, ended, last.estimates, self._settled
         return LiveState(False, last.stream.seconds, *said)
+
+
+def _require_risk(risk: float) -> None:
+    if not 0 < risk < 1:
+        raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
 
 
 def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:

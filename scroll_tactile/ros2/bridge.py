@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -16,16 +17,17 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
-from scroll_tactile.results import Estimate, Prediction, Receipt
+from scroll_tactile.results import Receipt
+from scroll_tactile.ros2.answers import Answer, answer_of, ended, under_way
+from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.ranges import all_clipped
+from scroll_tactile.signals.stream import Stream
 from store import StoreError
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
-Answer = Mapping[str, Any]
-"""What JSON can hold; see `Bridge`."""
-
-RANKED = 5  # materials of an answer's ranking
+RESTLESS = "the sensor is not at rest, or something touches it: nothing is found until it is left alone for two seconds"
+_FILE = re.compile(r"\w[\w.-]{0,99}", re.ASCII)  # a name that leads to no other folder
 
 
 @dataclass
@@ -45,18 +47,18 @@ class BridgeReport:
 class Bridge:
     """A live session of a learner, fed with messages.
 
-    field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact, of:
-    see `learner.live`. watch: note the sensor at rest before each touch, and touches that were decided and are known,
-    for `learner.health`: some hundred bytes each. answer: called with each answer, when something changed. warn: called
-    with each kind of fault once.
+    field: the path to a message's numbers, see `recordings.paths`; for a camera's pictures "data". risk, contact, of,
+    scene: see `learner.live`. watch: note the sensor at rest before each touch, and touches that were decided and are
+    known, for `learner.health`: some hundred bytes each. answer: called with each answer, when something changed. warn:
+    called with each kind of fault once.
 
-    An answer has event ("began", "prediction", "decided", "ended", or "brief" for a contact too short for a touch),
-    stamp (of the reading after which it is given), contact, seconds (since the touch began), decided, material,
-    probability, known, novelty (None where nothing was ever observed), unusual, candidates and ranking (the five
-    likeliest); "ended" also has end, why it did, and touches, of how many of the same thing the answer is. All but
-    event, stamp and contact may be missing where nothing was predicted yet. estimates, by quantity, is there where any
-    was declared: of each what an `Estimate` has. By an axis each answer has its name as of, a label as material, and
-    no estimates.
+    An answer has event ("began", "prediction", "decided", "ended", "brief" for a contact too short for a touch, or
+    "paused" for a touch that `pause` ended), stamp (of the reading after which it is given), contact, seconds (since
+    the touch began), decided, material, probability, known, novelty (None where nothing was ever observed), unusual,
+    candidates and ranking (the five likeliest); "ended" also has end, why it did, and touches, of how many of the same
+    thing the answer is. All but event, stamp and contact may be missing where nothing was predicted yet. estimates, by
+    quantity, is there where any was declared: of each what an `Estimate` has. By an axis each answer has its name as
+    of, a label as material, and no estimates.
 
     A message's time is its header's stamp. One without, or with a stamp of zero, counts by when it was published, on
     the clock of the stamps before it.
@@ -73,16 +75,20 @@ class Bridge:
         risk: float = 0.05,
         contact: Literal["auto", "manual"] = "auto",
         of: str | None = None,
+        scene: Sequence[str] | None = None,
         watch: bool = False,
         answer: Callable[[Answer], object],
         warn: Callable[[str], object],
     ) -> None:
         self.field = FieldPath(field)
         self.learner = learner
-        self.session = learner.live(risk=risk, contact=contact, of=of)
+        self._how: dict[str, Any] = {"risk": risk, "contact": contact, "scene": scene, "of": of}
+        self.session = learner.live(**self._how)
         self.report = BridgeReport()
         self.state = LiveState()
         self.stamp = 0.0
+        self._touch: Stream | None = None  # the last of the session before this one
+        self.paused = False
         self._learned: list[Receipt] = []  # by this bridge, and not taken back
         self._answer, self._warn = answer, warn
         if watch:
@@ -94,6 +100,7 @@ class Bridge:
         self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
         self._ahead = 0.0  # of when a message is published, by its stamp
         self._warned: set[type[Exception]] = set()
+        self._restless = False
 
     def receive(self, message: object, published: float) -> LiveState:
         """Take the reading of a message, published at this time in seconds, and say where the session stands.
@@ -113,7 +120,39 @@ class Bridge:
             return self.state
         self.stamp = stamp
         self._publish(state)
+        if self.session.report.restless != self._restless:
+            self._restless = self.session.report.restless
+            self._warn(RESTLESS if self._restless else "the sensor was at rest: touches are found from now on")
         return state
+
+    def check(self, scene: Sequence[str] | None) -> None:
+        """Raise what `adjust` raises for a scene; nothing changes."""
+        axis = self._how["of"]
+        names = self.learner.materials if axis is None else self.learner.axes.get(axis, {})
+        candidates_of(scene, sorted(names), names.keys())
+
+    def adjust(self, *, risk: float, scene: Sequence[str] | None) -> None:
+        """Answer by another risk and scene from the next touch on. Raises what `LiveSession.adjust` raises."""
+        if not self.paused:
+            self.session.adjust(risk=risk, scene=scene)
+        self._how |= {"risk": risk, "scene": scene}
+
+    def pause(self) -> None:
+        """End the touch under way, if any, as after a gap; it can still be learned, and `resume` begins anew."""
+        self.close()
+        self._touch, self.paused = self.touch, True
+        if self.state.contact:
+            self._say("paused", self.state._replace(contact=False))
+        self.state = LiveState()
+
+    def resume(self) -> None:
+        """Take readings again, after `pause`; rest is learned anew. Raises what `learner.live` raises."""
+        self.session, self.paused = self.learner.live(**self._how), False
+
+    @property
+    def touch(self) -> Stream | None:
+        """The last touch that ended; None before."""
+        return self._touch if self.session.touch is None else self.session.touch
 
     def learn(self, material: str) -> str:
         """Learn the last touch that ended under this name; durable when this returns. Says what was done.
@@ -121,9 +160,7 @@ class Bridge:
         Raises InputError where no touch has ended, or the memory has it under another name, and what `learner.observe`
         raises.
         """
-        touch = self.session.touch
-        if touch is None:
-            raise InputError("expected a touch to learn; none has ended yet")
+        touch = self._ended_touch("to learn")
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
@@ -151,6 +188,49 @@ class Bridge:
         self._learned.pop()
         left = self.learner.materials.get(receipt.material, 0)
         return f"{receipt.material}: observation {receipt.sequence} was taken back; {left} are left"
+
+    def retract(self, observation: str) -> str:
+        """Take back an observation, by its number; durable when this returns. Says what was done.
+
+        Raises InputError for what is no number, and what `learner.retract` raises.
+        """
+        if not observation.isascii() or not observation.isdigit():
+            raise InputError(f"expected the number of an observation, as learn gave it; came {observation!r:.60}")
+        self.learner.retract(int(observation))
+        self._learned = [each for each in self._learned if each.sequence != int(observation)]
+        return f"observation {int(observation)} was taken back"
+
+    @property
+    def learned(self) -> Receipt | None:
+        """What this bridge learned last, and was not taken back."""
+        return self._learned[-1] if self._learned else None
+
+    def save(self, name: str) -> str:
+        """Pack the memory as a file of this name beside its folder, for `learner.merge`. Says where it lies.
+
+        Raises InputError for a name with a folder in it, and where there is such a file, and what `learner.pack`
+        raises.
+        """
+        if not _FILE.fullmatch(name):
+            raise InputError(f"expected a file's name of letters, digits, '_', '-' and '.'; came {name!r:.60}")
+        if self.learner.path is None:
+            raise InputError("expected a memory on disk to be saved; it has no path")
+        path = self.learner.path.absolute().with_name(name if name.endswith(".zip") else f"{name}.zip")
+        if path.exists():
+            raise InputError(f"{path.name} is there already: choose another name")
+        self.learner.pack(path)
+        return str(path)
+
+    def predict(self) -> str:
+        """The answer to the last touch that ended, by the memory as it is now, as JSON; see the class.
+
+        Raises InputError where no touch has ended.
+        """
+        touch = self._ended_touch("to predict")
+        scene, axis = self._how["scene"], self._how["of"]
+        prediction = self.learner.predict(touch, scene=scene, of=axis)
+        said = {"event": "predicted", "stamp": self.stamp, "contact": self.state.contact, "seconds": touch.seconds}
+        return json.dumps(said | self._by | answer_of(prediction, {}))
 
     def materials(self) -> str:
         """The materials with their observations, as JSON."""
@@ -180,6 +260,11 @@ class Bridge:
         """The next touch is of the same thing as the last. Raises InputError before any touch."""
         self.session.again()
         return "the next touch is of the same thing as the last: what they say adds up"
+
+    def _ended_touch(self, what: str) -> Stream:
+        if self.touch is None:
+            raise InputError(f"expected a touch {what}; none has ended yet")
+        return self.touch
 
     def status(self) -> dict[str, int | bool]:
         """What the bridge and its session met, by name."""
@@ -242,37 +327,17 @@ class Bridge:
         """Answer what is new."""
         before, self.state = self.state, now
         for touch in now.touches:
-            self._answer(self._ended(touch))
+            self._answer(ended(touch, self.stamp, self._by))
             if self._watch:
                 self._note_health(touch)
         if now.contact:
             fresh = not before.contact or bool(now.touches)
             if now.decided and (fresh or not before.decided):
-                self._answer(self._now("decided", now))
+                self._say("decided", now)
             elif fresh or now.prediction is not before.prediction:
-                self._answer(self._now("began" if fresh else "prediction", now))
+                self._say("began" if fresh else "prediction", now)
         elif before.contact and not now.touches:
-            self._answer(self._now("brief", now))
+            self._say("brief", now)
 
-    def _now(self, event: str, now: LiveState) -> Answer:
-        answer = {} if now.prediction is None else _answer_of(now.prediction, now.estimates)
-        here = {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
-        return {"event": event, "stamp": self.stamp} | self._by | here | answer
-
-    def _ended(self, touch: LiveTouch) -> Answer:
-        over = {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
-        over |= {"touches": 1 + len(touch.earlier)}
-        return {"event": "ended", "stamp": self.stamp} | self._by | over | _answer_of(touch.prediction, touch.estimates)
-
-
-def _answer_of(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    measured = {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
-    return (
-        prediction.as_json()
-        | measured
-        | {
-            "unusual": prediction.unusual,
-            "candidates": prediction.candidates(),
-            "ranking": prediction.ranking[:RANKED],
-        }
-    )
+    def _say(self, event: str, now: LiveState) -> None:
+        self._answer(under_way(event, now, self.stamp, self._by))

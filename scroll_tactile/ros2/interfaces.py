@@ -6,15 +6,55 @@ import importlib
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from scroll_tactile.errors import FieldError, InputError, MissingLibraryError
 from scroll_tactile.libraries import install_line
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = ["interface", "kind_of", "require_rclpy"]
+__all__ = ["Quality", "interface", "kept", "kind_of", "require_rclpy"]
 
 _NAME = re.compile(r"([A-Za-z]\w*)/(msg|srv)/([A-Za-z]\w*)")
+
+PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+DEEP, FEW = 2000, 120  # readings and pictures that may wait: two seconds at 1 kHz and at 60 Hz
+RELIABILITIES, DURABILITIES = ("best_effort", "reliable"), ("volatile", "transient_local")
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The quality of service of a subscription.
+
+    As it is, best effort and volatile, which any publisher can serve; but its queue holds two seconds of readings at
+    1 kHz, not five messages: while a touch is learned and its row reaches the disk no reading is taken, and a sensor at
+    1 kHz would overrun a queue of five in 5 ms. depth: messages that may wait; 0 as said, or 120 pictures.
+    """
+
+    reliability: str = "best_effort"
+    durability: str = "volatile"
+    depth: int = 0
+
+    def profile(self, kind: str) -> Any:
+        """The same in rclpy's terms, for messages of a kind. Raises InputError for a word that is none of them."""
+        from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+        for name, words in (("reliability", RELIABILITIES), ("durability", DURABILITIES)):
+            if getattr(self, name) not in words:
+                raise InputError(f"expected {name} as {' or '.join(words)}; came {getattr(self, name)!r}")
+        return QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=self.depth or (FEW if kind in PICTURES else DEEP),
+            reliability=ReliabilityPolicy[self.reliability.upper()],
+            durability=DurabilityPolicy[self.durability.upper()],
+        )
+
+
+def kept(depth: int) -> Any:
+    """The quality of service of what is kept for those who subscribe later; any subscriber can have it."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def require_rclpy() -> Any:

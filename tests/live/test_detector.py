@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from live_touches import learner, shift, slide
-from touches import PAD
+from touches import PAD, SMALL
 
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.errors import InputError
@@ -111,6 +111,47 @@ def test_contact_from_the_first_reading_on_is_found_out_and_reported():
     assert live.report.relearned == 1
     begins = [round(touch.at * PAD.rate) - 200 for touch in ended]
     assert all(abs(begin - place) <= 2 for begin, place in zip(begins[-1:], [290], strict=True))
+
+
+def test_a_touch_that_ends_in_the_first_two_seconds_is_not_learned_as_rest():
+    """Learned with it, rest would be so loud that the next touch would be none."""
+    random = np.random.default_rng(9)
+    rows = np.concatenate([slide("b", 50, random), shift("ab", 3)[0]])
+    with learner().live() as live:
+        live.push(rows[:120])
+        assert live.report.learning and live.report.restless
+        ended = live.push(rows[120:]).touches
+        assert not live.report.learning and not live.report.restless and live.report.relearned == 0
+    begins = [round(touch.at * PAD.rate) - 50 for touch in ended]
+    assert np.abs(np.array(begins) - [120, 290]).max() <= 2
+
+
+def test_a_touch_that_the_memory_knows_is_not_learned_as_rest():
+    """A finger at a steady speed is as steady as one at rest: only the memory can tell."""
+    random = np.random.default_rng(9)
+    own = TactileLearner(sensor=PAD, embedding=SMALL)
+    for material in "abc" * 12:
+        own.observe(material, slide(material, 50, random))
+    own.settle()
+    rows = np.concatenate([slide("a", 200, random), shift("b", 3)[0]])
+    with own.live() as live:
+        live.push(rows[:200])
+        assert live.report.restless
+        [ended] = live.push(rows[200:]).touches
+        assert not live.report.restless and live.report.relearned == 0
+    assert ended.prediction.material == "b" and abs(round(ended.at * PAD.rate) - 320) <= 2
+
+
+def test_a_sensor_that_is_never_at_rest_has_its_quietest_two_seconds_for_one():
+    random = np.random.default_rng(5)
+    rows = 0.02 * random.standard_normal((1200, 12))
+    rows[::100] += 0.5 * random.standard_normal((12, 12))
+    contacts, detector = found(wide(12), rows[:900])
+    assert detector.restless and detector.learning and not contacts
+    _, detector = found(wide(12), rows)
+    assert not detector.learning and not detector.restless
+    kept = [found(wide(12), rows, size=size)[1]._rest.level.tobytes() for size in (1, 7, 10_000)]
+    assert len(set(kept)) == 1
 
 
 def test_rest_is_whole_numbers_whatever_the_blocks():

@@ -1,15 +1,22 @@
 """A small robot: a memory of a pad, messages of its readings, and a process that publishes them."""
 
+import io
+import os
+import signal
+import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
-from live_touches import shift, slide
+from live_touches import GEL, frames, shift, slide
 
 from scroll_tactile import TactileLearner
 
 TOPIC = "/finger/tactile"
+ROBOT = Path(__file__)
 
 
 @dataclass
@@ -48,30 +55,90 @@ def taught(path, sensor, embedding):
     return path
 
 
-def publish(topic, count, rate, every):
-    """Publish rests and touches at a rate as sensor_msgs/JointState, from when somebody listens; every: copies."""
+def stream(kind, count):
+    """What a finger's driver sends as a message of a kind: rests and touches, or of a camera one of the gel's."""
+    if kind in ("Image", "CompressedImage"):
+        return [np.asarray(frame) for frame in frames(GEL.materials[1], 5, 8)]
+    rows, _ = shift("abcab", seed=3)
+    return np.resize(rows, (count, rows.shape[1]))
+
+
+def message_of(kind, reading, stamp):
+    """A reading as a message of a kind that there are wheels of."""
+    from sensor_msgs.msg import CompressedImage, Image, JointState
+    from std_msgs.msg import Float32MultiArray
+
+    if kind == "Float32MultiArray":
+        return Float32MultiArray(data=reading.astype(np.float32).tolist())
+    if kind == "JointState":
+        message = JointState(position=reading.tolist(), velocity=reading[::-1].tolist(), effort=reading.tolist())
+    else:
+        high = GEL.sensor.limits[1].max()
+        pixels = np.round(reading * (255 / high)).astype(np.uint8)
+        if kind == "Image":
+            height, width, _ = pixels.shape
+            pixels = np.ascontiguousarray(pixels[..., ::-1])
+            message = Image(height=height, width=width, step=3 * width, encoding="bgr8", data=pixels.tobytes())
+        else:
+            from PIL import Image as Picture
+
+            file = io.BytesIO()
+            Picture.fromarray(pixels).save(file, "PNG")
+            message = CompressedImage(format="png", data=file.getvalue())
+    message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
+    return message
+
+
+def publish(topic, count, rate, every, kind="JointState"):
+    """Publish a stream at a rate, from when somebody listens; every: copies."""
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
-    from sensor_msgs.msg import JointState
 
     rclpy.init()
     node = rclpy.create_node("finger")
-    publisher = node.create_publisher(JointState, topic, qos_profile_sensor_data)
-    rows, _ = shift("abcab", seed=3)
-    rows = np.resize(rows, (count, rows.shape[1]))
+    readings = stream(kind, count)
+    publisher = node.create_publisher(type(message_of(kind, readings[0], 0)), topic, qos_profile_sensor_data)
     while not publisher.get_subscription_count():
         time.sleep(0.02)
     time.sleep(0.5)  # the other side may not have matched yet
     begin = time.time()
-    for i, row in enumerate(rows):
+    clock = GEL.sensor.rate if "Image" in kind else 50.0  # the sensor's own, whose rate is the pad's
+    for i, reading in enumerate(readings):
         time.sleep(max(0.0, begin + i // every * every / rate - time.time()))
-        message = JointState(position=row.tolist())
-        stamp = 1000 + i / 50.0  # by the sensor's own clock, whose rate is the pad's
-        message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
-        publisher.publish(message)
+        publisher.publish(message_of(kind, reading, 1000 + i / clock))
     time.sleep(0.5)
     rclpy.shutdown()
 
 
+@contextmanager
+def publishing(count, rate, every=1, kind="JointState", topic=TOPIC):
+    words = [sys.executable, ROBOT, topic, str(count), str(rate), str(every), kind]
+    paths = os.pathsep.join([str(ROBOT.parents[1]), *sys.path])
+    with subprocess.Popen(list(map(str, words)), env=os.environ | {"PYTHONPATH": paths}) as process:
+        yield process
+        process.wait(120)
+    assert process.returncode == 0
+
+
+@contextmanager
+def command(*words, **options):
+    """A process that is killed at the end, where it has not ended before."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROBOT.parents[2]), *sys.path])}
+    line = list(map(str, [sys.executable, *words]))
+    with subprocess.Popen(line, env=environment, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def ended_by_ctrl_c(process):
+    """What a process wrote, where ctrl-C ended it in order."""
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    return output
+
+
 if __name__ == "__main__":
-    publish(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]))
+    publish(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4]), sys.argv[5])

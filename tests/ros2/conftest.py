@@ -1,0 +1,72 @@
+"""Nodes of a real ROS 2 in this process, where its wheels are, and a memory that they share."""
+
+import os
+import time
+
+import pytest
+from robot import taught
+from touches import PAD, SMALL
+
+from scroll_tactile import TactileLearner
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch):
+    """A domain of this process's own, and no other machine."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(10 + os.getpid() % 90))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+
+@pytest.fixture(scope="module")
+def memory(tmp_path_factory):
+    return taught(tmp_path_factory.mktemp("ros2") / "memory", PAD, SMALL)
+
+
+@pytest.fixture(scope="module")
+def learner(memory, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("learning") / "own"
+    with TactileLearner.open(memory, mode="read") as source:
+        source.backup(folder)
+    with TactileLearner.open(folder) as made:
+        yield made
+
+
+@pytest.fixture
+def spinning(alone):
+    """A context; gives nodes in it, and spins all until something is there."""
+    rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
+    from diagnostic_msgs.srv import AddDiagnostics
+    from rclpy.executors import SingleThreadedExecutor
+    from std_srvs.srv import Trigger
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+
+    class Nodes:
+        def node(self, name):
+            made = rclpy.create_node(name, context=context)
+            executor.add_node(made)
+            return made
+
+        def until(self, there, seconds=20.0):
+            end = time.monotonic() + seconds
+            while not there():
+                assert time.monotonic() < end, "it never came"
+                executor.spin_once(timeout_sec=0.05)
+
+        def ask(self, node, kind, name, **request):
+            client = node.create_client(kind, name)
+            self.until(client.service_is_ready, 60)
+            future = client.call_async(kind.Request(**request))
+            self.until(future.done, 60)
+            node.destroy_client(client)
+            return future.result()
+
+        def call(self, node, name, argument=None):
+            if argument is None:
+                return self.ask(node, Trigger, name)
+            return self.ask(node, AddDiagnostics, name, load_namespace=argument)
+
+    yield Nodes()
+    rclpy.try_shutdown(context=context)

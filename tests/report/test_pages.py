@@ -318,7 +318,7 @@ def test_intervals_cut_a_recording_on_its_page(tmp_path):
     path = _table(tmp_path)
     cut = tmp_path / "cut.csv"
     cut.write_text("file,begin,end,material\ntouch.csv,0,1,<oak>\ntouch.csv,1,1.5,silk\n")
-    made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time", "--intervals", cut)
+    made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time", "--labels", cut)
     assert made.exit_code == 0, made.output
     text = words((tmp_path / "page.html").read_text())
     assert "2 touches of 2 names" in text

@@ -70,7 +70,7 @@ def live(
                 before = _shown(before, now, at, as_json, growing)
             if touch:
                 _shown(before, session.end(), at, as_json, growing)
-        _summed_up(session.report, as_json)
+        _summed_up(session.report, as_json, whole=touch)
 
 
 def _rows(file: Path, timed: bool = False) -> Iterator[npt.NDArray[np.float64]]:
@@ -168,13 +168,18 @@ def _line(event: str, at: float, **more: Any) -> None:
     sys.stdout.flush()
 
 
-def _summed_up(report: LiveReport, as_json: bool) -> None:
+def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
     counted = {name: count for name, count in vars(report).items() if count}
     if as_json:
         typer.echo(json.dumps({"event": "report", **counted}))
+    if not report.touches and not whole:
+        why = "all of it went into learning" if report.learning else "its first 2 s were taken for"
+        console(error=True).print(
+            f"[yellow]no touch was found:[/] {why} the sensor at rest. If it begins in a touch, or is one from end to "
+            "end, take --touch"
+        )
+    if as_json:
         return
-    if report.learning:
-        say("[yellow]all of it went into learning the sensor at rest[/]: for one touch from end to end take --touch")
     say(
         f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
         f"{report.revised} revised"

@@ -281,7 +281,7 @@ def trace(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
     for place, channel in enumerate(chosen):
         _draw(drawing, readings[:, channel], at, [gap.index for gap in gaps], axis, TRACE * place + 12)
         name = "mean" if recording.readings.ndim > 2 else f"channel {channel + 1}"
-        drawing.text(LEFT - 6, TRACE * place + 12 + TRACE / 2 + 4, name, anchor="end")
+        drawing.text(LEFT - 6, TRACE * place + 22, name, anchor="end")
     drawing.across(axis, 10, bottom, "time, seconds from its begin" if unit == "s" else "reading")
     return drawing.svg()
 
@@ -321,7 +321,7 @@ def _draw(drawing: Drawing, values: FloatArray, at: FloatArray, gaps: Sequence[i
     for run in _runs(shares, gaps):
         points = [(axis(at[i]), up(share)) for i, share in _pieces(shares, run, len(values))]
         drawing.line(points if len(points) > 1 else [*points, (points[0][0] + 0.5, points[0][1])], "own thin")
-    drawing.text(LEFT - 6, top + TRACE - 4, f"{brief(low)} to {brief(high)}", "tiny", "end")
+    drawing.text(LEFT - 6, top + 21, f"{brief(low)} to {brief(high)}", "tiny", "end")
 
 
 def _runs(shares: FloatArray, gaps: Sequence[int]) -> Iterator[tuple[int, int]]:

@@ -33,11 +33,9 @@ class Whose:
 def whose_readings(contents: Contents, recording: Recording, sensor: Sensor | None, preset: str | None) -> Whose:
     """The sensor that was given, or the preset's, or the one whose messages these are.
 
-    Raises InputError for both, ChannelCountError for a sensor of other channels.
+    Raises ChannelCountError for a sensor of other channels.
     """
     if sensor is not None:
-        if preset is not None:
-            raise InputError("give sensor= or preset=: both say whose readings they are")
         if recording.readings[:1].size != sensor.channels:
             recording.stream(sensor)
         return Whose(sensor, None, f"that of sensor {sensor.name}")
@@ -46,9 +44,7 @@ def whose_readings(contents: Contents, recording: Recording, sensor: Sensor | No
     for entry in contents.entries:
         if (entry.topic, entry.field) == (recording.topic, recording.field):
             for name in names_for(entry.kind, entry.field, recording.readings.shape[1:]):
-                return Whose(
-                    find(name).sensor, name, f"that of preset {name}, as messages {entry.kind} are its sensor's"
-                )
+                return Whose(find(name).sensor, name, f"that of preset {name}, of messages {entry.kind}")
     return Whose(None, None, "")
 
 

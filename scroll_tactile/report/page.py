@@ -56,7 +56,7 @@ main{display:grid;grid-template-columns:minmax(0,1fr);column-gap:2rem}section{gr
 .beside>*{grid-column:1}.beside>h2,.beside>.all{grid-column:1/-1}.beside>.table{grid-column:2;grid-row:2/span 9}
 .beside>.rows{grid-column:2}}
 p{margin:.4rem 0;max-width:44rem}.soft,figcaption,th{color:var(--soft)}a{color:var(--blue)}
-nav{font-size:.9rem;margin:.6rem 0 1rem}nav a{margin-right:.9rem;white-space:nowrap;display:inline-block;
+nav{font-size:.9rem;margin:.6rem 0 1rem}nav a{margin-right:.9rem;display:inline-block;
 padding:.15rem 0}
 .cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(11.6rem,1fr));gap:.7rem;margin:1rem 0}
 .card{background:var(--card);border:1px solid var(--line);border-left:.35rem solid var(--soft);border-radius:.4rem;
@@ -94,13 +94,13 @@ td.number,th.number{text-align:right;font-variant-numeric:tabular-nums;white-spa
 .pictures figure{margin:0}.pictures img,.wide img{display:block;width:100%;border-radius:.25rem}
 .pictures img{height:4.2rem}.frames img{height:auto}.wide img{image-rendering:pixelated}
 .pictures figcaption{font-size:.8rem;line-height:1.3}
-pre{overflow:auto;max-height:20rem;border:1px solid var(--line);border-radius:.4rem;background:var(--card);
-padding:.5rem .8rem;margin:.6rem 0;line-height:1.6}
+pre{overflow:auto;white-space:pre-wrap;max-height:20rem;border:1px solid var(--line);border-radius:.4rem;
+background:var(--card);padding:.5rem .8rem;margin:.6rem 0;line-height:1.6}
 code{font-family:ui-monospace,Menlo,Consolas,monospace;font-size:.85em}
 footer{margin-top:2.5rem;border-top:1px solid var(--line);padding-top:.8rem;font-size:.85rem;color:var(--soft)}
 @media print{:root{color-scheme:light;--paper:#fff;--ink:#000;--soft:#444;--line:#ccc;--card:#fff;--blue:#0067a8;
 --red:#c04a00;--green:#00795a;--band:#eee}body{max-width:none;padding:0;font-size:10pt}nav{display:none}
-.table,pre{max-height:none;overflow:visible}pre{white-space:pre-wrap}.rows{display:none}
+.table,pre{max-height:none;overflow:visible}.rows{display:none}
 table{font-size:8pt}th,td{padding:.1rem .35rem}th,th.number{position:static;white-space:normal}td.name{min-width:0}
 h2,h3{break-after:avoid}tr,.card{break-inside:avoid}
 figure{max-width:13cm}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}}

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import __version__
-from scroll_tactile.errors import FieldError
+from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.recordings import Contents, Interval, Recording, describe, read
 from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, ChannelSummary, channels_of
@@ -52,6 +52,8 @@ def recording_page(
     Raises what `describe` and `read` raise, ChannelCountError for a sensor of other channels, and InputError for both a
     sensor and a preset.
     """
+    if sensor is not None and chosen.get("preset") is not None:
+        raise InputError("give sensor= or preset=: both say whose readings they are")
     contents = describe(path)
     recording, why = _read(contents, fspath(path), chosen)
     whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
@@ -67,7 +69,7 @@ def recording_page(
     ]
     where = f"topic <code>{shown(recording.topic)}</code>, " if recording.topic else ""
     under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {_shape(recording)}.{why}"
-    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen)])
+    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen, whose)])
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     foot = f"Made {now} by scroll-tactile {shown(__version__)} of <code>{shown(recording.source)}</code>."
     return page(PurePosixPath(recording.source).name, under, summary, sections, foot)
@@ -198,10 +200,12 @@ def _range(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.clip(low - margin, -limit, limit), np.clip(high + margin, -limit, limit)
 
 
-def _state(recording: Recording, seen: _Seen | None) -> Card:
+def _state(recording: Recording, seen: _Seen | None, whose: Whose) -> Card:
     if seen is None:
         return "none", "Channels", "not looked at", "Only rows of numbers have channels that can be dead."
-    return card_of(seen.channels, f"{len(recording)} readings")
+    state, heading, answer, more = card_of(seen.channels, f"{len(recording)} readings")
+    unranged = "" if whose.sensor is not None else " Their range is not known: whether one is saturated is not told."
+    return state, heading, answer, more + unranged
 
 
 def _channels(seen: _Seen | None, whose: Whose) -> str:
@@ -260,9 +264,10 @@ def _touches(recording: Recording, cut: Cutting) -> str:
     for touch in cut.touches:
         begins, lasts = float(at[touch.begin]), float(at[touch.end - 1] - at[touch.begin])
         times = [begins, lasts] if unit == "s" else [None, None]
-        rows.append([touch.material or "no name", touch.begin, touch.end - touch.begin, *times])
-    header = ["material", "from reading", "readings", "begins (s)", "lasts (s)"]
-    names = len({str(row[0]) for row in rows})
+        name = [touch.material or "no name"] if cut.named else []
+        rows.append([*name, touch.begin, touch.end - touch.begin, *times])
+    header = [*(["material"] if cut.named else []), "from reading", "readings", "begins (s)", "lasts (s)"]
+    names = len({str(touch.material or "no name") for touch in cut.touches})
     listed = table(header, rows[:MOST_TOUCHES], "touches")
     counted = f"{len(rows)} touches of {names} names" if cut.named else f"{len(rows)} touches, {cut.why}"
     return f"<h3>Touches</h3>{note(f'{counted}.')}{listed}"

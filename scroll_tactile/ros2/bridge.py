@@ -273,6 +273,6 @@ def _answer_of(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dic
         | {
             "unusual": prediction.unusual,
             "candidates": prediction.candidates(),
-            "ranking": prediction.ranking[:RANKED],
+            "ranking": prediction.ranking_as_json(RANKED),
         }
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 from typing import Any, Self
 
 import numpy as np
@@ -10,7 +11,6 @@ import numpy.typing as npt
 from scipy.sparse import issparse
 from sklearn.base import BaseEstimator, ClassifierMixin, RegressorMixin
 from sklearn.exceptions import NotFittedError
-from sklearn.utils import is_scalar_nan
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import assert_all_finite, check_array, column_or_1d, validate_data
 
@@ -211,7 +211,7 @@ def _labels(y: Labels) -> npt.NDArray[Any]:
     labels = np.asarray(column_or_1d(y, warn=True))
     if labels.dtype.kind == "f":
         assert_all_finite(labels, input_name="y")
-    elif labels.dtype == object and any(map(is_scalar_nan, labels.tolist())):
+    elif labels.dtype == object and any(isinstance(label, float) and isnan(label) for label in labels):
         raise InputError("expected a label for each touch; came NaN among y")
     check_classification_targets(labels)
     return labels

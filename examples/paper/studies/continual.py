@@ -38,8 +38,8 @@ from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import PUBLISHED
 from examples.paper.studies.schedules import SCHEDULES, arrange, part_ends
 from examples.paper.systems.coming import Coming, code_of, require_systems
-from examples.paper.systems.own import is_own, own_embedding
-from scroll_tactile import Embedding, Joined, Kernels, Vision
+from examples.paper.systems.own import frozen_embedding, is_own
+from scroll_tactile import Embedding
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
@@ -357,7 +357,7 @@ def continual(
     f is the closed form, which no buffer and no order changes; f* is fine-tuned from it on the exemplars alone. Beside
     them: the ridge floor, what was published, and other continual learners on the same features and folds.
     """
-    frozen, own = _embedding(embedding, weights, features), require_systems(own_systems)
+    frozen, own = frozen_embedding(embedding, weights, features), require_systems(own_systems)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         (recordings,) = read("DATASET", dataset, data, seed, quick=quick).values()
@@ -394,17 +394,3 @@ def parse_sizes(text: str) -> tuple[Size, ...]:
             raise InputError(f"expected --sizes as numbers of exemplars or all, such as 0,20,400,all; came {text!r}")
         sizes.append("all" if word == "all" else int(word))
     return tuple(dict.fromkeys(sizes))
-
-
-def _embedding(choice: str, weights: str | None, features: int | None) -> Embedding:
-    if choice not in ("kernels", "vision", "kernels+vision") and not is_own(choice):
-        raise InputError(f"expected --embedding kernels, vision, kernels+vision, or module:factory; came {choice!r}")
-    if choice == "kernels" or is_own(choice):
-        if weights is not None:
-            raise InputError(f"--embedding {choice} has no weights; came {weights!r}. Leave --weights out")
-        return own_embedding(choice) if is_own(choice) else Kernels(dimension=features or 1008)
-    if weights is None:
-        raise InputError(f"--embedding {choice} needs --weights: a file, or a published name such as resnet18")
-    # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 have 98.6; both have 99.5 of BioTac.
-    vision = Vision(weights)
-    return vision if choice == "vision" else Joined(Kernels(dimension=features or 1260), vision)

@@ -71,8 +71,8 @@ class _TouchEstimator(BaseEstimator):  # type: ignore[misc]  # scikit-learn ship
             return [row[:, None] for row in checked]
         if ndim is not None and ndim != 3 and np.asarray(X).dtype != object:
             raise InputError(
-                f"expected touches of shape (N, T, n), or (N, T) of one channel; came {np.shape(X)}. Reshape your "
-                "data: X[None] is a single touch"
+                f"expected touches of shape (N, T, n), or (N, T) of one channel; came {np.asarray(X).shape}. "
+                "Reshape your data: X[None] is a single touch"
             )
         touches = [np.asarray(touch) for touch in X]
         return [touch[:, None] if touch.ndim == 1 else touch for touch in touches]

@@ -186,7 +186,13 @@ class _Seen:
         low, high = float(self.low.min()), float(self.high.max())
         if recording.report.rate is None or max(-low, high) > LARGEST or not 1e-3 <= recording.report.rate <= 1e5:
             return None
-        about = {"rate": float(f"{recording.report.rate:.4g}"), "low": low, "high": high, "unit": "", "duration": 4.0}
+        about: dict[str, Any] = {
+            "rate": float(f"{recording.report.rate:.4g}"),
+            "low": low,
+            "high": high,
+            "unit": "",
+            "duration": 4.0,
+        }
         return Sensor(name="own-sensor", channels=len(self.levels), **about)
 
 

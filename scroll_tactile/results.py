@@ -214,14 +214,24 @@ class Prediction:
     def as_json(self) -> dict[str, str | float | bool | None]:
         """Material, probability, known and novelty in JSON's types, which have no infinity: None stands for it.
 
+        Numbers have six digits, and below a billionth they are 0.
         Of known None stands for what cannot be told.
         """
         return {
             "material": self.material,
-            "probability": self.probability,
+            "probability": _written(self.probability),
             "known": self.known,
-            "novelty": None if math.isinf(self.novelty) else self.novelty,
+            "novelty": None if math.isinf(self.novelty) else _written(self.novelty),
         }
+
+    def ranking_as_json(self, most: int | None = None) -> list[list[str | float]]:
+        """The likeliest materials, each with its probability, in JSON's types; all unless `most` are wanted."""
+        return [[name, _written(probability)] for name, probability in self.ranking[:most]]
+
+
+def _written(number: float) -> float:
+    """A probability or a novelty as it is written down: six digits, and 0 below a billionth."""
+    return 0.0 if abs(number) < 1e-9 else float(f"{number:.6g}")
 
 
 @dataclass(frozen=True)

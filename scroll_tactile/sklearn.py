@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from math import isnan
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import issparse
 from sklearn.base import BaseEstimator, ClassifierMixin, RegressorMixin
 from sklearn.exceptions import NotFittedError
+from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import assert_all_finite, check_array, column_or_1d, validate_data
 
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import InputError
@@ -48,6 +52,31 @@ class _TouchEstimator(BaseEstimator):  # type: ignore[misc]  # scikit-learn ship
         tags.target_tags.required = True
         return tags
 
+    def _read(self, X: Touches, *, fitting: bool = False) -> list[npt.NDArray[Any]]:
+        """Each touch as (T, n). A table (N, T) is checked as scikit-learn does: numbers, finite, as wide as before.
+
+        Raises InputError for an array of another shape, ValueError or TypeError for what is no table of such numbers.
+        """
+        if fitting:
+            for name in ("n_features_in_", "feature_names_in_"):
+                self.__dict__.pop(name, None)
+        ndim = 2 if issparse(X) else getattr(np.asarray(X) if hasattr(X, "__array__") else X, "ndim", None)
+        if ndim == 2:
+            learner: TactileLearner | None = None if fitting else getattr(self, "learner_", None)
+            sensor = self.sensor if learner is None else learner.sensor
+            of_width = learner is None or self.n_features_in_ != learner.sensor.channels
+            how: dict[str, Any] = {"ensure_min_features": 1 if of_width and learner else 2}
+            how["ensure_all_finite"] = sensor is None or sensor.non_finite == "refused"
+            checked = validate_data(self, X, reset=learner is None, **how) if of_width else check_array(X, **how)
+            return [row[:, None] for row in checked]
+        if ndim is not None and ndim != 3 and np.asarray(X).dtype != object:
+            raise InputError(
+                f"expected touches of shape (N, T, n), or (N, T) of one channel; came {np.asarray(X).shape}. "
+                "Reshape your data: X[None] is a single touch"
+            )
+        touches = [np.asarray(touch) for touch in X]
+        return [touch[:, None] if touch.ndim == 1 else touch for touch in touches]
+
     def _empty_learner(self, touches: Sequence[npt.NDArray[Any]]) -> TactileLearner:
         """A learner with these settings, for touches like these."""
         sensor = _sensor_of(touches) if self.sensor is None else self.sensor
@@ -74,36 +103,38 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
     sensor: of the readings; None: 100 Hz, and the range of the first touches that are fitted, a tenth wider at both
     ends. embedding, readout, kept_touches: as of the learner.
 
-    After fitting: classes_, the labels in ascending order; n_features_in_, the channels; learner_, the learner. An
-    estimator that was fitted in parts, in any order, is the same as one that was fitted at once, if it was given a
-    sensor: without one the range is that of the first part, and the rest is read within it.
+    After fitting: classes_, the labels in ascending order; learner_, the learner; n_features_in_, the channels, or T of
+    a table (N, T): later tables have to be as wide, touches of other lengths come in a list. An estimator that was
+    fitted in parts, in any order, is the same as one that was fitted at once, if it was given a sensor: without one the
+    range is that of the first part, and the rest is read within it.
 
-    Raises InputError for labels that do not fit the touches, StreamError for touches that do not fit the sensor,
+    Raises InputError for labels that do not fit the touches, ValueError for missing or fractional labels and for tables
+    of another width, TypeError for sparse ones, StreamError for touches that do not fit the sensor,
     NotFittedError for predictions before anything was fitted.
     """
 
     def fit(self, X: Touches, y: Labels) -> Self:
         """Observe these touches and nothing else."""
-        for name in ("learner_", "classes_", "n_features_in_"):
+        for name in ("learner_", "classes_"):
             self.__dict__.pop(name, None)
         return self.partial_fit(X, y)
 
     def partial_fit(self, X: Touches, y: Labels, classes: Labels | None = None) -> Self:
         """Observe these touches beside all before. classes: taken as scikit-learn passes it, and not needed."""
-        touches, labels = list(_arrays(X)), np.asarray(y)
+        learner: TactileLearner | None = getattr(self, "learner_", None)
+        touches, labels = self._read(X, fitting=learner is None), _labels(y)
         if labels.shape != (len(touches),) or not touches:
             raise InputError(
                 f"expected touches, and one label for each; came {len(touches)} touches and labels of shape "
                 f"{labels.shape}"
             )
-        learner: TactileLearner | None = getattr(self, "learner_", None)
         if learner is None:
             learner = self._empty_learner(touches)
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):
             learner.observe(str(label), stream, again=True)  # a row that comes twice weighs twice
-        before = getattr(self, "classes_", labels[:0])
-        self.learner_, self.n_features_in_ = learner, learner.sensor.channels
+        before, self.learner_ = getattr(self, "classes_", labels[:0]), learner
+        self.n_features_in_ = getattr(self, "n_features_in_", learner.sensor.channels)
         self.classes_ = np.unique(np.concatenate([before, labels]))
         return self
 
@@ -116,7 +147,7 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
         """The probability of each label in the order of classes_, (N, classes), calibrated on touches left out."""
         learner = self._fitted_learner()
         names = [str(label) for label in self.classes_]
-        rankings = [dict(learner.predict(touch).ranking) for touch in _arrays(X)]
+        rankings = [dict(learner.predict(touch).ranking) for touch in self._read(X)]
         return np.array([[shares[name] for name in names] for shares in rankings]).reshape(-1, len(names))
 
 
@@ -129,15 +160,16 @@ class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  
     sensor, embedding, readout, kept_touches: as of `TactileClassifier`. It rests on 256 touches at most, drawn by their
     content (see `TactileLearner.estimate`).
 
-    After fitting: n_features_in_, the channels; learner_, the learner, whose quantity is "y", from the least y to the
-    most and their difference beyond both.
+    After fitting: n_features_in_, as of `TactileClassifier`; learner_, the learner, whose quantity is "y", from the
+    least y to the most and their difference beyond both.
 
     Raises InputError for numbers or materials that do not fit the touches, and where they say too little for a head.
     """
 
     def fit(self, X: Touches, y: npt.ArrayLike, materials: Labels | None = None) -> Self:
         """Observe these touches and nothing else."""
-        touches, numbers, names = list(_arrays(X)), np.asarray(y, dtype=np.float64), np.asarray(materials)
+        self.__dict__.pop("learner_", None)
+        touches, numbers, names = self._read(X, fitting=True), np.asarray(y, dtype=np.float64), np.asarray(materials)
         if not touches or numbers.shape != (len(touches),) or not np.isfinite(numbers).all():
             raise InputError(
                 f"expected touches, and a finite number for each; came {len(touches)} touches and numbers of shape "
@@ -150,7 +182,7 @@ class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  
         learner.declare(Quantity(name="y", unit="1", low=low - reach, high=high + reach, resolution=reach / 2**18))
         for name, number, touch in zip(names, numbers.tolist(), touches, strict=True):
             learner.observe(str(name), touch, values={"y": number}, again=True)
-        self.learner_, self.n_features_in_ = learner, learner.sensor.channels
+        self.learner_, self.n_features_in_ = learner, getattr(self, "n_features_in_", learner.sensor.channels)
         return self
 
     def predict(self, X: Touches) -> npt.NDArray[np.float64]:
@@ -166,19 +198,23 @@ class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  
 
     def _estimates(self, touches: Touches, risk: float, known: bool | None) -> list[Estimate]:
         learner = self._fitted_learner()
-        found = [learner.estimate(touch, risk=risk, known=known)["y"] for touch in _arrays(touches)]
+        found = [learner.estimate(touch, risk=risk, known=known)["y"] for touch in self._read(touches)]
         if lacking := next((each.missing for each in found if each.value is None), None):
             raise InputError(f"these touches say too little: {lacking}")
         return found
 
 
-def _arrays(touches: Touches) -> Iterator[npt.NDArray[Any]]:
-    """Each touch as (T, n)."""
-    if isinstance(touches, np.ndarray) and touches.dtype != object and touches.ndim not in (2, 3):
-        raise InputError(f"expected touches of shape (N, T, n), or (N, T) of one channel; came {touches.shape}")
-    for touch in touches:
-        array = np.asarray(touch)
-        yield array[:, None] if array.ndim == 1 else array
+def _labels(y: Labels) -> npt.NDArray[Any]:
+    """Labels as (N,). Raises ValueError for none, numbers that are not whole, and what is missing."""
+    if y is None:
+        raise InputError("TactileClassifier requires y to be passed, but the target y is None")
+    labels = np.asarray(column_or_1d(y, warn=True))
+    if labels.dtype.kind == "f":
+        assert_all_finite(labels, input_name="y")
+    elif labels.dtype == object and any(isinstance(label, float) and isnan(label) for label in labels):
+        raise InputError("expected a label for each touch; came NaN among y")
+    check_classification_targets(labels)
+    return labels
 
 
 def _sensor_of(touches: Sequence[npt.NDArray[Any]]) -> Sensor:

@@ -1,14 +1,17 @@
 """The learner as an estimator of scikit-learn."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pytest
+import scipy.sparse
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GridSearchCV, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
+from sklearn.utils.estimator_checks import check_estimator
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError, MaterialError, StreamError
@@ -110,6 +113,52 @@ def test_what_does_not_fit_is_said():
     with pytest.raises(StreamError):
         fitted.partial_fit([*X, X[0][:, :1]], [*y, "felt"])
     assert fitted.learner_.digest() == make().fit(X, y).learner_.digest()
+
+
+CANNOT = {
+    "check_estimators_overwrite_params": "an embedding keeps the kernels that it has made: it gives the same features",
+    "check_classifiers_train": "it fits lists of touches, whose lengths may differ, and then tables of any width",
+}
+"""Why checks of scikit-learn's fail: what they ask for is not what touches are."""
+
+
+def test_it_passes_all_checks_of_scikit_learn_but_some():
+    made = TactileClassifier(embedding=Kernels(dimension=64), kept_touches=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = check_estimator(made, expected_failed_checks=CANNOT, on_fail=None, on_skip=None)
+    failed = [each["check_name"] for each in found if each["status"] == "failed"]
+    assert failed == []
+    assert sum(each["status"] == "passed" for each in found) >= 50
+    assert {each["check_name"] for each in found if each["status"] == "xfail"} == {*CANNOT}
+
+
+@pytest.mark.parametrize(
+    ("X", "y", "error", "message"),
+    [
+        (np.ones((4, 9)), [1.0, np.nan, 0.0, 1.0], ValueError, "NaN"),
+        (np.ones((4, 9)), np.array(["a", np.nan, "b", "a"], dtype=object), InputError, "NaN among y"),
+        (np.ones((4, 9)), [0.1, 0.2, 0.3, 0.4], ValueError, "continuous"),
+        (scipy.sparse.csr_array(np.ones((4, 9))), [0, 1, 0, 1], TypeError, "[Ss]parse"),
+        (np.full((4, 9), np.nan), [0, 1, 0, 1], ValueError, "NaN"),
+        (np.ones((4, 1)), [0, 1, 0, 1], ValueError, "minimum of 2"),
+        (np.ones(4), [0, 1, 0, 1], InputError, "Reshape your data"),
+    ],
+)
+def test_what_is_no_table_or_no_label_is_refused(X, y, error, message):
+    with pytest.raises(error, match=message):
+        TactileClassifier(embedding=SMALL).fit(X, y)
+
+
+def test_a_table_of_another_width_is_refused_and_a_list_is_not():
+    X, y = touches()
+    fitted = TactileClassifier(embedding=SMALL, kept_touches=0).fit(X[:, :, 0], y)
+    assert fitted.n_features_in_ == 50
+    for read in (fitted.predict, lambda some: fitted.partial_fit(some, y)):
+        with pytest.raises(ValueError, match="X has 30 features, but TactileClassifier is expecting 50"):
+            read(X[:, :30, 0])
+    assert len(fitted.predict([touch[:30] for touch in X[:, :, 0]])) == len(X)
+    assert make().fit(X, y).n_features_in_ == 2
 
 
 def numbers(X):

@@ -203,7 +203,11 @@ def _say_estimates(answered: Answered) -> None:
 
 def _answer(answered: Answered) -> dict[str, Any]:
     of, found = answered.prediction, {name: own.as_json() for name, own in answered.estimates.items()}
-    return of.as_json() | {"seconds": of.seconds, "ranking": of.ranking} | ({"estimates": found} if found else {})
+    return (
+        of.as_json()
+        | {"seconds": of.seconds, "ranking": of.ranking_as_json()}
+        | ({"estimates": found} if found else {})
+    )
 
 
 def answer_row(answered: Answered) -> list[Any]:

@@ -92,7 +92,7 @@ def live(
                     if reading is not None:
                         shown_there.take(reading, at)
                     shown_there.show(now, at)
-        _summed_up(session.report, as_json)
+        _summed_up(session.report, as_json, whole=touch)
     if mcap is not None and not as_json:
         say(f"written: {shown(mcap)}")
 
@@ -106,8 +106,8 @@ def _states(
         session.begin()
     for count, (time, reading) in enumerate(rows, start=1):
         at = count / sensor.rate if time is None else time
-        reading = reading.reshape(sensor.shape) if reading.size == sensor.channels else reading
-        yield reading, session.push(reading, time), at
+        shaped = reading.reshape(sensor.shape) if reading.size == sensor.channels else reading
+        yield shaped, session.push(shaped, time), at
     if touch:
         yield None, session.end(), at
 
@@ -238,13 +238,18 @@ def _line(event: str, at: float, **more: Any) -> None:
     sys.stdout.flush()
 
 
-def _summed_up(report: LiveReport, as_json: bool) -> None:
+def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
     counted = {name: count for name, count in vars(report).items() if count}
     if as_json:
         typer.echo(json.dumps({"event": "report", **counted}))
+    if not report.touches and not whole:
+        why = "all of it went into learning" if report.learning else "its first 2 s were taken for"
+        console(error=True).print(
+            f"[yellow]no touch was found:[/] {why} the sensor at rest. If it begins in a touch, or is one from end to "
+            "end, take --touch"
+        )
+    if as_json:
         return
-    if report.learning:
-        say("[yellow]all of it went into learning the sensor at rest[/]: for one touch from end to end take --touch")
     say(
         f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
         f"{report.revised} revised"

@@ -1,4 +1,4 @@
-"""`scroll-tactile ros2` and `mcp`: a memory as a ROS 2 node, and as tools for planners."""
+"""`scroll-tactile ros2`: a memory as a ROS 2 node."""
 
 from __future__ import annotations
 
@@ -81,7 +81,23 @@ def ros2(
     met = serve(memory, topic or "", field or "", arguments=context.args, **how)
     count = met.pop("materials", 0)
     counted = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
+    say(f"{shown(memory or 'the memory')}: {count} materials. {counted}")
 
 
-from scroll_tactile.cli.options import Axis, MemoryFolder
-from scroll_tactile.cli.terminal import opened, say, shown
+def mcp(
+    memory: MemoryFolder,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="Let it observe and retract, too; without it the memory stays as it is.")
+    ] = False,
+    files: Annotated[
+        Path | None, typer.Option(help="A folder whose recordings it may name in place of readings.")
+    ] = None,
+) -> None:
+    """Serve a memory to a planner over standard input and output, by the Model Context Protocol, until it hangs up.
+
+    Its tools: what_is_felt, what_is_known, what_to_touch_again; with --learn observe and retract.
+    """
+    from scroll_tactile.planner.server import serve
+
+    with opened(memory, mode="write" if learn else "read") as learner:
+        serve(learner, learn=learn, files=files)

@@ -103,8 +103,11 @@ def report(
     preset: Annotated[str | None, typer.Option(help="Of a recording: a known sensor, in place of both.")] = None,
     clock: Annotated[str | None, typer.Option(help="Of a recording: whose times.")] = None,
     rate: Annotated[float | None, typer.Option(help="Of a recording without times: readings a second.")] = None,
-    intervals: Annotated[
-        Path | None, typer.Option(help="Of a recording: a CSV of file, begin, end, material that cuts it to touches.")
+    sensor: Annotated[
+        str | None, typer.Option(help="Of a recording: whose readings they are, a name or a JSON file, for its range.")
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(help="Of a recording: a table that cuts it to touches and names them, as for learn.")
     ] = None,
 ) -> None:
     """Write a page that shows what a memory knows, or what a recording holds; any browser opens it, without network."""
@@ -113,7 +116,8 @@ def report(
     require_page(page)
     chosen: dict[str, Any] = {"topic": topic, "field": field, "preset": preset, "clock": clock, "rate": rate}
     if _is_memory(source):
-        given = [f"--{name}" for name, value in {**chosen, "intervals": intervals}.items() if value is not None]
+        every = {**chosen, "sensor": sensor, "labels": labels}
+        given = [f"--{name}" for name, value in every.items() if value is not None]
         if given:
             raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
         from scroll_tactile.report.memory_page import memory_page
@@ -123,9 +127,11 @@ def report(
     else:
         from scroll_tactile.recordings import read_intervals
         from scroll_tactile.report.recording_page import recording_page
+        from scroll_tactile.sensors import read_sensor
 
-        cut = None if intervals is None else read_intervals(intervals)
-        html = recording_page(source, intervals=cut, **chosen)
+        cut = None if labels is None else read_intervals(labels)
+        whose = None if sensor is None else read_sensor(sensor)
+        html = recording_page(source, sensor=whose, intervals=cut, **chosen)
     save(html, page)
     say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")
 

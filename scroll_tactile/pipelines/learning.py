@@ -66,17 +66,17 @@ def learn_sources(
     Raises AnnotationError for a quantity that the memory has with another unit or range (nothing was learned);
     StoreError and CapacityError; what was learned until then is kept.
     """
-    done, batch = Learned(), _Batch(learner, every)
+    done, batch = Learned(), _Batch(learner, every, progress, len(sources))
     for quantity in options.declared:
         learner.declare(quantity)
     for number, address in enumerate(sources):
-        progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", number, len(sources))
+        batch.show(done, address, number)
         for touch in source_touches(learner, address, options):
             if isinstance(touch, Refused):
                 done.refused.append(touch)
                 done.failed.add(address)
             else:
-                batch.add(touch, address, done)
+                batch.add(touch, address, number, done)
         done.files += 1
     batch.observe(done)
     progress(f"{done.learned.total()} touches", len(sources), len(sources))
@@ -94,18 +94,24 @@ def store_model(learner: TactileLearner, progress: Progress) -> None:
 
 
 class _Batch:
-    """Touches that are about to become durable together."""
+    """Touches that are about to become durable together. of: how many sources there are, for the progress."""
 
-    def __init__(self, learner: TactileLearner, every: bool) -> None:
+    def __init__(self, learner: TactileLearner, every: bool, progress: Progress, of: int) -> None:
         self._learner, self._every = learner, every
-        self._touches: list[tuple[SourceTouch, str]] = []
+        self._progress, self._of = progress, of
+        self._touches: list[tuple[SourceTouch, str, int]] = []  # each with its source, and the number of that
         self._bytes = 0
         self._since = 0.0
 
-    def add(self, touch: SourceTouch, address: str, done: Learned) -> None:
+    def show(self, done: Learned, address: str, number: int) -> None:
+        """Report how far it is, before a source is read, or a touch of it observed: what waits is not done."""
+        first = min(number, self._touches[0][2]) if self._touches else number
+        self._progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", first, self._of)
+
+    def add(self, touch: SourceTouch, address: str, number: int, done: Learned) -> None:
         if not self._touches:
             self._since = monotonic()
-        self._touches.append((touch, address))
+        self._touches.append((touch, address, number))
         self._bytes += touch.stream.readings.nbytes
         late = monotonic() - self._since >= BATCH_SECONDS
         if late or len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
@@ -114,7 +120,8 @@ class _Batch:
     def observe(self, done: Learned) -> None:
         touches, self._touches, self._bytes = self._touches, [], 0
         with self._learner.batch():
-            for touch, address in touches:
+            for touch, address, number in touches:
+                self.show(done, address, number)
                 material, clipped = str(touch.material), all_clipped(touch.stream)
                 names = [] if self._every else self._learner.names_of(touch.stream)
                 if material in names and not (touch.values or touch.labels):

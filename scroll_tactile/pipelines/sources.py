@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +14,7 @@ import numpy.typing as npt
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import AnnotationError, InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.live.detector import ContactDetector
-from scroll_tactile.live.pressing import REST_FOLLOWED, PressDetector
+from scroll_tactile.live.spans import contact_spans
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in
@@ -24,22 +22,19 @@ from scroll_tactile.recordings.locations import is_remote
 from scroll_tactile.recordings.recording import require_columns
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
-from scroll_tactile.signals.stream import Stream, fewest_readings
+from scroll_tactile.signals.stream import Stream
 
 __all__ = [
     "Cut",
     "Refused",
     "SourceOptions",
     "SourceTouch",
-    "contact_spans",
     "find_sources",
     "has_touches",
     "readings_of",
     "source_touches",
     "stored_source",
 ]
-
-FALSE_CONTACTS = 1.0  # an hour
 
 Cut = Literal["episodes", "intervals", "none", "contact"]
 
@@ -112,50 +107,22 @@ class SourceOptions:
         if self.intervals is not None:
             return recording, touches(recording, self.intervals)
         if self.cut == "contact":
-            return recording, touches(recording, partial(contact_spans, learner), self.by)
+            return recording, touches(recording, partial(_contacts, learner), self.by)
         whole = self.cut == "none" or (self.cut is None and not recording.episodes)
         return recording, touches(recording, "whole" if whole else "episodes", self.by)
 
 
-def contact_spans(learner: TactileLearner, recording: Recording) -> list[tuple[int, int]]:
-    """Begin and end of each contact in a recording, as a live session finds them; a gap in time ends one.
-
-    A camera's begin in the second before, with the gel at rest: frames that are not in contact are no part of a touch.
-    Raises InputError where there is none.
-    """
+def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, int]]:
+    """Begin and end of each contact in a recording; raises InputError for none, and for another sensor's readings."""
     sensor, rest = learner.sensor, capabilities_of(learner.embedding).rest
-    detector = PressDetector(sensor, rest) if sensor.camera else ContactDetector(sensor, FALSE_CONTACTS)
-    rows = readings_of(sensor, recording)
-    before = round(REST_FOLLOWED * sensor.rate) if isinstance(rest, str) else 0
-    spans: list[tuple[int, int]] = []
-    for first, last in pairwise([0, *(gap.index for gap in recording.report.gaps), len(rows)]):
-        detector.interrupt()
-        for begin, end in _contacts(detector, rows[first:last]):
-            if end - begin >= fewest_readings(sensor):
-                free = max(first, spans[-1][1] if spans else 0)
-                spans.append((max(first + begin - before, free), first + end))
+    gaps = [gap.index for gap in recording.report.gaps]
+    spans = contact_spans(sensor, rest, readings_of(sensor, recording), gaps)
     if not spans:
         raise InputError(
             f"no contact was found in {recording.source}: it has to begin at rest, for two seconds or more, from which "
             "the sensor's noise is learned. For a file of one touch take cut='none'"
         )
     return spans
-
-
-def _contacts(detector: ContactDetector | PressDetector, rows: npt.NDArray[Any]) -> Iterator[tuple[int, int]]:
-    """Begin and end of each contact in readings that follow each other."""
-    taken, began = 0, None
-    while taken < len(rows):
-        used, event = detector.feed(rows[taken:])
-        taken += used
-        if event is not None and event.kind == "began":
-            began = taken - event.readings
-        elif event is not None:
-            if began is not None and event.kind != "relearned":
-                yield began, taken - event.readings
-            began = None
-    if began is not None:
-        yield began, len(rows)
 
 
 def readings_of(sensor: Sensor, recording: Recording) -> npt.NDArray[Any]:

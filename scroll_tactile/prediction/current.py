@@ -31,7 +31,7 @@ from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.open_memory import Derived, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.fitting import Draft, Renewal
+from scroll_tactile.prediction.fitting import Draft, Renewal, examined
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
 from scroll_tactile.readouts.estimation import Estimator
@@ -213,6 +213,13 @@ class CurrentModel:
             self._reading = self._extractor  # the fitted model uses nothing that was read from the disk
             self._model, self._behind = self._fitted(memory), []
         return self._model
+
+    def examined(self, ledger: Ledger) -> Model:
+        """The model that predictions are made with, the caller's own, with its sampled touches held out of it."""
+        model = self._present(ledger)
+        if model.fusion is None or self._exact:
+            return model.copy()
+        return examined(model, ledger.memory)
 
     def close(self) -> None:
         """End the threads; a later prediction starts new ones if it needs them."""

@@ -41,7 +41,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["PACES", "Draft", "Renewal", "at_pace"]
+__all__ = ["PACES", "Draft", "Renewal", "at_pace", "examined"]
 
 FloatArray = npt.NDArray[np.float64]
 Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
@@ -79,6 +79,21 @@ class Renewal:
                 self.model.readouts[scale] = task.solve(self.memory.statistics, like=self.readouts.pop(scale))
         give_back_scratch()
         return self.model
+
+
+def examined(model: Model, memory: Memory) -> Model:
+    """A model as it judges this memory, with the sampled touches and the scores of each held out.
+
+    Neither is stored, and updates leave both behind. The readouts are solved again, so that touches can be held out of
+    them; calibration and fusion stay those that answer. It takes a fifth of the time of a fit.
+    """
+    renewed, sample = Renewal.of(model, memory).solve(), list(memory.sample)
+    stages = [[*stage, *renewed.views] for stage in renewed.stages]
+    with one_thread():
+        held_out = {
+            scale: held_out_scores(readout, sample, stages, renewed.kind) for scale, readout in renewed.readouts.items()
+        }
+    return replace(renewed, sample=sample, held_out=held_out)
 
 
 @dataclass(frozen=True)

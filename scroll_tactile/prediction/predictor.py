@@ -331,6 +331,16 @@ class Predictor:
             model.freeze(memory.statistics)
             return model
 
+    def examined(self) -> Model:
+        """The model that answers, with its sampled touches, each held out of it: for pages. It fits only where none is.
+
+        Raises what `frozen` raises.
+        """
+        with self.ledger.lock, enough_memory():
+            model = self.current.examined(self.ledger)
+            model.freeze(self.ledger.memory.statistics)
+            return model
+
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:
     return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, recipe.augmentation, check)

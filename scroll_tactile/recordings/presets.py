@@ -14,7 +14,7 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.recordings.paths import FieldPath, nearest
 from scroll_tactile.sensors import CONTACTILE, Sensor
 
-__all__ = ["PRESETS", "Preset", "fields_for", "find", "is_known"]
+__all__ = ["PRESETS", "Preset", "fields_for", "find", "is_known", "names_for"]
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,15 @@ def find(name: str) -> Preset:
 def is_known(kind: str) -> bool:
     """Whether messages of this type are of a known tactile sensor."""
     return _short(kind) in _ALSO or any(_short(kind) in preset.types for preset in PRESETS.values())
+
+
+def names_for(kind: str, field: str, shape: tuple[int, ...]) -> list[str]:
+    """The presets of messages of this type whose field this is, and whose sensor has readings of this shape."""
+    return [
+        name
+        for name, preset in PRESETS.items()
+        if _short(kind) in preset.types and preset.field == field and preset.sensor.shape == shape
+    ]
 
 
 def fields_for(kind: str, message: object) -> list[tuple[str, tuple[int, ...]]]:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.report.drawing import LEFT, WIDTH, Axis, Drawing, clipped_name
+from scroll_tactile.recordings import Recording
+from scroll_tactile.report.drawing import LEFT, WIDTH, Axis, Drawing, brief, clipped_name
 
 __all__ = [
+    "MOST_TRACES",
     "Bin",
     "against_truth",
     "answers",
     "confusions",
+    "counted_from",
     "dated",
     "evidence",
     "histogram",
@@ -24,14 +28,20 @@ __all__ = [
     "reliability",
     "shares",
     "timeline",
+    "trace",
     "tree",
 ]
+
+FloatArray = npt.NDArray[np.float64]
 
 ROW = 15.0  # units a row of names
 LETTER = 7.0  # a letter's width, about
 RIGHT = WIDTH - 15.0
 FIRST_DATE = 1e8  # seconds since 1970: less are counted from some other moment
 COLUMNS = 256  # places along a time axis that are distinguished
+MOST_TRACES = 12  # channels of a recording, those that move most
+PIECES = 240  # of a trace: in each the least and the most are drawn
+TRACE = 30.0  # units a trace
 
 
 def dated(seconds: float) -> str:
@@ -248,3 +258,87 @@ def answers(
         drawing.line([(x, 184), (x + 20, 184)], "rival")
         drawing.text(x + 24, 188, clipped_name(rival, 120), title=rival)
     return drawing.svg()
+
+
+def trace(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
+    """The channels that move most, each from its least to its most, over time; gaps and touches are bands.
+
+    Of pictures it is their mean. spans: begin and end of touches, in readings.
+    """
+    readings = _channels(recording)
+    chosen = _moving(readings)
+    at, unit = counted_from(recording)
+    drawing = Drawing(TRACE * max(len(chosen), 1) + 50, "The channels over time")
+    axis, bottom = Axis(float(at[0]), float(at[-1]), LEFT, RIGHT), TRACE * max(len(chosen), 1) + 14
+    for begin, end in spans:
+        left, right = axis(at[begin]), axis(at[end - 1])
+        drawing.box(left, 10, max(right - left, 1.0), bottom - 10, "fill", 0.15, f"touch, readings {begin} to {end}")
+    gaps = recording.report.gaps if unit == "s" else ()
+    for gap in gaps:
+        left, right = axis(at[gap.index - 1]), axis(at[gap.index])
+        title = f"a gap of {gap.seconds:.3g} s before reading {gap.index}"
+        drawing.box(left, 10, max(right - left, 1.0), bottom - 10, "wrong", 0.35, title)
+    for place, channel in enumerate(chosen):
+        _draw(drawing, readings[:, channel], at, [gap.index for gap in gaps], axis, TRACE * place + 12)
+        name = "mean" if recording.readings.ndim > 2 else f"channel {channel + 1}"
+        drawing.text(LEFT - 6, TRACE * place + 22, name, anchor="end")
+    drawing.across(axis, 10, bottom, "time, seconds from its begin" if unit == "s" else "reading")
+    return drawing.svg()
+
+
+def counted_from(recording: Recording) -> tuple[FloatArray, str]:
+    """Where each reading lies, and the unit: seconds from the first; or its number, without a clock that goes on."""
+    times = recording.times
+    if len(times) and np.isfinite(times).all() and (np.diff(times) >= 0).all() and times[-1] > times[0]:
+        return np.asarray(times - times[0]), "s"
+    return np.arange(len(times), dtype=np.float64), ""
+
+
+def _channels(recording: Recording) -> FloatArray:
+    """What is drawn, (T, n)."""
+    found = recording.readings
+    if found.ndim > 2:
+        return np.asarray(found.reshape(len(found), -1).mean(axis=1, dtype=np.float64)[:, None])
+    found = np.asarray(found, dtype=np.float64).reshape(len(found), -1)
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+def _moving(readings: FloatArray) -> list[int]:
+    """The channels of which something is read, those that move most, in their order."""
+    read = np.flatnonzero(np.isfinite(readings).any(axis=0))
+    if len(read) > MOST_TRACES:
+        own = readings[:, read]
+        spread = np.nanquantile(own, 0.95, axis=0) / 2 - np.nanquantile(own, 0.05, axis=0) / 2  # halves: no overflow
+        read = np.sort(read[np.argsort(-spread, kind="stable")[:MOST_TRACES]])
+    return [int(channel) for channel in read]
+
+
+def _draw(drawing: Drawing, values: FloatArray, at: FloatArray, gaps: Sequence[int], axis: Axis, top: float) -> None:
+    """One channel, broken where time was lost or nothing was read."""
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    shares = (values / 2 - low / 2) / max(high / 2 - low / 2, np.finfo(np.float64).tiny)
+    up = Axis(0.0, 1.0, top + TRACE - 6, top)
+    for run in _runs(shares, gaps):
+        points = [(axis(at[i]), up(share)) for i, share in _pieces(shares, run, len(values))]
+        drawing.line(points if len(points) > 1 else [*points, (points[0][0] + 0.5, points[0][1])], "own thin")
+    drawing.text(LEFT - 6, top + 21, f"{brief(low)} to {brief(high)}", "tiny", "end")
+
+
+def _runs(shares: FloatArray, gaps: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Begin and end of each stretch without a gap in which all is read."""
+    read = np.isfinite(shares)
+    starts = {0, *gaps, *(np.flatnonzero(np.diff(read.astype(np.int8))) + 1).tolist()}
+    edges = [*sorted(start for start in starts if start < len(shares)), len(shares)]
+    for begin, end in itertools.pairwise(edges):
+        if read[begin]:
+            yield begin, end
+
+
+def _pieces(shares: FloatArray, run: tuple[int, int], count: int) -> Iterator[tuple[int, float]]:
+    """The readings of a run, or the least and the most of each piece of it, in the order of time."""
+    begin, end = run
+    step = max(1, 2 * count // PIECES)
+    for first in range(begin, end, step):
+        own = shares[first : min(first + step, end)]
+        for i in sorted({int(own.argmin()), int(own.argmax())}):
+            yield first + i, float(own[i])

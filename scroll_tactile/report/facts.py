@@ -86,7 +86,7 @@ class MemoryFacts:
 
     @cached_property
     def model(self) -> Model | None:
-        """The model, just fitted; None of an empty memory, and where none can be fitted."""
+        """The model that answers, touches held out of it; None of an empty memory, and where none can be fitted."""
         try:
             return self._fitted() if self.counts else None
         except CapacityError:
@@ -97,7 +97,7 @@ class MemoryFacts:
 
     def _fitted(self) -> Model:
         try:
-            return self.learner._by(self.of).fitted()
+            return self.learner._by(self.of).examined()
         except CANNOT_EMBED as error:
             self.missing.append(f"When answers are decided: {error}")
             self.unread = True

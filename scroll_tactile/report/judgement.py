@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.errors import printable
+from scroll_tactile.prediction.judging import HeldOutTouch
 from scroll_tactile.readouts.estimation import Heads
 from scroll_tactile.readouts.regression import RegressionHead
 from scroll_tactile.report.charts import against_truth, answers, confusions, over_time, reliability, shares, tree
@@ -12,14 +17,15 @@ from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.report.growing import Growing
 from scroll_tactile.report.knowledge import MOST_NEAR, bins_of, unknown_by
-from scroll_tactile.report.page import figure, note, side_by_side, table
+from scroll_tactile.report.page import figure, lines, note, side_by_side, table
+from scroll_tactile.results import Observation
 
 __all__ = ["ROWS", "alike", "calibration_plots", "estimated", "growing_answers", "mixed_up"]
 
 ROWS = 40  # materials, of which each has a row in a figure; of more there are tables
 SQUARE = 30  # materials, of which all pairs have a cell in a figure
 MOST_MISTAKES = 60
-PAIRS = 30
+PAIRS = 20
 
 
 def alike(facts: MemoryFacts) -> tuple[str, list[str]]:
@@ -74,7 +80,7 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     rest = len(facts.mistakes) - len(rows)
     listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
     more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
-    found = f"<div><h3>Worst confusions</h3>{listed}{more}{_by_name(facts)}</div>"
+    found = f"<div><h3>Worst confusions</h3>{listed}{more}{_one_by_one(facts)}</div>"
     found = found if rows else note("None was called by another name.")
     if len(tested) > SQUARE:
         return note(words) + found
@@ -92,14 +98,40 @@ def mixed_up(facts: MemoryFacts, order: list[str]) -> str:
     return note(words) + side_by_side(figure(confusions(names, counts), caption), found)
 
 
-def _by_name(facts: MemoryFacts) -> str:
-    """The touches that were called something else, by where they came from; nothing where nobody noted it."""
-    sources = {row.key: row.source for row in facts.journal if row.source is not None}
-    wrong = sorted((touch for touch in facts.held_out if touch.answer != touch.material), key=lambda touch: touch.key)
-    rows = [[sources[t.key], t.material, t.answer, f"{t.confidence:.0%}"] for t in wrong if t.key in sources]
-    if not rows:
+def _one_by_one(facts: MemoryFacts) -> str:
+    """The touches that were called something else, the surest first, and the lines that name them so; nothing of a
+    memory whose observations nobody noted."""
+    noted = {
+        (row.material if facts.of is None else row.labels.get(facts.of), row.key): row
+        for row in facts.journal
+        if row.state != "retracted"
+    }
+    wrong = [
+        (touch, row)
+        for touch in sorted(facts.held_out, key=lambda touch: (-touch.confidence, touch.key))
+        if touch.answer != touch.material and (row := noted.get((touch.material, touch.key))) is not None
+    ][:MOST_MISTAKES]
+    if not wrong:
         return ""
-    return "<h3>Touches it got wrong</h3>" + table(["touch", "of", "called", "probability"], rows, "wrong touches")
+    rows = [[row.sequence, row.source, t.material, t.answer, f"{t.confidence:.0%}"] for t, row in wrong]
+    listed = table(["observation", "touch", "of", "called", "probability"], rows, "wrong touches")
+    return "<h3>Touches it got wrong, the surest first</h3>" + listed + _renaming(facts, wrong)
+
+
+def _renaming(facts: MemoryFacts, wrong: Sequence[tuple[HeldOutTouch, Observation]]) -> str:
+    """The lines that put right touches whose name was wrong; those that are compacted stay what they are."""
+    path = facts.learner.path
+    if path is None or facts.of is not None:
+        return ""
+    words = [["scroll-tactile", "memory", "relabel", str(path), str(row.sequence), t.answer] for t, row in wrong]
+    commands = [
+        shlex.join(line)
+        for line, (_, row) in zip(words, wrong, strict=True)
+        if row.state == "kept" and all(printable(word) == word for word in line)
+    ]
+    if not commands:
+        return ""
+    return note("Where the name was wrong, and not the answer, this puts it right, exactly:") + lines(commands)
 
 
 def calibration_plots(facts: MemoryFacts) -> str:
@@ -108,6 +140,11 @@ def calibration_plots(facts: MemoryFacts) -> str:
     if trust is None:
         return facts.lacks("Whether to trust it", facts.nothing_left_out)
     verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
+    of = (
+        "Each touch was held out alone: others of the same sitting, sensor and hand stayed learned. Touches of "
+        "another day are harder: expect more wrong ones, and more called unknown. To measure these: scroll-tactile "
+        "evaluate."
+    )
     caption = (
         "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
         f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is the mean of perfect answers. "
@@ -121,10 +158,12 @@ def calibration_plots(facts: MemoryFacts) -> str:
     )
     if len(unknown_touches) <= ROWS:
         bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in unknown_touches]
-        return side_by_side(figure(drawn, caption), figure(shares(bars, alarms, "called unknown, left out"), words))
+        return note(of) + side_by_side(
+            figure(drawn, caption), figure(shares(bars, alarms, "called unknown, left out"), words)
+        )
     rows = [[name, unknown, count] for name, unknown, count in unknown_touches if unknown]
     listed = table(["material", "called unknown", "of"], rows, "touches called unknown")
-    return side_by_side(figure(drawn, caption), f"<div>{note(words)}{listed if rows else ''}</div>")
+    return note(of) + side_by_side(figure(drawn, caption), f"<div>{note(words)}{listed if rows else ''}</div>")
 
 
 def growing_answers(facts: MemoryFacts) -> str:
@@ -137,7 +176,7 @@ def growing_answers(facts: MemoryFacts) -> str:
         "material; dashed: the strongest other at any moment; upright: when it is decided, at a risk of "
         f"{facts.risk:.0%}. The first two are the hardest touches there are."
     )
-    return _soon(facts) + note(words) + side_by_side(*(_grown(touch) for touch in found))
+    return note(words) + side_by_side(_soon(facts), *(_grown(touch) for touch in found))
 
 
 def estimated(facts: MemoryFacts) -> str:

@@ -15,7 +15,7 @@ from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
 from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.report.judgement import ROWS, alike, calibration_plots, estimated, growing_answers, mixed_up
-from scroll_tactile.report.page import Card, State, cards, figure, page, table
+from scroll_tactile.report.page import Card, State, cards, figure, page, side_by_side, table
 from scroll_tactile.report.sensing import (
     channel_card,
     channel_section,
@@ -61,16 +61,19 @@ def memory_page(
     show("channels", 2, STEPS)
     sensor = learner.sensor
     found = None if learner.path is None or sensor.camera else learner.health()
+    # What tells most comes first; when it was taught is of use to few.
+    exemplars = facts.exemplars if sensor.camera else {}
+    strips = exemplar_pictures(sensor, facts.kept, exemplars)
     sections = [
-        ("known", "What it knows", known),
-        ("alike", "Who is near whom", near),
+        ("known", "What it knows", side_by_side(f"<div>{strips}</div>", f"<div>{known}</div>")),
         ("mixed", "What it mixes up", mixed),
+        ("alike", "Who is near whom", near),
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
         *([("estimated", "What it measures", estimated(facts))] if facts.estimator is not None else []),
-        *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
         ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
-        ("pictures", "What touches look like", exemplar_pictures(sensor, facts.kept, facts.exemplars)),
+        *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
+        ("when", "When it was taught", _over_time(facts)),
     ]
     for i, axis in enumerate(learner.axes):
         by = facts.by(axis)
@@ -126,12 +129,12 @@ def _mixes(facts: MemoryFacts) -> Card:
 
 
 def _trusts(facts: MemoryFacts) -> Card:
-    trust, heading = facts.trust, "Its answers are"
+    trust, heading = facts.trust, "Touches held out"
     if trust is None:
         return "none", heading, "not known", _sentence(facts.nothing_left_out)
     more = (
-        f"Mean probability {trust.confidence:.1%}, ECE {trust.error:.3f}. It would call {trust.unknown:.0%} of its own "
-        "touches unknown."
+        f"Mean probability {trust.confidence:.1%}, ECE {trust.error:.3f}, {trust.unknown:.0%} called unknown. Others "
+        "of their sittings were learned: tomorrow's touches are harder."
     )
     tested = len({touch.material for touch in facts.held_out})
     more += f" Measured among {tested} of {len(facts.counts)} materials." if tested < len(facts.counts) else ""
@@ -163,7 +166,7 @@ def _sentence(why: str) -> str:
 
 
 def _known(facts: MemoryFacts) -> str:
-    """Materials, and when they were observed."""
+    """The materials."""
     if not facts.counts:
         return facts.lacks("What it knows", "no touch was observed yet.")
     names, separation = facts.near
@@ -188,7 +191,7 @@ def _known(facts: MemoryFacts) -> str:
         for name, count in facts.counts.items()
     ]
     header = ["material", "touches", "right, left out", "nearest", "separation", "first observed (UTC)"]
-    return _over_time(facts) + table(header, rows, "materials")
+    return table(header, rows, "materials")
 
 
 def _over_time(facts: MemoryFacts) -> str:

@@ -15,13 +15,14 @@ import numpy.typing as npt
 from scroll_tactile import __version__
 from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.recordings import Contents, Interval, Recording, describe, read, touches
-from scroll_tactile.recordings.presets import find
+from scroll_tactile.recordings import Contents, Interval, Recording, describe, read
 from scroll_tactile.report.channels import DEAD, DRIFTING, SATURATED, ChannelSummary, channels_of
-from scroll_tactile.report.charts import FIRST_DATE, dated, histogram, timeline
+from scroll_tactile.report.charts import FIRST_DATE, MOST_TRACES, counted_from, dated, histogram, trace
+from scroll_tactile.report.cutting import Cutting, Whose, cut_of, learning, whose_readings
 from scroll_tactile.report.drawing import shown
-from scroll_tactile.report.page import Card, State, cards, figure, note, page, table
+from scroll_tactile.report.page import Card, State, cards, figure, note, page, side_by_side, table
 from scroll_tactile.report.sensing import card_of, level_picture, state_rows
+from scroll_tactile.sensors import Sensor
 
 __all__ = ["recording_page"]
 
@@ -29,32 +30,63 @@ FloatArray = npt.NDArray[np.float64]
 
 STRETCHES = 40  # that a recording is cut into, to see in which of them a channel is still
 MOST_ROWS = 60
-MOST_NAMES = 40
+MOST_TOUCHES = 1000
+MARGIN = 0.1  # of the range that was seen, beyond it at both ends
+LARGEST = 1e30  # of readings in which contacts are looked for
 LOST = 0.001  # of the readings: more is worth a look
 
 
-def recording_page(path: str | PathLike[str], *, intervals: Sequence[Interval] | None = None, **chosen: Any) -> str:
+def recording_page(
+    path: str | PathLike[str],
+    *,
+    sensor: Sensor | None = None,
+    intervals: Sequence[Interval] | None = None,
+    **chosen: Any,
+) -> str:
     """One HTML page that shows what a recording holds; it needs no network and no script.
 
-    chosen: topic, field, preset and the others of `read`; where a file has several fields and none is named, the
-    first is shown. intervals: of touches in it; its episodes unless given.
+    sensor: whose readings they are, which gives channels their range; unless given that of the preset, or of the one
+    that the messages' type is of. chosen: topic, field, preset and the others of `read`; where a file has several
+    fields and none is named, the first is shown. intervals: of touches in it; unless given its episodes, or contacts.
 
-    Raises what `describe` and `read` raise.
+    Raises what `describe` and `read` raise, ChannelCountError for a sensor of other channels, and InputError for both a
+    sensor and a preset.
     """
+    if sensor is not None and chosen.get("preset") is not None:
+        raise InputError("give sensor= or preset=: both say whose readings they are")
     contents = describe(path)
     recording, why = _read(contents, fspath(path), chosen)
-    seen = _Seen.of(recording, chosen.get("preset"))
-    sections = [("time", "Time", _time(recording)), ("channels", "Channels", _channels(seen))]
-    sections += [
-        ("touches", "Touches", _touches(recording, intervals)),
+    whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
+    seen = _Seen.of(recording, whose.sensor)
+    cut = cut_of(recording, intervals, whose.sensor or (None if seen is None else seen.sensor(recording)))
+    spans = [(touch.begin, touch.end) for touch in cut.touches]
+    words = learning(recording, fspath(path), whose, cut, chosen)
+    sections = [
+        ("signal", "Signal", side_by_side(_signal(recording, spans), f"<div>{_touches(recording, cut)}{words}</div>")),
+        ("channels", "Channels", _channels(seen, whose)),
+        ("time", "Time", _time(recording)),
         ("holds", "What the file has", _holds(contents)),
     ]
     where = f"topic <code>{shown(recording.topic)}</code>, " if recording.topic else ""
     under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {_shape(recording)}.{why}"
-    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen)])
+    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen, whose)])
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     foot = f"Made {now} by scroll-tactile {shown(__version__)} of <code>{shown(recording.source)}</code>."
     return page(PurePosixPath(recording.source).name, under, summary, sections, foot)
+
+
+def _signal(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
+    channels = 1 if recording.readings.ndim > 2 else int(np.prod(recording.readings.shape[1:]))
+    which = f"The {MOST_TRACES} of {channels} channels that move most" if channels > MOST_TRACES else "All channels"
+    of = "The mean of each picture" if recording.readings.ndim > 2 else which
+    words = f"{of}, each from its least to its most."
+    if spans:
+        words += " Blue bands are touches."
+    if recording.report.gaps:
+        words += " Red bands are gaps, in which nothing was read."
+    if counted_from(recording)[1] != "s":
+        words += " Across: the number of the reading, for it has no clock that goes on."
+    return figure(trace(recording, spans), words)
 
 
 def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, str]:
@@ -122,22 +154,21 @@ def _losses(recording: Recording) -> Card:
 
 @dataclass(frozen=True)
 class _Seen:
-    """The readings as levels (C, T), the range of each channel, (C,), and whether it is its sensor's; the channels."""
+    """The readings as levels (C, T), the range of each channel, (C,), and the channels."""
 
     levels: LevelArray
     low: FloatArray
     high: FloatArray
-    ranged: bool
     channels: list[ChannelSummary]
 
     @classmethod
-    def of(cls, recording: Recording, preset: str | None) -> _Seen | None:
-        """None of pictures, and of a single reading."""
+    def of(cls, recording: Recording, sensor: Sensor | None) -> _Seen | None:
+        """None of pictures, and of a single reading. Without a sensor the range is what was seen, and a tenth more at
+        both ends: nothing that lies there can be called saturated."""
         if recording.readings.ndim != 2 or len(recording) < 2:
             return None
         readings = np.asarray(recording.readings, dtype=np.float64)
         readings = np.where(np.isfinite(readings), readings, np.nan)
-        sensor = None if preset is None else find(preset).sized(readings.shape[1])
         if sensor is not None:
             low, high = (np.broadcast_to(limit, readings.shape[1:]).astype(np.float64) for limit in sensor.limits)
         else:
@@ -148,23 +179,42 @@ class _Seen:
         levels = np.ascontiguousarray(levels.T)
         parts = np.array_split(levels, max(1, min(STRETCHES, len(readings) // 2)), axis=1)
         signed = (low < 0) & (high > 0) & (sensor is not None)
-        return cls(levels, low, high, sensor is not None, channels_of(parts, [""] * len(parts), signed, ordered=True))
+        return cls(levels, low, high, channels_of(parts, [""] * len(parts), signed, ordered=True))
+
+    def sensor(self, recording: Recording) -> Sensor | None:
+        """One that the readings could be of, for contacts; None where they have no rate, or numbers beyond reason."""
+        low, high = float(self.low.min()), float(self.high.max())
+        if recording.report.rate is None or max(-low, high) > LARGEST or not 1e-3 <= recording.report.rate <= 1e5:
+            return None
+        about: dict[str, Any] = {
+            "rate": float(f"{recording.report.rate:.4g}"),
+            "low": low,
+            "high": high,
+            "unit": "",
+            "duration": 4.0,
+        }
+        return Sensor(name="own-sensor", channels=len(self.levels), **about)
 
 
 def _range(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The least and the most of each channel; 0 and 0 where nothing was read."""
+    """The least and the most of each channel, and a tenth of what lies between beyond them; ±1 where nothing is."""
     read = np.isfinite(readings)
     low, high = np.where(read, readings, np.inf).min(axis=0), np.where(read, readings, -np.inf).max(axis=0)
-    return np.where(read.any(axis=0), low, 0.0), np.where(read.any(axis=0), high, 0.0)
+    low, high = np.where(read.any(axis=0), low, 0.0), np.where(read.any(axis=0), high, 0.0)
+    margin = np.where(high > low, MARGIN * high - MARGIN * low, 1.0)
+    limit = np.finfo(np.float64).max / 2
+    return np.clip(low - margin, -limit, limit), np.clip(high + margin, -limit, limit)
 
 
-def _state(recording: Recording, seen: _Seen | None) -> Card:
+def _state(recording: Recording, seen: _Seen | None, whose: Whose) -> Card:
     if seen is None:
         return "none", "Channels", "not looked at", "Only rows of numbers have channels that can be dead."
-    return card_of(seen.channels, f"{len(recording)} readings")
+    state, heading, answer, more = card_of(seen.channels, f"{len(recording)} readings")
+    unranged = "" if whose.sensor is not None else " Their range is not known: whether one is saturated is not told."
+    return state, heading, answer, more + unranged
 
 
-def _channels(seen: _Seen | None) -> str:
+def _channels(seen: _Seen | None, whose: Whose) -> str:
     if seen is None:
         return note("Not shown: these are pictures, or too few readings.")
     caption = (
@@ -172,12 +222,16 @@ def _channels(seen: _Seen | None) -> str:
         "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
     )
     words = (
-        f"Dead: it never changes in {DEAD:.0%} of {STRETCHES} equal stretches of the recording. Saturated: "
-        f"{SATURATED:.0%} of the readings lie at the end of the range. Drifting: its level moves by {DRIFTING:.0%} of "
-        "the range from begin to end."
+        f"Dead: it never changes in {DEAD:.0%} of {STRETCHES} equal stretches of the recording. Drifting: its level "
+        f"moves by {DRIFTING:.0%} of the range from begin to end. "
     )
-    if not seen.ranged:
-        words += " The range of a channel is what was seen of it; with --preset it is its sensor's, and means more."
+    if whose.sensor is None:
+        words += (
+            "The range of a channel is taken as what was seen of it and a tenth more, so that none can be called "
+            "saturated: --sensor or --preset gives the true one."
+        )
+    else:
+        words += f"Saturated: {SATURATED:.0%} of the readings lie at the end of the range, {whose.how}."
     drawn = level_picture(seen.levels, "level of each channel over time", caption)
     return drawn + note(words) + state_rows(seen.channels, seen.low, seen.high, "")
 
@@ -207,29 +261,22 @@ def _time(recording: Recording) -> str:
     )
 
 
-def _touches(recording: Recording, intervals: Sequence[Interval] | None) -> str:
-    if intervals is None and not recording.episodes:
-        return note("Not cut: the file has no episodes or labels. A table of intervals cuts it: --intervals.")
-    try:
-        found = touches(recording, "episodes" if intervals is None else intervals)
-    except InputError as error:
-        return note(f"Not cut: {error}")
-    begin = float(recording.times[0]) if np.isfinite(recording.times).all() else None
+def _touches(recording: Recording, cut: Cutting) -> str:
+    """The touches in it, and where each begins."""
+    if not cut.touches:
+        return f"<h3>Touches</h3>{note(cut.why)}"
+    at, unit = counted_from(recording)
     rows = []
-    spans: dict[str, tuple[list[float], list[float]]] = {}
-    for touch in found:
-        start = None if begin is None else float(touch.times[0]) - begin
-        lasts = None if begin is None else float(touch.times[-1] - touch.times[0])
-        rows.append([touch.material or "no name", touch.end - touch.begin, start, lasts])
-        if start is not None:
-            spans.setdefault(touch.material or "no name", ([], []))[0].append(float(touch.times[0]))
-    drawn = ""
-    anew = bool((np.diff(recording.times) < 0).any())  # each episode counts from its own begin
-    if begin is not None and not anew and len(spans) <= MOST_NAMES and len(found) > 1:
-        every = [(name, *both) for name, both in spans.items()]
-        drawn = figure(timeline(every, begin, float(recording.times[-1])), "Each upright line is the begin of a touch.")
-    listed = table(["material", "readings", "begins (s)", "lasts (s)"], rows[:1000], "touches")
-    return note(f"{len(found)} touches of {len({str(row[0]) for row in rows})} names.") + drawn + listed
+    for touch in cut.touches:
+        begins, lasts = float(at[touch.begin]), float(at[touch.end - 1] - at[touch.begin])
+        times = [begins, lasts] if unit == "s" else [None, None]
+        name = [touch.material or "no name"] if cut.named else []
+        rows.append([*name, touch.begin, touch.end - touch.begin, *times])
+    header = [*(["material"] if cut.named else []), "from reading", "readings", "begins (s)", "lasts (s)"]
+    names = len({str(touch.material or "no name") for touch in cut.touches})
+    listed = table(header, rows[:MOST_TOUCHES], "touches")
+    counted = f"{len(rows)} touches of {names} names" if cut.named else f"{len(rows)} touches, {cut.why}"
+    return f"<h3>Touches</h3>{note(f'{counted}.')}{listed}"
 
 
 def _holds(contents: Contents) -> str:

@@ -36,6 +36,6 @@ def answer_of(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dict
     more = {
         "unusual": prediction.unusual,
         "candidates": prediction.candidates(),
-        "ranking": prediction.ranking[:RANKED],
+        "ranking": prediction.ranking_as_json(RANKED),
     }
     return prediction.as_json() | measured | more

@@ -39,6 +39,18 @@ def test_a_recording_is_replayed_with_its_touches(memory):
     assert result.output.count("touched for") == len(SHIFT.touches)
 
 
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_a_file_without_a_rest_in_front_is_told_of_touch(memory, words):
+    result = run("live", memory / "memory", memory / "silk.npy", *words)
+    assert "no touch was found" in result.stderr and "--touch" in result.stderr
+    long = np.tile(SCENE.touch("silk", 9).readings, (4, 1))
+    np.save(memory / "long.npy", long)
+    result = run("live", memory / "memory", memory / "long.npy", *words)
+    assert json.loads(result.stdout.splitlines()[-1])["event"] == "report" if words else "touches: 0" in result.stdout
+    assert "its first 2 s were taken for the sensor at rest" in " ".join(result.stderr.split())
+    assert "no touch" not in run("live", memory / "memory", memory / "silk.npy", "--touch", *words).stderr
+
+
 def test_times_in_a_table_are_those_of_its_column(memory):
     table, header = np.column_stack([SHIFT.readings, SHIFT.times]), ",".join([*map(str, range(60)), "time"])
     np.savetxt(memory / "timed.csv", table, delimiter=",", header=header, comments="", fmt="%.17g")

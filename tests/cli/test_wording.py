@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from scroll_tactile import sensors
 from scroll_tactile.cli.application import app
 from scroll_tactile.cli.wording import in_options, typed
+from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.BIOTAC)
@@ -168,3 +169,12 @@ def _parameters(name):
     from typer.main import get_command
 
     return get_command(app).commands[name].params
+
+
+def test_probabilities_are_written_with_six_digits():
+    ranking = (("felt", 0.123456789), ("oak", 8.06e-98), ("silk", 3.0000000001e-9))
+    prediction = Prediction("felt", 0.123456789, ranking, 12.3456789, True, 1.0)
+    assert prediction.as_json() == {"material": "felt", "probability": 0.123457, "known": True, "novelty": 12.3457}
+    assert prediction.ranking_as_json() == [["felt", 0.123457], ["oak", 0.0], ["silk", 3e-9]]
+    assert prediction.ranking_as_json(1) == [["felt", 0.123457]]
+    assert Prediction(None, 0.0, (), float("inf"), False, 0.0).as_json()["novelty"] is None

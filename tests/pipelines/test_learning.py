@@ -52,6 +52,15 @@ def sources_of(*paths):
     return found
 
 
+def test_progress_goes_touch_by_touch_though_a_batch_becomes_durable_together(data, learner):
+    told, sources = [], sources_of(data)
+    learn_sources(learner, sources, FOLDERS, lambda what, done, of: told.append((what.split(";")[0], done, of)))
+    assert {of for *_, of in told} == {6}
+    done = [at for _, at, _ in told]
+    assert done == sorted(done) and done[-1] == 6
+    assert list(dict.fromkeys(what for what, *_ in told)) == [f"{i} touches" for i in range(7)]
+
+
 class TestSources:
     def test_folders_are_looked_through_and_each_file_comes_once(self, data, monkeypatch):
         again = [data / "b" / "1.npy", data, data / ".." / "data" / "a"]

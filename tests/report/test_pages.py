@@ -1,8 +1,11 @@
 """Pages in a real browser: nothing is asked for, nothing runs over, and what is odd is escaped or explained."""
 
 import re
+import shlex
+from html import unescape
 from html.parser import HTMLParser
 
+import bags
 import numpy as np
 import pytest
 from browser import Browser
@@ -10,8 +13,12 @@ from commands import refused, run
 
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
+from scroll_tactile.pipelines.learning import store_model
+from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.judging import held_out_touches
 from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.report import memory_page, recording_page, save
+from scroll_tactile.report.page import table
 from scroll_tactile.simulation.scene import Scene
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
@@ -187,6 +194,67 @@ def test_touches_that_are_mixed_up_are_named_by_where_they_came_from(tmp_path):
     assert re.search(r"by only 20 touches|overconfident|underconfident|calibrated", text)
 
 
+def pasted(html):
+    """The commands that a page has to be copied."""
+    (found,) = re.findall("<pre[^>]*><code>(.*?)</code></pre>", html, re.S)
+    return [shlex.split(line) for line in unescape(found).splitlines()]
+
+
+def test_the_surest_of_the_wrong_touches_can_be_named_anew_by_a_line_to_paste(tmp_path):
+    scene, path = Scene(sensor=PAD), tmp_path / "my memory"
+    own, other = scene.materials[:2]
+    with TactileLearner.open(path, sensor=PAD, embedding=SMALL, exemplars=0) as learner:
+        feel(learner, 8, 3)
+        mislabelled = learner.observe(own, scene.touch(other, 20), source="<b>.csv")
+        commands = pasted(memory_page(learner))
+    ours = [words for words in commands if words[4] == str(mislabelled.sequence)]
+    assert ours == [["scroll-tactile", "memory", "relabel", str(path), str(mislabelled.sequence), other]]
+    assert run(*ours[0][1:]).exit_code == 0
+    with TactileLearner.open(path, mode="read") as learner:
+        assert learner.materials == {name: 8 + (name == other) for name in scene.materials[:3]}
+
+
+def test_a_wide_screen_is_filled_and_what_tells_most_comes_first(browser, html, tmp_path):
+    save(html, tmp_path / "page.html")
+    browser.show(tmp_path / "page.html", 1600)
+    right = "Math.max(...[...document.querySelectorAll('#known table')].map(e => e.getBoundingClientRect().right))"
+    assert browser.evaluate(right) > 1450
+    headings = browser.evaluate("[...document.querySelectorAll('h2')].map(e => e.textContent).join()").split(",")
+    assert headings[0] == "What it knows" and headings[-1] == "When it was taught"
+    strips = "document.querySelector('#known .pictures').getBoundingClientRect().top"
+    assert browser.evaluate(f"{strips} < document.querySelector('svg').getBoundingClientRect().top") is True
+    hidden = "[...document.querySelectorAll('.table')].filter(box => box.scrollHeight > box.clientHeight + 2)"
+    assert browser.evaluate(f"{hidden}.length") == 0
+
+
+def test_a_long_table_says_how_long_it_is():
+    short, long = (table(["name", "number"], [["a", i] for i in range(count)], "it") for count in (40, 41))
+    assert "long" not in short and "rows" not in short
+    assert 'class="table long"' in long and "41 rows: the table scrolls." in long
+
+
+def test_held_out_touches_are_said_to_be_of_learned_sittings(html):
+    text = words(html)
+    assert "Others of their sittings were learned: tomorrow's touches are harder" in text.replace("&#x27;", "'")
+    assert "Touches of another day are harder" in text
+
+
+def test_a_page_of_a_stored_model_fits_nothing_and_says_the_same(tmp_path, monkeypatch):
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, exemplars=0) as learner:
+        feel(learner, 12, 5)
+        store_model(learner, lambda what, done, of: None)
+    with TactileLearner.open(tmp_path / "m", mode="read") as learner:
+        fresh = held_out_touches(learner.model(), 0.05)
+        monkeypatch.delattr(Draft, "fit")
+        found = held_out_touches(learner._predictor.examined(), 0.05)
+        html = memory_page(learner)
+    assert [(one.material, one.key, one.answer) for one in found] == [(o.material, o.key, o.answer) for o in fresh]
+    for one, other in zip(found, fresh, strict=True):
+        assert one.probability == pytest.approx(other.probability, abs=1e-9)
+        assert (one.novelty, one.threshold) == pytest.approx((other.novelty, other.threshold), abs=1e-9)
+    assert "60 touches of 5 materials were left out" in words(html)
+
+
 def test_a_compacted_memory_and_one_that_keeps_no_readings(tmp_path):
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, kept_touches=0, exemplars=0) as learner:
         feel(learner, 4, 3)
@@ -266,13 +334,13 @@ def test_more_materials_than_the_ridge_weighs_leave_a_page(learner, monkeypatch)
     def refuse(_):
         raise InputError("the readout weighs 1024 materials at most")
 
-    monkeypatch.setattr(Predictor, "fitted", refuse)
+    monkeypatch.setattr(Predictor, "examined", refuse)
     assert "Nothing could be fitted: the readout weighs 1024 materials at most" in words(memory_page(learner))
 
     def lack(_):
         raise CapacityError("no memory is left")
 
-    monkeypatch.setattr(Predictor, "fitted", lack)
+    monkeypatch.setattr(Predictor, "examined", lack)
     with pytest.raises(CapacityError):
         memory_page(learner)
 
@@ -302,6 +370,67 @@ def test_what_a_page_says_of_a_recording(browser, tmp_path):
         assert browser.said == []
 
 
+def _session(folder):
+    """Three touches with rests between them, of which half a second is lost in the second."""
+    random, scene = np.random.default_rng(0), Scene(sensor=PAD)
+    parts = [20 + random.normal(0, 0.5, (150, 6))]
+    for i in range(3):
+        parts += [60 + scene.touch("silk", i).readings / 2, 20 + random.normal(0, 0.5, (100, 6))]
+    readings = np.concatenate(parts)
+    times, there = np.arange(len(readings)) / 50, np.ones(len(readings), bool)
+    there[310:335] = False
+    table = zip(times[there], readings[there], strict=True)
+    rows = [",".join(f"{cell:.4f}" for cell in (at, *row)) for at, row in table]
+    path = folder / "my session.csv"
+    path.write_text("\n".join(["time,e1,e2,e3,e4,e5,e6", *rows]) + "\n")
+    return path
+
+
+def test_a_recording_shows_its_signal_and_gaps_and_proposes_touches(browser, tmp_path):
+    html = recording_page(_session(tmp_path), field="e*", clock="time")
+    text = words(html)
+    assert "4 touches, proposed by contact" in text and "All channels, each from its least" in text
+    assert html.count('class="own thin"') == 6 * 2  # each is broken where time was lost
+    assert html.count("<title>a gap of 0.52 s before reading 310</title>") == 1
+    assert html.count("<title>touch, readings") == 4
+    (command,) = pasted(html)
+    (tmp_path / "sensor.json").write_text(PAD.model_dump_json())
+    given = {"memory": tmp_path / "m", "sensor.json": tmp_path / "sensor.json", "MATERIAL": "silk"}
+    made = run(*[given.get(word, word) for word in command[1:]])
+    assert made.exit_code == 0, made.output
+    assert "4 touches of 1 materials" in made.output
+    save(html, tmp_path / "page.html")
+    browser.show(tmp_path / "page.html", 390)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+
+
+def test_channels_are_called_saturated_only_where_their_range_is_known(tmp_path):
+    readings = np.clip(np.random.default_rng(0).normal(200, 80, (400, 6)), 0, 255)
+    np.save(tmp_path / "touch.npy", readings)
+    text = words(recording_page(tmp_path / "touch.npy", rate=50.0))
+    assert "all 6 alive" in text and "whether one is saturated is not told" in text
+    (tmp_path / "pad.json").write_text(PAD.model_dump_json())
+    page, how = tmp_path / "page.html", ("report", tmp_path / "touch.npy")
+    made = run(*how, page, "--rate", "50", "--sensor", tmp_path / "pad.json")
+    assert made.exit_code == 0, made.output
+    text = words(page.read_text())
+    assert "6 saturated" in text and "that of sensor pad" in text
+    assert "19 channels" in refused(*how, page, "--rate", "50", "--sensor", "biotac")
+    with pytest.raises(InputError, match="both say whose"):
+        recording_page(tmp_path / "touch.npy", rate=50.0, sensor=PAD, preset="biotac")
+
+
+def test_a_known_message_type_gives_the_range_and_the_line_to_learn_it(tmp_path):
+    store, values = bags.typestore(2), np.random.default_rng(0).integers(0, 4096, (60, 19)).astype(np.int16)
+    stamps = [bags.START + i / 100 for i in range(60)]
+    messages = [(at, bags.biotac(store, row, at)) for at, row in zip(stamps, values, strict=True)]
+    path = bags.write(tmp_path / "hand", store, {"/left/tactile": messages}, form="mcap")
+    html = recording_page(path)
+    assert "that of preset biotac, of messages sr_robot_msgs/msg/BiotacAll" in words(html)
+    expected = ["learn", "memory", str(path), "--preset", "biotac", "--topic", "/left/tactile", "--label", "MATERIAL"]
+    assert pasted(html) == [["scroll-tactile", *expected]]
+
+
 def test_the_command_tells_memories_from_recordings(learner, tmp_path):
     path = _table(tmp_path)
     made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time")
@@ -318,7 +447,7 @@ def test_intervals_cut_a_recording_on_its_page(tmp_path):
     path = _table(tmp_path)
     cut = tmp_path / "cut.csv"
     cut.write_text("file,begin,end,material\ntouch.csv,0,1,<oak>\ntouch.csv,1,1.5,silk\n")
-    made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time", "--intervals", cut)
+    made = run("report", path, tmp_path / "page.html", "--field", "e*", "--clock", "time", "--labels", cut)
     assert made.exit_code == 0, made.output
     text = words((tmp_path / "page.html").read_text())
     assert "2 touches of 2 names" in text

@@ -15,7 +15,17 @@ from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures, Split, run_cells, silent, split
 from examples.paper.runs.options import leave_out, named
 from examples.paper.runs.results import write
-from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, NEED_WEIGHTS, SYSTEMS, Catalogue, library_of, name_of
+from examples.paper.systems.catalogue import (
+    CONTROLS,
+    EPOCHAL,
+    NEED_WEIGHTS,
+    SYSTEMS,
+    Catalogue,
+    lacking,
+    library_of,
+    name_of,
+    require_libraries,
+)
 from examples.paper.systems.descent import Course
 from examples.paper.systems.own import code_digest, is_own, require_own
 from examples.paper.systems.system_protocol import System
@@ -68,7 +78,7 @@ class SystemStudy:
     folder: where finished cells are noted, so that a killed run resumes; or None.
 
     Raises InputError for unknown systems, sets of one name, a device that is not there, or weights that are needed and
-    not given.
+    not given, and MissingLibraryError for a system whose library is not installed.
     """
 
     sets: Sequence[Recordings]
@@ -91,6 +101,7 @@ class SystemStudy:
             )
         for key in filter(is_own, self.systems):
             require_own(key)
+        require_libraries(self.systems)
         needing = [key for key in self.systems if key in NEED_WEIGHTS and self.weights is None]
         if needing:
             raise InputError(f"{', '.join(needing)} need the weights of a trained ResNet: give a file or resnet18")
@@ -198,7 +209,8 @@ def choose_systems(
         require_own(key)
     if keys:
         return tuple(dict.fromkeys(keys))
-    return tuple(usual) if weights is not None else leave_out(usual, NEED_WEIGHTS, "--weights")
+    able = leave_out(usual, lacking(usual), "their libraries (pip install -e '.[bench,spiking]')")
+    return able if weights is not None else leave_out(able, NEED_WEIGHTS, "--weights")
 
 
 def say_conditions(keys: Sequence[str], epochs: int, device: str, precision: str, *, quick: bool) -> None:

@@ -22,21 +22,29 @@ from examples.paper.runs.cells import Cell, Figures, learn, require_folds, run_c
 from examples.paper.runs.options import Data, Dataset, Device, Folds, Json, Plot, Quick, Run, Seed, folds_of, read
 from examples.paper.runs.pictures import draw_into
 from examples.paper.runs.results import show, write
-from examples.paper.runs.study import sensors_of
-from examples.paper.studies.continual_metrics import Points, accuracy_of, curve, forgetting_of, tally
+from examples.paper.runs.study import OwnSystems, sensors_of
+from examples.paper.studies.continual_metrics import (
+    Points,
+    accuracy_of,
+    curve,
+    forgetting_of,
+    method_row,
+    spread_of,
+    tally,
+)
 from examples.paper.studies.continual_picture import draw_continual
 from examples.paper.studies.peers import ContinualPeer, NearestMean, RanPAC, StreamingLDA, touch_features
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.replay import PUBLISHED
 from examples.paper.studies.schedules import SCHEDULES, arrange, part_ends
-from examples.paper.systems.own import is_own, own_embedding
-from scroll_tactile import Embedding, Joined, Kernels, Vision
+from examples.paper.systems.coming import Coming, code_of, require_systems
+from examples.paper.systems.own import frozen_embedding, is_own
+from scroll_tactile import Embedding
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.classification import Labelled
-from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.readouts.readout import ReadoutName
 
 __all__ = ["SIZES", "Continual", "Size", "continual", "parse_sizes", "rows"]
@@ -69,7 +77,8 @@ class Continual:
     sizes: of the buffer. epochs: of a fine-tune; the learner's own choice where it is None. device: of fine-tunes.
     every: measure after every so many parts of the pass, as many as materials (see `part_ends`); 0: at its end only,
     and no forgetting. tuned_curve: measure `f*` there too, each time from a fine-tune of its own.
-    peers: whether to run them. folder: where finished parts are noted, so that an interrupted run resumes; or None.
+    peers: whether to run them. systems: of one's own, beside them. folder: where finished parts are noted, so that an
+    interrupted run resumes; or None.
 
     Raises InputError for sizes that cannot be, such as fewer exemplars than materials, or a negative `every`.
     """
@@ -85,6 +94,7 @@ class Continual:
     peers: bool = True
     device: str = "cpu"
     folder: Path | None = None
+    systems: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         kinds = len(set(self.recordings.materials))
@@ -121,10 +131,12 @@ class Continual:
         if self.peers:
             methods += [name for name in PEERS if name not in WITH_BUFFER]
             methods += [f"{name} {size}" for size in sizes for name in WITH_BUFFER]
+        methods += self.systems
         for fold in folds:
             cells = [Cell(self.recordings.name, fold, method) for method in methods]
             measure = _ContinualFold(self, self._cached, fold).measure
-            yield from run_cells(self.folder, self.plan, [self.recordings], cells, measure, progress)
+            code = code_of(self.systems)
+            yield from run_cells(self.folder, self.plan, [self.recordings], cells, measure, progress, code)
 
     @cached_property
     def _cached(self) -> Embedding:
@@ -155,6 +167,8 @@ class _ContinualFold:
             learner = self._offline(self._learner(0, "ridge"), progress)
             floor = accuracy_of(tally([name for name, _ in self.test], _predict(learner, self.test)))
             return {"digest": learner.digest(), "accuracy": floor, "forgetting": None, "curve": []}
+        if cell.system in self.task.systems:
+            return self._own(Coming(cell.system, self.task.seed), progress)
         if cell.system in PEERS:
             return self._peer(PEERS[cell.system](0, self.task.seed), progress)
         method, _, size = cell.system.rpartition(" ")
@@ -226,6 +240,19 @@ class _ContinualFold:
                 points[str(done)] = tally([truth for truth, _ in asked], answer(asked))
         return points
 
+    def _own(self, system: Coming, progress: Progress) -> Figures:
+        """A system of one's own: it is asked where the others are."""
+        points: Points = {}
+        for done, touch in enumerate(self.train, start=1):
+            system.observe(done, touch)
+            progress("learning", done, self.total)
+            if done in self.stops:
+                met = {material for material, _ in self.train[:done]}
+                asked = [touch for touch in self.test if touch[0] in met]
+                predicted = system.predict([stream for _, stream in asked])
+                points[str(done)] = tally([truth for truth, _ in asked], predicted)
+        return {"one_pass": system.one_pass, **_figures(points)}
+
     @cached_property
     def _vectors(self) -> tuple[np.ndarray, np.ndarray]:
         """Features of the training and of the test touches."""
@@ -275,40 +302,20 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
     found = []
     for system in dict.fromkeys(cell.system for cell, _ in results):
         folds = [figures for cell, figures in results if cell.system == system]
-        method, _, size = system.rpartition(" ") if system not in PEERS else (system, "", "")
-        row = _row(method or system, size if method and size else None, folds)
+        method, _, size = ("", "", system) if system in PEERS or is_own(system) else system.rpartition(" ")
+        row = method_row(method or system, size if method and size else None, folds)
         if method == "f*":
             of_each = {
                 "seconds": "tuning_seconds",
                 "exemplars": "exemplars",
                 "bytes_per_exemplar": "bytes_per_exemplar",
             }
-            row |= {name: _spread([fold[key] for fold in folds]) for name, key in of_each.items()}
+            row |= {name: spread_of([fold[key] for fold in folds]) for name, key in of_each.items()}
             row["kept"] = sum(fold["kept"] for fold in folds)
         found.append(row)
         if system == "f":
             found.append(row | {"method": "f*", "size": "0", "kept": 0})
     return found
-
-
-def _row(method: str, size: str | None, folds: Sequence[Figures]) -> dict[str, Any]:
-    moments = zip(*(fold["curve"] for fold in folds), strict=True)
-    return {
-        "method": method,
-        "size": size,
-        "accuracy": _spread([fold["accuracy"] for fold in folds]),
-        "forgetting": _spread([fold["forgetting"] for fold in folds]),
-        # Folds of a set that is not balanced may have met other numbers of materials by then: the mean of these too.
-        "curve": [[sum(column) / len(folds) for column in zip(*moment, strict=True)] for moment in moments],
-    }
-
-
-def _spread(values: Sequence[float | None]) -> dict[str, float] | None:
-    known = [value for value in values if value is not None]
-    if not known or len(known) < len(values):
-        return None
-    mean, spread = mean_and_spread(known)
-    return {"mean": mean, "sd": spread}
 
 
 def continual(
@@ -339,6 +346,7 @@ def continual(
         bool, typer.Option("--tuned-curve", help="Measure f* there too: a fine-tune at each. Slow.")
     ] = False,
     peers: Annotated[bool, typer.Option(help="Measure other methods on the same features.")] = True,
+    own_systems: OwnSystems = None,
     quick: Quick = False,
     run: Run = None,
     json: Json = None,
@@ -349,11 +357,12 @@ def continual(
     f is the closed form, which no buffer and no order changes; f* is fine-tuned from it on the exemplars alone. Beside
     them: the ridge floor, what was published, and other continual learners on the same features and folds.
     """
-    frozen = _embedding(embedding, weights, features)
+    frozen, own = frozen_embedding(embedding, weights, features), require_systems(own_systems)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         (recordings,) = read("DATASET", dataset, data, seed, quick=quick).values()
         settings: dict[str, Any] = {"every": curve, "tuned_curve": tuned_curve, "epochs": epochs, "peers": peers}
+        settings |= {"systems": own}
         task = Continual(recordings, frozen, schedule, seed, parse_sizes(sizes), device=device, folder=run, **settings)
         results = list(task.run(folds_of(folds, recordings, quick=quick), progress))
     found = rows(results)
@@ -385,17 +394,3 @@ def parse_sizes(text: str) -> tuple[Size, ...]:
             raise InputError(f"expected --sizes as numbers of exemplars or all, such as 0,20,400,all; came {text!r}")
         sizes.append("all" if word == "all" else int(word))
     return tuple(dict.fromkeys(sizes))
-
-
-def _embedding(choice: str, weights: str | None, features: int | None) -> Embedding:
-    if choice not in ("kernels", "vision", "kernels+vision") and not is_own(choice):
-        raise InputError(f"expected --embedding kernels, vision, kernels+vision, or module:factory; came {choice!r}")
-    if choice == "kernels" or is_own(choice):
-        if weights is not None:
-            raise InputError(f"--embedding {choice} has no weights; came {weights!r}. Leave --weights out")
-        return own_embedding(choice) if is_own(choice) else Kernels(dimension=features or 1008)
-    if weights is None:
-        raise InputError(f"--embedding {choice} needs --weights: a file, or a published name such as resnet18")
-    # Beside vision 1260 kernels have 98.7 % of RoboSkin, 1008 have 98.6; both have 99.5 of BioTac.
-    vision = Vision(weights)
-    return vision if choice == "vision" else Joined(Kernels(dimension=features or 1260), vision)

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.pipelines.metrics import mean_and_spread
 
 __all__ = [
     "METRICS",
@@ -23,7 +25,9 @@ __all__ = [
     "curve",
     "forgetting",
     "forgetting_of",
+    "method_row",
     "metrics_of",
+    "spread_of",
     "tally",
 ]
 
@@ -135,3 +139,25 @@ def metrics_of(points: Points, ends: Sequence[int]) -> dict[str, float | None]:
         "forgetting": forgetting_of(at_ends),
         "backward_transfer": backward_transfer(shares),
     }
+
+
+def method_row(method: str, size: str | None, folds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the folds of a method, with a size of its buffer, have in the mean."""
+    moments = zip(*(fold["curve"] for fold in folds), strict=True)
+    return {
+        "method": method,
+        "size": size,
+        "accuracy": spread_of([fold["accuracy"] for fold in folds]),
+        "forgetting": spread_of([fold["forgetting"] for fold in folds]),
+        # Folds of a set that is not balanced may have met other numbers of materials by then: the mean of these too.
+        "curve": [[sum(column) / len(folds) for column in zip(*moment, strict=True)] for moment in moments],
+    }
+
+
+def spread_of(values: Sequence[float | None]) -> dict[str, float] | None:
+    """Mean and standard deviation over folds, None where one has none."""
+    known = [value for value in values if value is not None]
+    if not known or len(known) < len(values):
+        return None
+    mean, spread = mean_and_spread(known)
+    return {"mean": mean, "sd": spread}

@@ -22,7 +22,7 @@ from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, over_folds, require_folds, run_cells, silent
 from examples.paper.runs.options import Data, Dataset, Folds, Json, Quick, Run, Seed, folds_of, numbers, read
 from examples.paper.runs.results import show, write
-from examples.paper.runs.study import sensors_of
+from examples.paper.runs.study import OwnSystems, sensors_of
 from examples.paper.studies.continual_metrics import METRICS, Points, accuracy_of, metrics_of, tally
 from examples.paper.studies.fleet_study import Fleet
 from examples.paper.studies.peers import (
@@ -37,6 +37,7 @@ from examples.paper.studies.peers import (
 from examples.paper.studies.peers_replay import GDumb, Replaying
 from examples.paper.studies.random_convolution import random_convolution
 from examples.paper.studies.schedules import arrange, part_ends, si_blurry
+from examples.paper.systems.coming import Coming, code_of, require_systems
 from scroll_tactile import Embedding, Kernels
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
@@ -71,7 +72,8 @@ class ContinualMetrics:
 
     every: measure after so many touches, and at the end of each task. capacity: touches in the peers' buffers.
     robots: of the fleets, beside one robot that has everything. alphas: of their Dirichlet splits. seed: of all that is
-    drawn. features: of the kernels. folder: of the notes, so that a run that was killed resumes; or None.
+    drawn. features: of the kernels. systems: of one's own, beside METHODS. folder: of the notes, so that a run that was
+    killed resumes; or None.
 
     Raises InputError for fewer touches than one between two measurements, or fewer robots than one.
     """
@@ -84,6 +86,7 @@ class ContinualMetrics:
     alphas: tuple[float, ...] = ALPHAS
     features: int = 1008
     folder: Path | None = None
+    systems: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.every < 1:
@@ -106,7 +109,8 @@ class ContinualMetrics:
         for fold in folds:
             measured = _MetricsFold(self, fold)
             cells = [Cell(self.recordings.name, fold, key) for key in measured.measures]
-            yield from run_cells(self.folder, self.plan, [self.recordings], cells, measured.measure, progress)
+            code = code_of(self.systems)
+            yield from run_cells(self.folder, self.plan, [self.recordings], cells, measured.measure, progress, code)
 
     @cached_property
     def kernels(self) -> Embedding:
@@ -136,7 +140,9 @@ class _MetricsFold:
         self.train, self.test = hold_out(task.recordings, task.recordings.fold == fold)
         self.truth = [name for name, _ in self.test]
         self.measures: dict[str, Callable[[Progress], Figures]] = {
-            f"{stream}, {method}": partial(self._pass, stream, method) for stream in STREAMS for method in METHODS
+            f"{stream}, {method}": partial(self._pass, stream, method)
+            for stream in STREAMS
+            for method in (*METHODS, *task.systems)
         }
         fleets = [(1, 1.0), *((robots, alpha) for robots in task.robots for alpha in task.alphas)]
         self.measures |= {
@@ -174,6 +180,8 @@ class _MetricsFold:
         return order, part_ends("class-by-class", [names[i] for i in order])
 
     def _maker(self, name: str, progress: Progress) -> Callable[[], _Method]:
+        if name in self.task.systems:
+            return lambda: _of_system(Coming(name, self.task.seed), self.train, self.test)
         if name in _PEERS:
             trained, tested = self.vectors
             return lambda: _of_vectors(
@@ -251,6 +259,14 @@ def _of_vectors(peer: ContinualPeer, names: Sequence[str], trained: np.ndarray, 
     return _Method(observe, peer.boundary, lambda places: peer.predict(tested[list(places)]))
 
 
+def _of_system(system: Coming, train: Sequence[Labelled], test: Sequence[Labelled]) -> _Method:
+    return _Method(
+        lambda i: system.observe(i, train[i]),
+        lambda: None,
+        lambda places: system.predict([test[i][1] for i in places]),
+    )
+
+
 def _of_streams(learner: TactileLearner, train: Sequence[Labelled], test: Sequence[Labelled]) -> _Method:
     return _Method(
         lambda i: learner.observe(*train[i]),
@@ -297,6 +313,7 @@ def metrics(
     every: Annotated[int, typer.Option(min=1, help="Measure after every so many touches.")] = 40,
     buffer: Annotated[int, typer.Option(min=1, help="Touches in the peers' buffers.")] = 200,
     robots: Annotated[str, typer.Option(help="Of the fleets, beside one robot.")] = "10,100",
+    own_systems: OwnSystems = None,
     quick: Quick = False,
     run: Run = None,
     json: Json = None,
@@ -306,12 +323,13 @@ def metrics(
     Accuracy at the end, over tasks and at any time, forgetting, backward transfer, seconds and peak memory a task: of
     ours and of other continual learners. Then deal the touches to fleets, and merge what their robots learned.
     """
+    own = require_systems(own_systems)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         (recordings,) = read("DATASET", dataset, data, seed, quick=quick).values()
         fleets = tuple(numbers("--robots", robots))[: 1 if quick else None]
         alphas = ALPHAS[: 1 if quick else None]
-        task = ContinualMetrics(recordings, seed, every, buffer, fleets, alphas, folder=run)
+        task = ContinualMetrics(recordings, seed, every, buffer, fleets, alphas, folder=run, systems=own)
         results = list(task.run(folds_of(folds, recordings, quick=quick), progress))
     means = summary(results)
     columns = {"stream, method": "{./name}"} | {f"{name}, %": f"{{?./{name}|±}}" for name in METRICS}
@@ -325,4 +343,4 @@ def metrics(
     show("memories merged; networks averaged (FedAvg)", columns, [row for row in named if "learning" not in row])
     cells = {cell.key: figures for cell, figures in results}
     sensor = sensors_of([recordings])[recordings.name]
-    write(context, task.plan | {"sensor": sensor, "methods": METHODS, "means": means, "cells": cells})
+    write(context, task.plan | {"sensor": sensor, "methods": [*METHODS, *own], "means": means, "cells": cells})

@@ -20,10 +20,13 @@ from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.cells import Cell, Figures, over_folds, require_folds, run_cells, silent
 from examples.paper.runs.options import OF_TOUCHES, Data, Folds, Json, Quick, Run, Seed, folds_of, read
 from examples.paper.runs.results import show, write
+from examples.paper.runs.study import OwnSystems
 from examples.paper.studies.default_learner import Answering, Answers, Checkout, answers
 from examples.paper.studies.perturbations import dead, drift, gaussian, noise, speed
 from examples.paper.studies.replay import novelty_area, rotations
 from examples.paper.studies.strengths import require_channels
+from examples.paper.systems.coming import answering, code_of, require_systems
+from examples.paper.systems.own import is_own
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
@@ -96,6 +99,8 @@ def _measure(fit: Fit, answering: Answering, progress: Progress) -> Figures:
 
 def _figures(truth: Sequence[str], found: Answers, learned: set[str]) -> Figures:
     new = [material not in learned for material in truth]
+    if "probability" not in found:  # a system of one's own: it says materials alone
+        return {"tested": len(truth)} | ({} if any(new) else {"accuracy": accuracy(truth, found["material"])})
     if any(new):
         return {"novelty_auroc": novelty_area(found["novelty"], new), "tested": len(truth)}
     right = [true == guess for true, guess in zip(truth, found["material"], strict=True)]
@@ -112,8 +117,9 @@ def _figures(truth: Sequence[str], found: Answers, learned: set[str]) -> Figures
 class Robustness:
     """All rows of a recorded set.
 
-    sides: by name, whose default learner answers. seed: of what perturbations draw. quick: no other session, and no
-    materials left out. folder: where finished cells are kept, or None; a changed project's figures belong into another.
+    sides: by name, whose default learner answers, or which system of one's own, by its key. seed: of what perturbations
+    draw. quick: no other session, and no materials left out. folder: where finished cells are kept, or None; a changed
+    project's figures belong into another.
 
     Raises InputError for a negative seed and for a camera's frames.
     """
@@ -143,7 +149,8 @@ class Robustness:
             }
             rows: dict[str, dict[str, Figures]] = {side: {} for side in self.sides}
             measure = partial(self._cell, cells)
-            for cell, figures in run_cells(self.folder, plan, [self.recordings], [*cells], measure, progress):
+            code = code_of([side for side in self.sides if is_own(side)])
+            for cell, figures in run_cells(self.folder, plan, [self.recordings], [*cells], measure, progress, code):
                 rows[cells[cell][0]] |= figures["rows"]
             for side, own in rows.items():
                 for row, found in _with_novelty(own).items():
@@ -178,7 +185,7 @@ def _with_novelty(rows: Mapping[str, Figures]) -> dict[str, Figures]:
     """The rows of a fold, with the mean of all rotations for one row of novelty."""
     turned = [figures for row, figures in rows.items() if row.startswith(NOVELTY)]
     found = {row: figures for row, figures in rows.items() if not row.startswith(NOVELTY)}
-    if turned:
+    if turned and "novelty_auroc" in turned[0]:
         area = float(np.mean([figures["novelty_auroc"] for figures in turned]))
         found[NOVELTY] = {"novelty_auroc": area, "tested": sum(figures["tested"] for figures in turned)}
     return found
@@ -309,6 +316,7 @@ def robustness(
     before: Annotated[
         Path | None, typer.Option(help="An older checkout of the project, whose default learner is measured beside.")
     ] = None,
+    own_systems: OwnSystems = None,
     seed: Seed = 0,
     quick: Quick = False,
     run: Run = None,
@@ -321,6 +329,7 @@ def robustness(
     sides: dict[str, Answering] = {NOW: answers}
     if before is not None:
         sides["before"] = Checkout(before)
+    sides |= {key: answering(key, seed) for key in require_systems(own_systems)}
     if series is not None and not series.is_file():
         raise InputError(f"expected sets of series in {series}; there is no such file")
     found: dict[str, dict[str, Any]] = {side: {} for side in sides}
@@ -360,4 +369,5 @@ def _show(found: Mapping[str, Mapping[str, Any]]) -> None:
             for head, figure in figures.items():
                 step = ".3f" if single else "±3"
                 columns[head if side == NOW else f"{head}, {side}"] = f"{{?./{side}/{figure}|{step}}}"
-        show(name, columns, [{"row": row} | {side: found[side][name][row] for side in found} for row in rows])
+        of = {row: {side: found[side].get(name, {}).get(row, {}) for side in found} for row in rows}
+        show(name, columns, [{"row": row} | sides for row, sides in of.items()])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -28,7 +28,8 @@ from examples.paper.runs.study import OwnEmbeddings, OwnSystems, Systems, System
 from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import TrainedNetwork
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.cli.terminal import progress_bar, say
+from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.pipelines.metrics import accuracy
 
@@ -101,8 +102,8 @@ def _votes(truth: Sequence[str], predicted: Sequence[str], touch: Sequence[int])
     return {"recordings": len(ballots), "recordings_right": right}
 
 
-def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
-    """One row for each system: data set → accuracy over its folds, the paper's, and the difference."""
+def rows(results: Sequence[tuple[Cell, Figures]], *, compared: bool = True) -> list[dict[str, Any]]:
+    """One row for each system: data set → accuracy over its folds, the paper's, and the difference where `compared`."""
     found: list[dict[str, Any]] = []
     for key in dict.fromkeys([*SYSTEMS, *(cell.system for cell, _ in results)]):
         sets: dict[str, Any] = {}
@@ -114,7 +115,7 @@ def rows(results: Sequence[tuple[Cell, Figures]]) -> list[dict[str, Any]]:
             paper = PAPER.get(key, {}).get(dataset)
             sets[dataset] = ours | {
                 "paper": paper,
-                "difference": None if paper is None else ours["mean"] - paper,
+                "difference": None if paper is None or not compared else ours["mean"] - paper,
                 "seconds": sum(cell["seconds"] for cell in cells),
             }
             if "epochs" in cells[0]:
@@ -155,19 +156,37 @@ def table1(
         found = [*read("--sets", sets, data, seed, known=OF_TABLE1, quick=quick).values()]
         few = epochs or (QUICK_EPOCHS if quick else 100)
         study = Table1(found, keys, weights, few, device, seed, quick, run, precision)
-        results = list(study.run({item.name: folds_of(folds, item, quick=quick) for item in found}, progress))
+        chosen = {item.name: folds_of(folds, item, quick=quick) for item in found}
+        results, stopped = _as_far_as_it_goes(study.run(chosen, progress))
     columns = {
         "system": "{./system}",
         "paper": "{?./paper|%}",
         "here, %": "{./here|±}",
-        "apart": "{?./difference|*100|+.1f}",
-    }
+    } | ({} if quick else {"apart": "{?./difference|*100|+.1f}"})  # a fifth of a fold is no figure to compare
     columns |= {"of recordings": "{?./here/vote|%}", "folds": "{./here/folds}", "seconds": "{./here/seconds|.0f}"}
-    table = rows(results)
+    table = rows(results, compared=not quick)
     for name in (item.name for item in found):
         own = [(row, row["sets"][name]) for row in table if name in row["sets"]]
         show(name, columns, [figures | {"system": row["system"], "here": figures} for row, figures in own])
+    if stopped is not None:
+        say("[yellow]stopped:[/] the rows above are what was done until then")
+        raise stopped
     close(context, study, [(cell, _without_losses(figures)) for cell, figures in results], {"rows": table})
+
+
+def _as_far_as_it_goes(
+    cells: Iterator[tuple[Cell, Figures]],
+) -> tuple[list[tuple[Cell, Figures]], ScrollTactileError | None]:
+    """The cells that are done, and the error that ended them; raises it where none is done."""
+    results: list[tuple[Cell, Figures]] = []
+    try:
+        for cell in cells:
+            results.append(cell)
+    except ScrollTactileError as error:
+        if not results:
+            raise
+        return results, error
+    return results, None
 
 
 def _without_losses(figures: Figures) -> Figures:

@@ -25,9 +25,10 @@ from examples.paper.runs.cached import Cached
 from examples.paper.runs.cells import Cell, Figures, learn, require_folds, run_cells, silent
 from examples.paper.runs.options import Data, Dataset, Folds, Json, Quick, Run, Seed, folds_of, read
 from examples.paper.runs.results import show, write
-from examples.paper.runs.study import sensors_of
+from examples.paper.runs.study import OwnSystems, sensors_of
 from examples.paper.studies.peers import touch_features
 from examples.paper.studies.recursive_ridge import RecursiveRidge
+from examples.paper.systems.coming import Coming, code_of, require_systems
 from scroll_tactile import Embedding, Kernels
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
@@ -141,7 +142,8 @@ class Unlearning:
     """A schedule of requests on each fold's training touches.
 
     checkpoints: after how many requests all is compared with starting anew; the last is the number of requests.
-    seed: draws them. features: of the kernels. folder: of the notes, so that a run that was killed resumes; or None.
+    seed: draws them. features: of the kernels. systems: of one's own, beside ours. folder: of the notes, so that a run
+    that was killed resumes; or None.
     """
 
     recordings: Recordings
@@ -149,6 +151,7 @@ class Unlearning:
     seed: int = 0
     features: int = 1008
     folder: Path | None = None
+    systems: tuple[str, ...] = ()
 
     @property
     def plan(self) -> dict[str, Any]:
@@ -162,10 +165,35 @@ class Unlearning:
         Raises InputError for a fold that is not there or a folder of another run, and what learning raises.
         """
         require_folds(self.recordings.fold, folds)
-        cells = [Cell(self.recordings.name, fold, "requests") for fold in folds]
-        yield from run_cells(self.folder, self.plan, [self.recordings], cells, self._measure, progress)
+        cells = [Cell(self.recordings.name, fold, who) for who in ("requests", *self.systems) for fold in folds]
+        code = code_of(self.systems)
+        yield from run_cells(self.folder, self.plan, [self.recordings], cells, self._measure, progress, code)
 
     def _measure(self, cell: Cell, progress: Progress) -> Figures:
+        return self._own(cell, progress) if cell.system in self.systems else self._ours(cell, progress)
+
+    def _own(self, cell: Cell, progress: Progress) -> Figures:
+        """After so many requests, the share of answers that a system of one's own gives that starts anew."""
+        train, test = hold_out(self.recordings, self.recordings.fold == cell.fold)
+        streams = [stream for _, stream in test]
+        first, drawn = requests(self.checkpoints[-1], len(train), self.seed)
+        followed, there, found = Coming(cell.system, self.seed), set(first), {}
+        for i in first:
+            followed.observe(i, train[i])
+        for done, request in enumerate(drawn, start=1):
+            progress("requests", done, len(drawn))
+            (there.update if request.adds else there.difference_update)(request.touches)
+            for i in request.touches:
+                followed.observe(i, train[i]) if request.adds else followed.retract(i)
+            if done in self.checkpoints:
+                anew = Coming(cell.system, self.seed)
+                for i in sorted(there):
+                    anew.observe(i, train[i])
+                pairs = zip(followed.predict(streams), anew.predict(streams), strict=True)
+                found[str(done)] = float(np.mean([one == other for one, other in pairs]))
+        return {"learned": len(train), "at first": len(first), "same_answers_after": found}
+
+    def _ours(self, cell: Cell, progress: Progress) -> Figures:
         train, test = hold_out(self.recordings, self.recordings.fold == cell.fold)
         first, drawn = requests(self.checkpoints[-1], len(train), self.seed)
         peer = _Peer(touch_features(self._kernels, [stream for _, stream in train]), [name for name, _ in train])
@@ -311,6 +339,7 @@ def unlearning(
     data: Data,
     folds: Folds = "all",
     seed: Seed = 0,
+    own_systems: OwnSystems = None,
     quick: Quick = False,
     run: Run = None,
     json: Json = None,
@@ -320,12 +349,14 @@ def unlearning(
     Ours must have the bytes of a memory that never had what went. Beside it: ridge heads that Woodbury's identity
     follows in float64, as exact federated continual unlearning and ACIL do, and their relative error.
     """
+    own = require_systems(own_systems)
     with progress_bar() as progress:
         progress("reading", 0, 1)
         (recordings,) = read("DATASET", dataset, data, seed, quick=quick).values()
-        task = Unlearning(recordings, CHECKPOINTS[: 2 if quick else None], seed, folder=run)
+        task = Unlearning(recordings, CHECKPOINTS[: 2 if quick else None], seed, folder=run, systems=own)
         results = list(task.run(folds_of(folds, recordings, quick=quick), progress))
-    means = summary(results)
+    means = summary([(cell, figures) for cell, figures in results if cell.system not in own])
+    means |= {"own": {key: _same_answers(results, key) for key in own}} if own else {}
     rows: list[dict[str, Any]] = [{"way": "ours: the same bytes", "after": means["same_bytes"]}]
     rows.append({"way": "ours", "after": means["ours"]})
     for penalty, ways in means["peer"].items():
@@ -335,9 +366,19 @@ def unlearning(
     show("unlearning", columns, [row | {"after": {n: _shown(x) for n, x in row["after"].items()}} for row in rows])
     columns = {"the same answers": "{./same_answers}", "ours, ms a request": "{./ours_ms|.0f}"}
     show("the processor's time", columns | {"the peer's": "{./peer_ms|.0f}"}, [means])
+    if own:
+        columns = {"the same answers as from starting anew, %": "{./system}"}
+        columns |= {f"{count} requests": f"{{./after/{count}|%}}" for count in means["same_bytes"]}
+        show("one's own", columns, [{"system": key, "after": after} for key, after in means["own"].items()])
     sensor = sensors_of([recordings])[recordings.name]
     cells = {cell.key: figures for cell, figures in results}
     write(context, task.plan | {"sensor": sensor, "means": means, "cells": cells})
+
+
+def _same_answers(results: Sequence[tuple[Cell, Figures]], key: str) -> dict[str, float]:
+    """After so many requests, the mean over folds of a system's share of answers that starting anew gives."""
+    folds = [figures["same_answers_after"] for cell, figures in results if cell.system == key]
+    return {count: float(np.mean([fold[count] for fold in folds])) for count in folds[0]}
 
 
 def _shown(figure: float | None) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib.util import find_spec
 
 from torch import nn
 
@@ -26,10 +27,22 @@ from scroll_tactile import Embedding, Frames, Joined, Kernels, Vision
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import missing
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.signals.augmentation import Augmentation
 
-__all__ = ["CONTROLS", "EPOCHAL", "NEED_WEIGHTS", "OURS", "SYSTEMS", "Catalogue", "library_of", "name_of"]
+__all__ = [
+    "CONTROLS",
+    "EPOCHAL",
+    "NEED_WEIGHTS",
+    "OURS",
+    "SYSTEMS",
+    "Catalogue",
+    "lacking",
+    "library_of",
+    "name_of",
+    "require_libraries",
+]
 
 SYSTEMS = {
     "svm": "SVM",
@@ -177,6 +190,26 @@ class Catalogue:
     def _both(self) -> Embedding:
         # 1260 kernels beside vision, as `continual` has: RoboSkin 98.7 % against 98.6 with 1008.
         return Joined(Cached(Kernels(dimension=1260)), self._vision)
+
+
+_EXTRAS = {
+    "svm": ("sklearn", "scikit-learn", "bench"),
+    "svm-spikes": ("sklearn", "scikit-learn", "bench"),
+    "snn": ("snntorch", "snntorch", "spiking"),
+}
+"""Key → the module that it cannot be fitted without, the library's name, and the extra that it comes with."""
+
+
+def lacking(keys: Sequence[str]) -> list[str]:
+    """Those of some systems whose library is not installed."""
+    return [key for key in keys if key in _EXTRAS and find_spec(_EXTRAS[key][0]) is None]
+
+
+def require_libraries(keys: Sequence[str]) -> None:
+    """Raise MissingLibraryError, before hours go into others, where a system's library is not installed."""
+    for key in lacking(keys):
+        _, library, extra = _EXTRAS[key]
+        raise missing(library, extra, f"the system {key}", "leave it out of --systems")
 
 
 def name_of(key: str) -> str:

@@ -25,6 +25,7 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.pipelines.sources import SourceOptions
     from scroll_tactile.quantities import Quantity
     from scroll_tactile.results import (
+        Adaptation,
         Candidates,
         Compacted,
         Composition,
@@ -45,6 +46,7 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.testing.learner_checks import check_learner
 
 __all__ = [
+    "Adaptation",
     "Augmented",
     "Candidates",
     "Capabilities",
@@ -91,6 +93,7 @@ __version__ = "0.14.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
+    "Adaptation": "results",
     "Augmented": "signals.copies",
     "Candidates": "results",
     "Capabilities": "embeddings.protocol",

@@ -93,7 +93,7 @@ class Fitted:
     """gains, offsets: (n,), offsets as shares of the range. lost: channels that read nothing any more, (n,).
 
     before, after: rᵀ P r of the touches over the numbers of their known channels, as they are and each corrected by the
-    others: about 1 of a skin that did not change.
+    others: about 1 of a skin that did not change. gained: the logarithm of how much likelier that makes them.
     """
 
     gains: Floats
@@ -101,6 +101,7 @@ class Fitted:
     lost: npt.NDArray[np.bool_]
     before: float
     after: float
+    gained: float
 
 
 class _Fit:
@@ -208,10 +209,11 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
             at, likely = fit.mode(sigma, tau, none)
             if likely > evidence:
                 best, evidence, how = at, likely, (sigma, tau)
-    before = fit.loss(none[:n], none[n:]) / fit.dimension
+    before = fit.loss(none[:n], none[n:])
     held = [fit.mode(*how, best, leave)[0] for leave in range(len(touches))]
-    after = np.array([fit.loss(at[:n], at[n:])[leave] for leave, at in enumerate(held)]) / fit.dimension
+    after = np.array([fit.loss(at[:n], at[n:])[leave] for leave, at in enumerate(held)])
     limit = np.log(GREATEST_GAIN)
     gains = np.where(fit.known, np.exp(np.clip(best[:n], -limit, limit)), 1.0)
     offsets = np.where(fit.known, np.clip(best[n:] * reference.spans, -1.0, 1.0), 0.0)
-    return Fitted(gains, offsets, fit.lost, float(before.mean()), float(after.mean()))
+    means = (float(each.mean()) / fit.dimension for each in (before, after))
+    return Fitted(gains, offsets, fit.lost, *means, float((before - after).sum()) / 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -24,6 +25,7 @@ from store import Store
 __all__ = ["adapt_to", "known_touches"]
 
 FEWEST, FEWEST_MATERIALS = 3, 2  # touches, and materials among them: one may have changed itself
+LIKELIER = math.log(100)  # that the touches have to be, each by the correction of the others, than without any
 FEWEST_SPREAD = 8  # touches of materials that were touched before, by which it is known how touches differ
 
 
@@ -116,7 +118,7 @@ def _require_known(reference: Reference, materials: Sequence[str], store: Store)
 
 def _refusal(found: Fitted) -> str:
     """Why a correction is not kept; "" where it is."""
-    if found.after >= found.before:
+    if found.gained < LIKELIER:
         return "the touches are explained no better with any correction: the skin reads as it did, or changed otherwise"
     return ""
 

@@ -118,8 +118,8 @@ class _Fit:
         self.lost = ~reference.idle & (np.median(lively, axis=0) < DEAD)
         self.known = ~reference.idle & ~self.lost
         chosen = np.flatnonzero(np.concatenate([np.tile(self.known, KINDS), [True]]))
-        self.precision = np.zeros((len(self.means[0]),) * 2)
-        self.precision[np.ix_(chosen, chosen)] = np.linalg.inv(reference.scatter[np.ix_(chosen, chosen)])
+        self.whitened = np.zeros((len(chosen), self.means.shape[1]))
+        self.whitened[:, chosen] = np.linalg.inv(np.linalg.cholesky(reference.scatter[np.ix_(chosen, chosen)]))
         self.dimension = len(chosen)
 
     def _measured(self, logs: Floats, offsets: Floats) -> Floats:
@@ -143,8 +143,8 @@ class _Fit:
 
     def loss(self, logs: Floats, offsets: Floats) -> Floats:
         """rᵀ P r of each touch, (touches,)."""
-        away = self.numbers(logs, offsets) - self.means
-        return np.asarray(np.einsum("ti,ij,tj->t", away, self.precision, away))
+        away = (self.numbers(logs, offsets) - self.means) @ self.whitened.T
+        return np.asarray(np.square(away).sum(axis=1))
 
     def _slopes(self, logs: Floats, offsets: Floats) -> tuple[Floats, Floats]:
         """The numbers less their means, and by each log gain and offset, (touches, 3 n + 1, 2 n)."""
@@ -178,10 +178,10 @@ class _Fit:
         least, curved = objective(at), np.eye(len(free))
         for _ in range(ROUNDS):
             away, slopes = self._slopes(at[:n], at[n:])
-            slopes = slopes[:, :, free]
-            towards = np.einsum("ij,tjk,t->tik", self.precision, slopes, weights)
-            curved = np.einsum("tik,til->kl", slopes, towards) + np.diag(prior[free])
-            slope = np.einsum("tik,ti->k", towards, away) + prior[free] * at[free]
+            away = (np.sqrt(weights)[:, None] * away @ self.whitened.T).ravel()
+            slopes = (np.sqrt(weights)[:, None, None] * (self.whitened @ slopes[:, :, free])).reshape(len(away), -1)
+            curved = slopes.T @ slopes + np.diag(prior[free])
+            slope = slopes.T @ away + prior[free] * at[free]
             before = least
             while damping < 1e6:
                 moved = at.copy()
@@ -203,10 +203,10 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     """
     n, fit = reference.channels, _Fit(reference, touches, materials)
     none = np.zeros(2 * n)
-    best, evidence, how = none, -np.inf, (SIGMAS[0], TAUS[0])
+    best, evidence, how, at = none, -np.inf, (SIGMAS[0], TAUS[0]), none
     for sigma in SIGMAS:
         for tau in TAUS:
-            at, likely = fit.mode(sigma, tau, none)
+            at, likely = fit.mode(sigma, tau, at)
             if likely > evidence:
                 best, evidence, how = at, likely, (sigma, tau)
     before = fit.loss(none[:n], none[n:])

@@ -28,9 +28,10 @@ __all__ = ["Fitted", "Reference", "fitted"]
 Floats = npt.NDArray[np.float64]
 
 SIGMAS = (0.03, 0.12)  # of log gains: units of one make, and other ones
-TAUS = (0.01, 0.03, 0.1, 0.3, 1.0)  # of offsets, of what readings of a channel span
+TAUS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # of offsets, of what readings of a channel span
 OWN = 0.02  # of a logarithm: what a number scatters by besides
 IDLE = 1.0  # times the floor of spreads: a channel below it says nothing of its gain
+CLIPPED, MOSTLY = 0.1, 0.4  # of the readings: more of them at an end of the range than before; that usually are there
 DEAD = -3.0  # of the logarithms of spread and noise, together: a channel that fell by so much reads nothing any more
 STEP, ROUNDS, ENOUGH = 1e-3, 30, 1e-3  # of derivatives; of the search, and what is no progress
 
@@ -107,7 +108,7 @@ class Fitted:
 class _Fit:
     """Touches as shares of the range, (T, n) each, beside what is known of their materials."""
 
-    def __init__(self, reference: Reference, touches: Sequence[Floats], materials: Sequence[str]) -> None:
+    def __init__(self, reference: Reference, touches: Sequence[Floats], materials: Sequence[str], ends: Floats) -> None:
         n = self.n = reference.channels
         self.touches, self.spans = touches, reference.spans
         self.means = np.array([reference.mean(name) for name in materials])
@@ -115,7 +116,9 @@ class _Fit:
         none = np.zeros(n)
         away = self.numbers(none, none) - self.means
         lively = away[:, n : 2 * n] + away[:, 2 * n : 3 * n]
-        self.lost = ~reference.idle & (np.median(lively, axis=0) < DEAD)
+        clipped = np.mean([((shares <= 0) | (shares >= 1)).mean(axis=0) for shares in touches], axis=0)
+        clipped = (clipped > ends + CLIPPED) & (ends < MOSTLY)
+        self.lost = ~reference.idle & (clipped | (np.median(lively, axis=0) < DEAD))
         self.known = ~reference.idle & ~self.lost
         chosen = np.flatnonzero(np.concatenate([np.tile(self.known, KINDS), [True]]))
         self.whitened = np.zeros((len(chosen), self.means.shape[1]))
@@ -196,12 +199,13 @@ class _Fit:
         return at, -least - float(volume) / 2
 
 
-def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[str]) -> Fitted:
+def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[str], ends: Floats) -> Fitted:
     """What became of each channel, by touches as shares of the range, (T, n) each, of these materials.
 
-    The materials were taken into the reference. `before` and `after` say whether it explains the touches better.
+    The materials were taken into the reference. ends: the share of earlier readings of each channel that lie at an end
+    of the range, (n,): one that is clipped more often now is lost, as what it reads is not known. `before` and `after` say whether it explains the touches better.
     """
-    n, fit = reference.channels, _Fit(reference, touches, materials)
+    n, fit = reference.channels, _Fit(reference, touches, materials, ends)
     none = np.zeros(2 * n)
     best, evidence, how, at = none, -np.inf, (SIGMAS[0], TAUS[0]), none
     for sigma in SIGMAS:

@@ -8,10 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.adapting import Fitted, Reference, fitted
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text
+from scroll_tactile.matching.likelihood import LEVELS
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE
 from scroll_tactile.persistence.ledger import Ledger
@@ -23,6 +25,8 @@ from scroll_tactile.signals.stream import Stream, validate
 from store import Store
 
 __all__ = ["adapt_to", "known_touches"]
+
+Floats = npt.NDArray[np.float64]
 
 FEWEST, FEWEST_MATERIALS = 3, 2  # touches, and materials among them: one may have changed itself
 LIKELIER = math.log(100)  # that the touches have to be, each by the correction of the others, than without any
@@ -74,17 +78,25 @@ def adapt_to(ledger: Ledger, touches: Mapping[Stream, str], sensor: Sensor, unti
         ledger.require_write_mode()
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
+        ends = _at_ends(memory, sensor.channels)
         reference = _reference(store, memory, sensor.channels, {touch.key for touch in touches}, until)
     _require_known(reference, sorted(set(touches.values())), store)
     low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
     shares = [(touch.readings - low) / (high - low) for touch in touches]
-    found = fitted(reference, shares, list(touches.values()))
+    found = fitted(reference, shares, list(touches.values()), ends)
     span = np.broadcast_to(high - low, (sensor.channels,))
     correction = Correction(
         found.gains.astype(np.float32), (found.offsets * span).astype(np.float32), found.lost.astype(np.bool_)
     )
     why = _refusal(found)
     return _result(correction, found, why, None if why else ledger.adapt(correction))
+
+
+def _at_ends(memory: Memory, channels: int) -> Floats:
+    """The share of kept readings of each channel that lie at an end of the range, (n,); 1 where none are kept."""
+    kept = [] if memory.kept is None else memory.kept.touches()
+    shares = [((touch.levels == 0) | (touch.levels == LEVELS - 1)).mean(axis=1) for touch in kept]
+    return np.asarray(np.mean(shares, axis=0) if shares else np.ones(channels), np.float64)
 
 
 def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:

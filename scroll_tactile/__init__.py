@@ -27,6 +27,7 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.pipelines.sources import SourceOptions
     from scroll_tactile.quantities import Quantity
     from scroll_tactile.results import (
+        Adaptation,
         Candidates,
         Compacted,
         Composition,
@@ -47,6 +48,7 @@ if typing.TYPE_CHECKING:
     from scroll_tactile.testing.learner_checks import check_learner
 
 __all__ = [
+    "Adaptation",
     "Annotated",
     "AnswerLog",
     "Augmented",
@@ -96,6 +98,7 @@ __version__ = "0.15.0"
 
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
+    "Adaptation": "results",
     "Annotated": "pipelines.annotating.annotation_run",
     "AnswerLog": "pipelines.annotating.answer_log",
     "Augmented": "signals.copies",

@@ -152,9 +152,11 @@ class TactileLearner(MemoryKeeper):
     def stream(self, readings: Readings) -> Stream:
         """What `observe` makes of readings before it learns them: sound, and of a camera's the frames in contact.
 
+        Of a memory that was adapted to a changed skin, read through that, and no second time wherever it is passed.
+
         Raises StreamError, and SensorMismatchError for another sensor's stream.
         """
-        return self._predictor.extractor.stream(readings)
+        return self._predictor.stream(readings)
 
     def observe(
         self,
@@ -186,7 +188,8 @@ class TactileLearner(MemoryKeeper):
         material, source = require_name(material), None if source is None else require_source(source)
         predictor = self._predictor  # one: `reembed` puts another in its place
         noted = Annotation.of(self.quantities, values, labels) if values or labels else NO_ANNOTATION
-        touch = predictor.extractor.verified().stream(stream)
+        predictor.extractor.verified()
+        touch = predictor.stream(stream)
         learned = predictor.extractor.learned(touch)
         receipt = predictor.ledger.observe(material, touch, *learned, source, noted, again=again)
         predictor.prepare()
@@ -200,8 +203,9 @@ class TactileLearner(MemoryKeeper):
 
         stream: as for `observe`. Raises StreamError; SensorMismatchError for another sensor's stream; StoreError.
         """
-        touch = self._predictor.extractor.stream(stream)
-        return self._ledger.names(touch.key)
+        touch = self._predictor.stream(stream)
+        before = [] if touch.raw is None else self._ledger.names(touch.raw.key)  # learned before it was adapted
+        return list(dict.fromkeys([*before, *self._ledger.names(touch.key)]))
 
     def reembed(
         self, embedding: Embedding | None = None, *, progress: Callable[[str, int, int], object] | None = None

@@ -10,6 +10,7 @@ from typing import Literal, Self
 from scroll_tactile.errors import InputError
 
 __all__ = [
+    "Adaptation",
     "Candidates",
     "ChangeKind",
     "Compacted",
@@ -95,6 +96,29 @@ class Observation:
     source: str | None = None
     values: Mapping[str, float] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """What `TactileLearner.adapt` found out about a changed skin.
+
+    kept: whether touches are read through it from now on; False where the touches that it was made of are not explained
+    better with it, and all stays as it was. why: in a sentence. sequence: its row in the memory's journal, to retract
+    it by; None where it was not kept. gains, offsets: of each channel, as the changed skin reads low + gain · (x − low)
+    + offset, in the sensor's unit, where the one that learned would have read x; 1 and 0 where nothing is known.
+    left_out: channels that read nothing any more: all of their values are missing from now on. before, after: how far
+    the touches lie from what was learned of their materials, each judged with the others' correction: the mean squared
+    deviation of a number that is known of a channel, about 1 for a skin that did not change.
+    """
+
+    kept: bool
+    why: str
+    sequence: int | None
+    gains: tuple[float, ...]
+    offsets: tuple[float, ...]
+    left_out: tuple[int, ...]
+    before: float
+    after: float
 
 
 @dataclass(frozen=True)

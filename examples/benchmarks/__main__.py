@@ -7,6 +7,7 @@ from importlib.util import find_spec
 
 import typer
 
+from examples.benchmarks.adapting import adapt
 from examples.benchmarks.appending import log
 from examples.benchmarks.buffers import buffers
 from examples.benchmarks.chips.comparison import chips
@@ -32,7 +33,7 @@ app = typer.Typer(
 )
 BENCHMARKS: tuple[Callable[..., None], ...] = (
     *(speed, many, live, decisions, ros2, vision),
-    *(buffers, interleaved, log, fleet, chips, health),
+    *(buffers, interleaved, log, fleet, chips, health, adapt),
 )
 for benchmark in BENCHMARKS:
     app.command()(benchmark)

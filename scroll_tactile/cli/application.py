@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from scroll_tactile import __version__, native
+from scroll_tactile.cli.adapting import adapt
 from scroll_tactile.cli.annotation import annotate
 from scroll_tactile.cli.bulk import evaluate, fleet, learn
 from scroll_tactile.cli.everyday import compose, describe, inspect, observe, predict
@@ -47,4 +48,5 @@ COMMANDS = (demo, observe, learn, fleet, predict, evaluate, annotate, live, insp
 for command in COMMANDS:
     app.command()(command)
 app.command(context_settings=PASSED_ON)(ros2)
+memory.command()(adapt)
 app.add_typer(memory, name="memory")

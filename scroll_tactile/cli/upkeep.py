@@ -225,11 +225,11 @@ def retract(
     folder: MemoryFolder,
     observation: Annotated[int, typer.Argument(help="Its number, as observe and export give it.", show_default=False)],
 ) -> None:
-    """Take one observation out again, exactly, as if it had never been made."""
+    """Take one observation out again, exactly, as if it had never been made; or what `memory adapt` found."""
     with opened_for_upkeep(folder) as learner:
         learner.retract(observation)
         left = sum(learner.materials.values())
-    say(f"observation {observation} was retracted; {left} are left")
+    say(f"row {observation} was retracted; {left} observations are left")
 
 
 @memory.command()

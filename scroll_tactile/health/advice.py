@@ -49,5 +49,6 @@ def advice(health: Health) -> str:
     look = _FEW if health.kind in ("gain", "offset", "dead", "noisier", "slower") else _ALL
     return (
         f"{look}; answers to touches since then may be wrong. Mended, --after {health.alarmed} asks about later "
-        "touches alone; if it cannot be mended, teach the materials again with the sensor as it is"
+        "touches alone; if it cannot be mended, about five touches of known materials take it over: `scroll-tactile "
+        f"memory adapt`, with --until {health.since - 1}"
     )

@@ -18,6 +18,7 @@ from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Window
 from scroll_tactile.prediction.predictor import Predictor, estimates_of, nothing_known
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.results import Estimate, Prediction
+from scroll_tactile.signals.correction import Correction, corrected_stream
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 
@@ -94,6 +95,7 @@ class GrowingTouch:
     the touches of the same thing before it; encoded: they, as its model reads them. estimator: None where no quantity
     was declared. widths: quantity → how narrow its interval is to be. estimates: by quantity, as of `stage`; settled:
     whether every interval was as narrow as it is to be, False where none is asked to be. rest: readings before it.
+    correction: through which they are read: that of the memory when the touch began.
     """
 
     predictor: Predictor
@@ -116,6 +118,7 @@ class GrowingTouch:
     stage: int | None = None
     settled: bool = False
     rest: Array | None = None
+    correction: Correction | None = None
 
     def predict_in_time(self) -> None:
         """Predict at the last moment that the touch has come to, if any is new, until both are what was asked for."""
@@ -133,8 +136,8 @@ class GrowingTouch:
             self.moments.clear()
 
     def stream(self, count: int) -> Stream:
-        """The stream of its first readings. Raises StreamError where they make none."""
-        return self.extractor.stream(self.rows.first(count))
+        """The stream of its first readings, corrected. Raises StreamError where they make none."""
+        return corrected_stream(self.extractor.stream(self.rows.first(count)), self.correction)
 
     def predict(self, stream: Stream) -> Prediction:
         """The prediction for the beginning of it, as `learner.predict` gives it."""

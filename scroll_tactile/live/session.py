@@ -27,6 +27,7 @@ from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.results import Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.contact import MOST_FRAMES, Rest
+from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings, validate
 
 __all__ = ["LiveSession"]
@@ -289,6 +290,7 @@ class LiveSession:
             estimator=self._predictor.estimator(),
             widths=self._widths,
             rest=None if self.sensor.camera else rest,
+            correction=self._predictor.ledger.correction,
         )
         self._under_way.predict_in_time()
 
@@ -339,7 +341,7 @@ class LiveSession:
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
         said = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
-        rest = None if touch.rest is None else validate(touch.rest, self.sensor)
+        rest = None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
         self._ended.append(LiveTouch(stream, prediction, *said, rest))
         self._settled = touch.settled
 

@@ -31,6 +31,7 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
+from scroll_tactile.signals.correction import Correction
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, together
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
@@ -38,10 +39,11 @@ from scroll_tactile.statistics.targets import TargetSums
 from store import Head, Record
 from store.records import LateArray
 
-__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "Memory"]
+__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "Memory"]
 
 LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
 ANNOTATED = "sample-annotations", "kept-annotations"  # attributes: of each of their touches, how it was annotated
+MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
 Chosen = tuple["TouchSample", "KeptTouches | None", "ExemplarSample | None"]
 
 
@@ -59,6 +61,7 @@ class Memory:
     - exemplars: the candidates for the buffer, and where their readings lie; None where the recipe has no buffer.
     - descriptions: material → what it is made of; the material need not have been observed.
     - quantities: those that touches can carry, by name.
+    - corrections: of readings of a changed skin, by their rows, the last of those that count; see `correction`.
     - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.
     - tuned_last_sequence: the last sequence that the tuned model was trained on.
 
@@ -89,12 +92,24 @@ class Memory:
         self.sequence = self.compacted = self.saved = self.retractions = 0
         self.descriptions: dict[str, Description] = {}
         self.quantities: dict[str, Quantity] = {}
+        self.corrections: dict[int, Correction] = {}
         self.stale = False
 
     def digest(self) -> str:
         """Hex of a SHA-256 over all sums, those of values and labels where there are any."""
         own = self.statistics.digest()
         return hashlib.sha256((own + self.targets.digest()).encode()).hexdigest() if self.targets else own
+
+    @property
+    def correction(self) -> Correction | None:
+        """Through which new touches are read; None where the skin is the one that learned."""
+        return next(reversed(self.corrections.values()), None)
+
+    def correct(self, sequence: int, correction: Correction) -> None:
+        """Read new touches through a correction, by its row; the oldest that nobody can come back to goes."""
+        self.corrections[sequence] = correction
+        for old in list(self.corrections)[:-MOST_CORRECTIONS]:
+            del self.corrections[old]
 
     @property
     def sample(self) -> TouchSample:
@@ -277,6 +292,9 @@ class Memory:
             "descriptions": dict(sorted(self.descriptions.items())),
         }
         arrays |= sampled
+        if self.corrections:
+            rows = self.corrections.items()
+            attributes["corrections"] = [[sequence, correction.to_text()] for sequence, correction in rows]
         if self.kept is not None:
             levels, attributes["kept"] = self.kept.to_arrays()
             arrays |= levels
@@ -340,6 +358,8 @@ class Memory:
         self.descriptions = dict(attributes.get("descriptions", {}))  # a merge brings them as rows
         for name, fields in attributes.get("quantities", {}).items():
             self.quantities[name] = Quantity(name=name, **fields)
+        for row, text in attributes.get("corrections", ()):
+            self.corrections[row] = Correction.from_text(text, self.recipe.sensor)
         self.take_tuned(arrays, attributes)
         return self
 

@@ -16,7 +16,9 @@ from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Ann
 from store import Head
 
 __all__ = [
+    "ADAPT",
     "CHANNELS",
+    "CORRECTION",
     "DECLARE",
     "DESCRIBE",
     "KINDS",
@@ -26,6 +28,7 @@ __all__ = [
     "MOST_BYTES",
     "OBSERVE",
     "RETRACT",
+    "RETRACTS",
     "SENSE",
     "SOURCE",
     "VALUES",
@@ -60,10 +63,12 @@ MEMBER = "member"  # a stream that such a memory had observed: its name and hash
 DESCRIBE = "describe"  # what a material is made of, in the attribute "constituents"; null removes the description
 DECLARE = "declare"  # a quantity that touches can carry: its unit, low, high and resolution; the label is its name
 SENSE = "sense"  # a touch of the material that is its label, or without one the sensor at rest: read, and not learned
+ADAPT = "adapt"  # touches from now on are read through a correction; or an earlier such row counts no more
 SOURCE = "source"  # an attribute of an observation: the file or place it comes from, where `observe` was given one
 VALUES, LABELS = "values", "labels"  # of an observation or a member: quantity → steps, and axis → label, if any
 CHANNELS = "channels"  # of an observation or a sense: numbers of the channels, see `health.channel_numbers`
-KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE, SENSE]
+CORRECTION, RETRACTS = "correction", "retracts"  # of an adapt: `Correction.to_text`, or the row that is taken back
+KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE, SENSE, ADAPT]
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = dict[Scale, npt.NDArray[np.int32]]

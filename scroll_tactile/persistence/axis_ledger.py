@@ -8,6 +8,7 @@ from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.signals.correction import Correction
 from store import Checkpoint
 
 __all__ = ["AxisLedger", "axis_name"]
@@ -33,6 +34,11 @@ class AxisLedger(Ledger):
         if self._seen != self._of.version:
             self._memory, self._seen = axis_memory(of, self._axis), self._of.version
         return self._memory
+
+    @property
+    def correction(self) -> Correction | None:
+        """As of the memory."""
+        return self._of.correction
 
     def derived(self, name: str) -> Checkpoint | None:
         """As of the memory, under the name that `axis_name` gives."""

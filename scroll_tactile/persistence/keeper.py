@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
@@ -17,15 +17,17 @@ from scroll_tactile.health.watch import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.persistence.adapting import adapt_to, known_touches
 from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.persistence.observations import health_of, observations
 from scroll_tactile.persistence.packing import pack_memory
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.results import Compacted, Health, Merged, Observation, Receipt
+from scroll_tactile.results import Adaptation, Compacted, Health, Merged, Observation, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name, require_source, require_text
+from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["MemoryKeeper"]
@@ -121,7 +123,7 @@ class MemoryKeeper(ABC):
         channels; StoreError.
         """
         name = "" if material is None else require_name(material)
-        self._ledger.sense(name, validate(stream, self.sensor))
+        self._ledger.sense(name, corrected_stream(validate(stream, self.sensor), self._ledger.correction))
 
     def health(
         self, *, bound: float = 0.01, after: int = 0, until: int | None = None, source: str | None = None
@@ -146,6 +148,34 @@ class MemoryKeeper(ABC):
             ledger.watched = health_of(store, memory, self.sensor.channels, rules, ledger.watched)
             return ledger.watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
 
+    def adapt(
+        self,
+        touches: Mapping[str, Stream | npt.ArrayLike] | Iterable[tuple[str, Stream | npt.ArrayLike]],
+        *,
+        until: int | None = None,
+    ) -> Adaptation:
+        """Take over a changed skin, from a few touches of known materials felt with it; nothing is learned of them.
+
+        touches: pairs of a material and readings as for `observe`, three or more, five are better, of two materials or
+        more; or a mapping from materials to readings. until: the last row of the journal that the skin before it felt,
+        such as the one before `Health.since`; None: all.
+
+        A gain and an offset of each channel are estimated from them, drawn to none (see `health.adapting`), and a
+        channel that reads nothing any more is left out. Where that explains touches better which it was not estimated
+        from, later ones are read through it: `observe`, `predict`, `estimate`, `compose`, `sense` and touches that
+        begin in live sessions. What was learned stays as it is, to the byte; `retract` takes the adaptation back.
+
+        A second one replaces the first: it is made from the readings as they came. It is of this unit: `merge` and
+        `pack` leave it behind, a compaction, a backup and `reembed` keep it. An `exported` judge knows nothing of it.
+
+        Raises StreamError, MaterialError; UnknownMaterialError for a material never observed; InputError for too few
+        touches or materials, for a camera, in a memory without a path, or one that does not know how touches of the
+        materials read by channel; StoreError.
+        """
+        require_arguments({}, {"until": until})
+        self._ledger.require_store("be adapted")
+        return adapt_to(self._ledger, known_touches(touches, self.sensor), self.sensor, until)
+
     @contextmanager
     def batch(self) -> Iterator[None]:
         """Make what is observed, retracted or forgotten in the block durable together, when it ends.
@@ -159,8 +189,11 @@ class MemoryKeeper(ABC):
         with self._ledger.batch():
             yield
 
-    def retract(self, receipt: Receipt | int) -> None:
+    def retract(self, receipt: Receipt | Adaptation | int) -> None:
         """Take one observation out again, by its receipt or its sequence; durable when this returns.
+
+        Or one adaptation to a changed skin: touches are read from then on as before it, through the last that is left.
+        What was learned meanwhile stays as it was read.
 
         Statistics, exemplars and readouts are then, to the bit, those of a memory that never had it; an f* that was
         made from it is gone. Its features stay in the journal, unused, until `compact`.

@@ -7,17 +7,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
+from scroll_tactile.errors import AnnotationError, FineTuneError, InputError, ObservationError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.memory.descriptions import Description, describe, require_units
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     CHANNELS,
+    CORRECTION,
     DECLARE,
     DESCRIBE,
     OBSERVE,
     RETRACT,
+    RETRACTS,
     SENSE,
     SOURCE,
     Added,
@@ -32,11 +35,18 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.merge import MergePlan, MergeRules
-from scroll_tactile.persistence.observations import compaction_point, observation_of, observations_from, observations_of
+from scroll_tactile.persistence.observations import (
+    adaptation_of,
+    compaction_point,
+    observation_of,
+    observations_from,
+    observations_of,
+)
 from scroll_tactile.persistence.open_memory import OpenMemory, give_back_scratch
-from scroll_tactile.persistence.replaying import apply_description, refill, replay, until
+from scroll_tactile.persistence.replaying import apply_correction, apply_description, refill, replay, until
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.results import Compacted, Merged, Receipt
+from scroll_tactile.results import Adaptation, Compacted, Merged, Receipt
+from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.validation.gate import MemoryStore
@@ -78,6 +88,8 @@ class Ledger(OpenMemory):
             # A memory opened to read skips this: its journal refuses the row below.
             if not again and (self.store is None or self.store.mode == "write"):
                 known = self._known(material, stream.key, annotation)
+                if known is None and stream.raw is not None:  # learned before the memory was adapted
+                    known = self._known(material, stream.raw.key, annotation)
                 if known is not None:
                     return self._receipt(known, material, stream, repeated=True)
             # Checked before the row is in the journal: the next opening must be able to add every row.
@@ -195,10 +207,48 @@ class Ledger(OpenMemory):
                 memory.sequence = store.append(SENSE, material, b"", attributes=attributes).sequence
             self._checkpoint_if_due()
 
-    def retract(self, receipt: Receipt | int) -> None:
+    @property
+    def correction(self) -> Correction | None:
+        """Through which new touches are read; None where the skin is the one that learned."""
+        with self.lock:
+            return self.memory.correction
+
+    def adapt(self, correction: Correction) -> int:
+        """Read touches through a correction from now on; durable when this returns, in a batch at its end.
+
+        Returns its row in the journal. The model stays: what was learned is what it was.
+        """
+        with self.lock:
+            store, memory = self.require_store("be adapted"), self.memory
+            with self._mutation(_nothing):
+                head = store.append(ADAPT, "", b"", attributes={CORRECTION: correction.to_text()})
+                apply_correction(memory, head)
+                memory.sequence = head.sequence
+            self._checkpoint_if_due()
+            return head.sequence
+
+    def _take_back(self, store: Store, adaptation: Head) -> None:
+        """Have an adaptation count no more; the one before it does again, if there is one."""
+        memory, sequence = self.memory, adaptation.sequence
+        if sequence not in memory.corrections:
+            raise ObservationError(
+                f"row {sequence} of {store.path} is no adaptation that counts: it was retracted already, or "
+                f"{MOST_CORRECTIONS} came after it"
+            )
+        with self._mutation(_nothing):
+            head = store.append(ADAPT, "", b"", attributes={RETRACTS: sequence})
+            apply_correction(memory, head)
+            memory.sequence = head.sequence
+        self._checkpoint_if_due()
+
+    def retract(self, receipt: Receipt | Adaptation | int) -> None:
         """As `TactileLearner.retract`."""
         with self.lock:
             store = self.require_store("retract anything")
+            if (adaptation := adaptation_of(store, receipt)) is not None:
+                self._take_back(store, adaptation)
+                return
+            assert not isinstance(receipt, Adaptation)
             self._retract(store, [observation_of(store, self.memory, receipt)], "")
 
     def forget(self, material: str | None, source: str | None) -> int:

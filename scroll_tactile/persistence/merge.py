@@ -190,7 +190,7 @@ class MergePlan:
         self, compaction: Checkpoint | None
     ) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
         if compaction is not None:
-            left_out = ("tuned", "descriptions")  # the tuned model stays there; descriptions come as rows of their own
+            left_out = ("tuned", "corrections", "descriptions")  # these stay there, and descriptions come as rows
             attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in compaction.arrays.items() if not name.startswith("tuned")}
             yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None

@@ -9,11 +9,13 @@ from scroll_tactile.health.channel_numbers import from_text
 from scroll_tactile.health.watch import Watch, WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     CHANNELS,
     DECLARE,
     MEMBER,
     OBSERVE,
     RETRACT,
+    RETRACTS,
     SENSE,
     SOURCE,
     active_rows,
@@ -21,10 +23,18 @@ from scroll_tactile.memory.touch_rows import (
     declared_by,
     retracted_by,
 )
-from scroll_tactile.results import Observation, Receipt
+from scroll_tactile.results import Adaptation, Observation, Receipt
 from store import Head, Record, Store
 
-__all__ = ["compaction_point", "health_of", "observation_of", "observations", "observations_from", "observations_of"]
+__all__ = [
+    "adaptation_of",
+    "compaction_point",
+    "health_of",
+    "observation_of",
+    "observations",
+    "observations_from",
+    "observations_of",
+]
 
 
 def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
@@ -51,6 +61,24 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
             f"({receipt.key.hex()[:12]}); in {store.path} it is of {record.label!r} ({record.key.hex()[:12]})"
         )
     return record
+
+
+def adaptation_of(store: Store, receipt: Receipt | Adaptation | int) -> Head | None:
+    """The row of an adaptation; None where the receipt is of anything else.
+
+    Raises ObservationError for an adaptation that was not kept, and for one of another memory.
+    """
+    sequence = receipt if isinstance(receipt, int) else receipt.sequence
+    if sequence is None:
+        raise ObservationError("this adaptation was not kept: there is nothing to retract")
+    if isinstance(sequence, bool) or not 1 <= sequence <= store.last or isinstance(receipt, Receipt):
+        return None
+    head = next(store.heads(sequence - 1), None)
+    if head is not None and head.sequence == sequence and head.kind == ADAPT and RETRACTS not in head.attributes:
+        return head
+    if isinstance(receipt, Adaptation):
+        raise ObservationError(f"row {sequence} of {store.path} is no adaptation: it is one of another memory")
+    return None
 
 
 def observations_of(store: Store, memory: Memory, material: str) -> list[int]:

@@ -170,9 +170,13 @@ class OpenMemory:
             return
         if self._batching:
             raise InputError("no checkpoint can be written in a batch: end it first")
-        if self.store.mode == "read":
-            raise ReadOnlyError(f'{self.store.path} was opened with mode="read": open it to write')
+        self.require_write_mode()
         self._pass_over_failures(self.store)
+
+    def require_write_mode(self) -> None:
+        """Raise ReadOnlyError, before any work is done, where the journal takes no row."""
+        if self.store is not None and self.store.mode == "read":
+            raise ReadOnlyError(f'{self.store.path} was opened with mode="read": open it to write')
 
     def _pass_over_failures(self, store: Store) -> None:
         try:

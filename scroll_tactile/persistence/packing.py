@@ -13,6 +13,7 @@ from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     CHANNELS,
     DECLARE,
     DESCRIBE,
@@ -43,6 +44,7 @@ def pack_memory(
     identity: dict[str, Any] = Identity.read(store).to_json()
     packed = copy(memory)
     packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
+    packed.corrections = {}  # they are of this unit; what was read through them is in the touches
     if not readings:
         identity |= {"exemplars": 0, "kept_touches": 0}
         packed.kept = packed.exemplars = None
@@ -100,7 +102,7 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     heads = [head for head in source.heads() if head.kind == OBSERVE]
     observed = found.arrays["observations"]
     counts = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
-    if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE, SENSE)):
+    if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE, SENSE, ADAPT)):
         return None
     if observed.ndim != 1 or counts != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)

@@ -20,6 +20,7 @@ from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     DECLARE,
     DESCRIBE,
     OBSERVE,
@@ -42,6 +43,7 @@ from store.lock import WriterLock
 __all__ = ["Reembedding"]
 
 ROWS_TOGETHER = 64  # rows that wait for the disk together
+WITHOUT_READINGS = RETRACT, DESCRIBE, DECLARE, SENSE, ADAPT
 CHECKPOINT_EVERY = 256  # rows between checkpoints of the new memory: a resumed run embeds no more than these again
 
 
@@ -143,7 +145,7 @@ class Reembedding:
 
 def _require_readings(store: Store) -> None:
     heads = list(store.heads())
-    brought = [head.sequence for head in heads if head.kind not in (OBSERVE, RETRACT, DESCRIBE, DECLARE, SENSE)]
+    brought = [head.sequence for head in heads if head.kind not in WITHOUT_READINGS and head.kind != OBSERVE]
     bare = [head.sequence for head in heads if head.kind == OBSERVE and "nbytes" not in head.attributes]
     if store.compacted:
         what = f"rows 1 to {store.compacted} were compacted, and their readings given up"

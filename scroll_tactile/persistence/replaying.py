@@ -12,12 +12,15 @@ from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description, describe
 from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
+    CORRECTION,
     DECLARE,
     DESCRIBE,
     MEMBER,
     MERGE,
     OBSERVE,
     RETRACT,
+    RETRACTS,
     SENSE,
     Added,
     Codes,
@@ -29,12 +32,14 @@ from scroll_tactile.memory.touch_rows import (
     unspanned,
 )
 from scroll_tactile.quantities import Quantity
+from scroll_tactile.signals.correction import Correction
 from scroll_tactile.statistics.annotations import Annotation, Annotations, together
 from scroll_tactile.validation.gate import misdeclared, wrong_values
 from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
     "apply_appended",
+    "apply_correction",
     "apply_declaration",
     "apply_description",
     "load",
@@ -114,8 +119,9 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         _join(memory, record, store)
         changed = None
     else:
-        assert record.kind in (MEMBER, DESCRIBE, DECLARE, SENSE), "the gate lets no other row through"
+        assert record.kind in (MEMBER, DESCRIBE, DECLARE, SENSE, ADAPT), "the gate lets no other row through"
     apply_description(memory.descriptions, record)
+    apply_correction(memory, record)
     memory.sequence = record.sequence
     return changed
 
@@ -149,6 +155,14 @@ def apply_description(descriptions: dict[str, Description], row: Head | Record) 
     """Apply a journal row to descriptions; a forgotten material loses its description."""
     if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
         describe(descriptions, row.label, row.attributes.get("constituents"))
+
+
+def apply_correction(memory: Memory, row: Head | Record) -> None:
+    """Apply a journal row to the corrections of a changed skin."""
+    if row.kind == ADAPT and RETRACTS in row.attributes:
+        memory.corrections.pop(cast(int, row.attributes[RETRACTS]), None)
+    elif row.kind == ADAPT:
+        memory.correct(row.sequence, Correction.from_text(row.attributes[CORRECTION], memory.recipe.sensor))
 
 
 def apply_declaration(quantities: dict[str, Quantity], row: Head, store: Store) -> None:
@@ -186,6 +200,7 @@ def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
     for head in store.heads(memory.compacted):  # whoever compacts has read all
         if head.sequence <= last_sequence:
             apply_description(made.descriptions, head)
+            apply_correction(made, head)
             apply_declaration(made.quantities, head, store)
         elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             replay(later, store.record(head.sequence), store)

@@ -37,6 +37,7 @@ from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.results import Composition, Constituent, Estimate, Prediction
 from scroll_tactile.settings import candidates_of
+from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
@@ -129,6 +130,13 @@ class Predictor:
         for predictor in (self, *self._axes.values()):
             predictor.replaced = True
 
+    def stream(self, readings: Readings) -> Stream:
+        """The validated stream of some readings, read through the correction of the memory, if its skin changed.
+
+        Raises as `FeatureExtractor.stream`.
+        """
+        return corrected_stream(self.extractor.stream(readings), self.ledger.correction)
+
     def predict(
         self,
         streams: Sequence[Readings],
@@ -138,7 +146,7 @@ class Predictor:
         """As `TactileLearner.predict`. reader_of: gives the reader of the tuned model, if that is to answer."""
         if not streams:
             raise InputError("expected a stream to predict, or several of one thing; came none")
-        touches = [self.extractor.stream(stream) for stream in streams]
+        touches = [self.stream(stream) for stream in streams]
 
         def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Prediction]:
             reader = None if reader_of is None else reader_of(self)
@@ -158,7 +166,7 @@ class Predictor:
 
     def compose(self, readings: Readings, constituents: Sequence[str] | None, unfamiliar: float) -> Composition:
         """As `TactileLearner.compose`."""
-        touch = self.extractor.stream(readings)
+        touch = self.stream(readings)
 
         def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Composition]:
             wanted = require_constituents(self.ledger.memory.descriptions, constituents)
@@ -192,7 +200,7 @@ class Predictor:
 
         scene, axis: of the prediction; the estimates rest on what the touch is among all materials.
         """
-        touch = self.extractor.stream(readings)
+        touch = self.stream(readings)
 
         def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], tuple[Prediction, dict[str, Estimate]]]:
             estimator = self.current.estimator(self.ledger)

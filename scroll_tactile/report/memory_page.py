@@ -89,9 +89,11 @@ def memory_page(
 
 def _under(learner: TactileLearner) -> str:
     sensor, embedding = learner.sensor, learner.embedding
+    row = max(learner.memory.corrections, default=None)
+    through = "" if row is None else f" Its skin changed: touches are read through the adaptation in row {row}."
     return (
         f"A tactile memory of sensor <b>{shown(sensor.name)}</b>, {sensor.channels} channels at {sensor.rate:g} Hz; "
-        f"embedding {shown(embedding.name)}, {embedding.dimension} features."
+        f"embedding {shown(embedding.name)}, {embedding.dimension} features.{through}"
     )
 
 

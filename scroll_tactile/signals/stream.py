@@ -42,6 +42,8 @@ class Stream:
     clipped: how many values lay outside the sensor's range before they were clipped to it.
     mask: which values were missing (NaN or infinite), bool of the readings' shape, read-only; None where none were.
         `readings` has in their place the line between their neighbours in time.
+    raw: the stream as the sensor gave it, where a memory that was adapted to a changed skin has corrected it since
+        (`TactileLearner.adapt`): it is not corrected again. None where nobody has.
 
     Two streams are equal where their sensors and their readings are.
     """
@@ -50,6 +52,7 @@ class Stream:
     readings: npt.NDArray[np.float32]
     clipped: int = 0
     mask: npt.NDArray[np.bool_] | None = None
+    raw: "Stream | None" = None
 
     @property
     def missing(self) -> int:
@@ -90,15 +93,15 @@ class Stream:
         _require_length(count, self.sensor)
         if count >= len(self):
             return self
-        part = self.readings[:count]
+        part, raw = self.readings[:count], None if self.raw is None else self.raw.first(seconds)
         if self.mask is None or not self.mask[:count].any():
-            return Stream(self.sensor, part, min(self.clipped, part.size))
+            return Stream(self.sensor, part, min(self.clipped, part.size), raw=raw)
         mask = self.mask[:count]
         _require_any(mask, self.sensor)
         part = part.copy()
         interpolate(part, mask, self.sensor)
         part.setflags(write=False)
-        return Stream(self.sensor, part, min(self.clipped, int(np.count_nonzero(~mask))), mask)
+        return Stream(self.sensor, part, min(self.clipped, int(np.count_nonzero(~mask))), mask, raw)
 
     def __len__(self) -> int:
         return len(self.readings)

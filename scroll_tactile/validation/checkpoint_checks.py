@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.memory.state import MOST_CORRECTIONS
 from scroll_tactile.memory.touch_rows import Arrays
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
@@ -20,6 +21,7 @@ from scroll_tactile.statistics.tables import rows_of
 from scroll_tactile.validation.expected import (
     LONGEST_TOUCH,
     array,
+    check_correction,
     check_description,
     check_readings,
     check_values,
@@ -89,6 +91,17 @@ class CheckpointChecks:
             whole("tuned_last_sequence", attributes.get("tuned_last_sequence"), 0, last_sequence or 2**63 - 1)
         if "tuned" in attributes:
             self._check_tuned(arrays, attributes["tuned"])
+        if "corrections" in attributes:
+            self._check_corrections(attributes["corrections"], last_sequence)
+
+    def _check_corrections(self, pairs: Any, last_sequence: int | None) -> None:
+        few = isinstance(pairs, list) and 0 < len(pairs) <= MOST_CORRECTIONS
+        expect(few, "corrections", f"1 to {MOST_CORRECTIONS} by their rows", pairs)
+        before = 0
+        for pair in pairs:
+            expect(isinstance(pair, list) and len(pair) == 2, "corrections", "a row and a correction", pair)
+            before = whole("corrections", pair[0], before + 1, last_sequence or 2**63 - 1)
+            check_correction("corrections", pair[1], self._sensor)
 
     def _check_axis(
         self, whole_: Arrays, totals: Mapping[Scale, IntArray], arrays: Arrays, labels: list[str], *, thorough: bool

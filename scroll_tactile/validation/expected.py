@@ -15,8 +15,10 @@ from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.health.channel_numbers import from_text
 from scroll_tactile.memory.descriptions import checked
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     CHANNELS,
     CODES,
+    CORRECTION,
     DECLARE,
     DESCRIBE,
     KINDS,
@@ -30,6 +32,7 @@ from scroll_tactile.memory.touch_rows import (
     PACKED_WHOLE,
     PACKED_ZERO,
     RETRACT,
+    RETRACTS,
     SENSE,
     SOURCE,
     VALUES,
@@ -41,6 +44,7 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.quantities import MOST_QUANTITIES, MOST_STEPS, Quantity
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name, require_source
+from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import MOST_WINDOWS, WindowPlan
 from scroll_tactile.statistics.annotations import MOST_AXES
@@ -55,6 +59,7 @@ __all__ = [
     "Unexpected",
     "array",
     "check_annotation",
+    "check_correction",
     "check_description",
     "check_quantity",
     "check_readings",
@@ -206,12 +211,23 @@ class RowChecks:
                 name("label", head.label)
             whole("columns", head.attributes.get("columns"), 1, LONGEST_TOUCH)
             expect(CHANNELS in head.attributes, CHANNELS, "numbers of the channels", None)
+        elif head.kind == ADAPT:
+            self._check_adaptation(head)
         elif head.kind == DECLARE:
             check_quantity("quantity", head.label, head.attributes)
         elif head.kind == DESCRIBE:
             name("label", head.label)
             expect("constituents" in head.attributes, "constituents", "a description", None)
             check_description("constituents", head.label, head.attributes["constituents"])
+
+    def _check_adaptation(self, head: Head) -> None:
+        told = set(head.attributes)
+        expect(not head.label and not head.key, "label", "none of an adaptation", head.label)
+        expect(told in ({CORRECTION}, {RETRACTS}), "attributes", f"{CORRECTION} or {RETRACTS}", sorted(told))
+        if RETRACTS in told:
+            whole(RETRACTS, head.attributes[RETRACTS], 1, head.sequence - 1)
+        else:
+            check_correction(CORRECTION, head.attributes[CORRECTION], self._sensor)
 
     def _check_observation(self, attributes: Mapping[str, Any]) -> None:
         columns = whole("columns", attributes.get("columns"), 1, LONGEST_TOUCH)
@@ -293,6 +309,14 @@ def check_description(field: str, material: str, constituents: Any) -> None:
         for name, value in constituents.items()
     )
     expect(same, field, "shares as floats", constituents)
+
+
+def check_correction(field: str, text: Any, sensor: Sensor) -> None:
+    """Raise Unexpected for what is no correction of readings of this sensor."""
+    try:
+        Correction.from_text(text, sensor)
+    except InputError as error:
+        raise Unexpected(f"{field}: {error}") from None
 
 
 def check_annotation(field: str, attributes: Mapping[str, Any]) -> None:

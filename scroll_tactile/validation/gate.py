@@ -24,11 +24,13 @@ from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     DECLARE,
     MEMBER,
     MERGE,
     OBSERVE,
     RETRACT,
+    RETRACTS,
     annotation_of,
     declared_by,
     unspanned,
@@ -306,15 +308,16 @@ def _in_rows(store: MemoryStore) -> tuple[list[Head], dict[int, str]]:
 
 
 def wrong_retractions(path: Path, heads: Sequence[Head]) -> Iterator[DamageError]:
-    """What is wrong with the rows, in order, that retract what is no observation, or was retracted before."""
-    kinds = {head.sequence: head.kind for head in heads}
+    """What is wrong with the rows, in order, that take back what is not there to be taken, or was taken back before."""
+    kinds = {head.sequence: RETRACT if RETRACTS in head.attributes else head.kind for head in heads}
     for head in heads:
-        if head.kind != RETRACT:
-            continue
-        gone = unspanned(head.attributes["sequences"])
-        if others := [sequence for sequence in gone if kinds.get(sequence, OBSERVE) != OBSERVE]:
+        kind, gone = OBSERVE, unspanned(head.attributes["sequences"]) if head.kind == RETRACT else []
+        if head.kind == ADAPT and RETRACTS in head.attributes:
+            kind, gone = ADAPT, [cast(int, head.attributes[RETRACTS])]
+        if others := [sequence for sequence in gone if kinds.get(sequence, kind) != kind]:
+            what = "observations" if kind == OBSERVE else "adaptation"
             yield DamageError(
-                f"row {head.sequence} of {path} retracts {others[:5]}, which are no observations, or retracted before",
+                f"row {head.sequence} of {path} retracts {others[:5]}, which are no {what}, or retracted before",
                 path=path,
                 sequence=head.sequence,
             )

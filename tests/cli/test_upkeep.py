@@ -134,7 +134,7 @@ class TestRetracting:
         assert sizes[2] < sizes[1]
 
     def test_retract_and_forget(self, path):
-        assert "observation 2 was retracted; 11 are left" in words(run("memory", "retract", path, 2))
+        assert "row 2 was retracted; 11 observations are left" in words(run("memory", "retract", path, 2))
         assert "b/ü: 3 observations were retracted; 2 materials are left" in words(run("memory", "forget", path, "b/ü"))
         assert "was retracted already" in refused("memory", "retract", path, 2)
         assert "'b/ü' was never observed" in refused("memory", "forget", path, "b/ü")

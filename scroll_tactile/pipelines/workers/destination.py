@@ -27,6 +27,15 @@ SAVED_EVERY = 4096  # touches: what opening replays where a run was cut short; a
 Progress = Callable[[str, int, int], object]
 
 
+def _require_own_skin(learner: TactileLearner) -> None:
+    """Raise InputError for a memory that reads through an adaptation: workers learn apart from it."""
+    if learner.memory.corrections:
+        raise InputError(
+            f"{learner.path} was adapted to a changed skin by row {max(learner.memory.corrections)}, of which the "
+            "workers of a fleet know nothing: learn with scroll-tactile learn, or retract that row first"
+        )
+
+
 @dataclass
 class FleetReport:
     """What a run did.
@@ -75,6 +84,7 @@ class Destination:
         if place.exists():
             self.learner = stack.enter_context(TactileLearner.open(place, **requested.arguments))
             hush(self.learner)
+            _require_own_skin(self.learner)
         there = {} if self.learner is None else self.learner.quantities
         for quantity in options.declared:
             require_declarable(there, quantity)

@@ -1,0 +1,142 @@
+"""Taking over a changed skin: what is known of its touches, read from the journal, and the row that corrects them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.errors import InputError, UnknownMaterialError
+from scroll_tactile.health.adapting import Fitted, Reference, fitted
+from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text
+from scroll_tactile.matching.likelihood import LEVELS
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE
+from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.results import Adaptation
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.settings import require_name
+from scroll_tactile.signals.correction import Correction
+from scroll_tactile.signals.stream import Stream, validate
+from store import Store
+
+__all__ = ["adapt_to", "known_touches"]
+
+Floats = npt.NDArray[np.float64]
+
+FEWEST, FEWEST_MATERIALS = 3, 2  # touches, and materials among them: one may have changed itself
+LIKELIER = math.log(100)  # that the touches have to be, each by the correction of the others, than without any
+FEWEST_SPREAD = 8  # touches of materials that were touched before, by which it is known how touches differ
+
+
+def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor: Sensor) -> dict[Stream, str]:
+    """Touches as the sensor gave them, each once, with their materials.
+
+    Raises InputError for what is no pairs of a material and readings, or of too few touches or materials; StreamError,
+    SensorMismatchError, MaterialError.
+    """
+    if sensor.camera or sensor.channels > MOST_CHANNELS:
+        raise InputError(
+            f"a memory is adapted channel by channel, and sensor {sensor.name!r} has "
+            + ("pixels" if sensor.camera else f"{sensor.channels}; at most {MOST_CHANNELS} can be told apart")
+        )
+    found: dict[Stream, str] = {}
+    for material, readings in _pairs(touches):
+        stream = validate(readings, sensor)
+        stream = stream if stream.raw is None else stream.raw
+        if len(stream) < 3:
+            raise InputError(f"expected touches of three readings or more; came {len(stream)} of {material!r}")
+        if found.setdefault(stream, require_name(material)) != material:
+            raise InputError(f"one touch came as {found[stream]!r} and as {material!r}")
+    if len(found) < FEWEST or len(set(found.values())) < FEWEST_MATERIALS:
+        raise InputError(
+            f"expected {FEWEST} different touches or more, five are better, of {FEWEST_MATERIALS} materials or more, "
+            f"so that a changed skin is told from a changed material; came {dict(Counter(found.values()))}"
+        )
+    return found
+
+
+def _pairs(touches: Any) -> list[tuple[str, Any]]:
+    try:
+        pairs = list(touches.items() if isinstance(touches, Mapping) else touches)
+        return [(material, readings) for material, readings in pairs]
+    except (TypeError, ValueError):
+        raise InputError(
+            "expected touches as pairs of a material and its readings, or a mapping from materials to readings; came "
+            f"{type(touches).__name__} {touches!r:.60}"
+        ) from None
+
+
+def adapt_to(ledger: Ledger, touches: Mapping[Stream, str], sensor: Sensor, until: int | None) -> Adaptation:
+    """As `TactileLearner.adapt`, for touches that `known_touches` gave."""
+    with ledger.lock:
+        store, memory = ledger.require_store("be adapted"), ledger.memory
+        ledger.require_write_mode()
+        if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
+            raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
+        ends = _at_ends(memory, sensor.channels)
+        reference = _reference(store, memory, sensor.channels, {touch.key for touch in touches}, until)
+    _require_known(reference, sorted(set(touches.values())), store)
+    low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
+    shares = [(touch.readings - low) / (high - low) for touch in touches]
+    found = fitted(reference, shares, list(touches.values()), ends)
+    span = np.broadcast_to(high - low, (sensor.channels,))
+    correction = Correction(
+        found.gains.astype(np.float32), (found.offsets * span).astype(np.float32), found.lost.astype(np.bool_)
+    )
+    why = _refusal(found)
+    return _result(correction, found, why, None if why else ledger.adapt(correction))
+
+
+def _at_ends(memory: Memory, channels: int) -> Floats:
+    """The share of kept readings of each channel that lie at an end of the range, (n,); 1 where none are kept."""
+    kept = [] if memory.kept is None else memory.kept.touches()
+    shares = [((touch.levels == 0) | (touch.levels == LEVELS - 1)).mean(axis=1) for touch in kept]
+    return np.asarray(np.mean(shares, axis=0) if shares else np.ones(channels), np.float64)
+
+
+def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:
+    """What the rows up to one say of touches, without those by which the memory is to be adapted."""
+    last = memory.sequence if until is None else min(until, memory.sequence)
+    reference = Reference(channels)
+    for head in store.heads():
+        if head.sequence > last:
+            break
+        if head.kind == OBSERVE and not memory.is_gone(head.sequence) and head.key not in own:
+            numbers = from_text(head.attributes.get(CHANNELS), channels)
+            if numbers is not None:
+                reference.take(head.label, numbers)
+    return reference
+
+
+def _require_known(reference: Reference, materials: Sequence[str], store: Store) -> None:
+    """Raise InputError where the rows do not say how touches of these materials read, and how touches differ."""
+    if missing := [name for name in materials if not reference.counts.get(name)]:
+        raise InputError(
+            f"the journal of {store.path} has no numbers of the channels of earlier touches of {missing[:5]}: they are "
+            "those by which it is to be adapted, lie behind `until`, came in with a compacted memory, or were observed "
+            "by a version before 0.14. Take touches of other materials"
+        )
+    if reference.total - len(reference.counts) < FEWEST_SPREAD:
+        raise InputError(
+            f"the journal of {store.path} has {reference.total} touches of {len(reference.counts)} materials, too few "
+            "to know how touches of one material differ: observe more before the skin is changed"
+        )
+
+
+def _refusal(found: Fitted) -> str:
+    """Why a correction is not kept; "" where it is."""
+    if found.gained < LIKELIER:
+        return "the touches are explained no better with any correction: the skin reads as it did, or changed otherwise"
+    return ""
+
+
+def _result(correction: Correction, found: Fitted, why: str, sequence: int | None) -> Adaptation:
+    lost = np.flatnonzero(correction.lost).tolist()
+    told = why or "later touches are read through it" + (f"; channels {lost} are left out" if lost else "")
+    gains, offsets = tuple(correction.gains.tolist()), tuple(correction.offsets.tolist())
+    return Adaptation(not why, told, sequence, gains, offsets, tuple(lost), found.before, found.after)

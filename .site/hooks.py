@@ -154,7 +154,9 @@ def _notebook(path: Path) -> dict[str, str | bytes]:
     parts, pictures = [], {}
     for i, cell in enumerate(json.loads(path.read_text(encoding="utf-8"))["cells"]):
         text = "".join(cell["source"])
-        parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else linked(text, "examples/x", "tour.md"))
+        parts.append(
+            f"```python\n{text}\n```" if cell["cell_type"] == "code" else linked(text, "examples/x", "tour.md")
+        )
         for output in cell.get("outputs", ()):
             data = output.get("data", {})
             if "image/png" in data:
@@ -190,8 +192,12 @@ def _overview() -> str:
 def _api_part(api: str, place: str) -> str:
     """The part of API.md that a page of the reference shows in another form; all of it for the first."""
     title = Path(place).stem.replace("-", ".")
-    return api if title == "index" else f"# {title}\n\n" + (re.search(
-        rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", api, re.MULTILINE | re.DOTALL) or [""])[1]
+    return (
+        api
+        if title == "index"
+        else f"# {title}\n\n"
+        + (re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", api, re.MULTILINE | re.DOTALL) or [""])[1]
+    )
 
 
 def _decisions() -> str:

@@ -81,7 +81,9 @@ class Page:
             printed = f"{self.code}\n" if line == "echo $?" else self._command(line)
             may_fail = i + 1 < len(commands) and commands[i + 1].startswith("echo $?")
             assert may_fail or line == "echo $?" or not self.code, f"{line}\n{printed}"
-            assert not expected.strip() or _is_as_shown(printed, expected), f"$ {line}\n{printed}\nexpected:\n{expected}"
+            assert not expected.strip() or _is_as_shown(printed, expected), (
+                f"$ {line}\n{printed}\nexpected:\n{expected}"
+            )
 
     def _command(self, line: str) -> str:
         if PLAIN.match(line):

@@ -1,31 +1,63 @@
 """The site's own pages run, and the notebook gives what it shows."""
 
-import importlib.util
-import re
+import json
+import subprocess
 import sys
 from pathlib import Path
 
-import tour
 import pytest
-from pages import BLOCK, ENVIRONMENT, Page
+import tour
+from pages import ENVIRONMENT, Page
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / ".site/docs"
-NAMES = sorted(str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md"))
-RUNNING = [name for name in NAMES if name == "tutorial.md" or name.startswith("howto/")]
+RUNNING = ["tutorial.md", *sorted(f"howto/{path.name}" for path in (DOCS / "howto").glob("*.md"))]
 
 
 @pytest.mark.parametrize("name", RUNNING)
-def test_pages_do_what_they_show(name, tmp_path, monkeypatch):
+def test_a_page_does_what_it_shows(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for variable, value in ENVIRONMENT.items():
         monkeypatch.setenv(variable, value)
     page = Page(DOCS / name)
     page.run()
-    assert page.ran + len(page.left) > 0
+    assert page.ran or page.left
+
+
+@pytest.mark.parametrize(
+    ("block", "message"),
+    [
+        ("```python\nprint(1)\n```", "nobody runs this block"),
+        ("```pycon\n>>> 1 + 1\n3\n```", "Expected:"),
+        ("```console\n$ scroll-tactile --version\nno number\n```", "expected:"),
+        ("```console\n$ scroll-tactile predict nothing nothing.npy\n```", "Error: "),
+    ],
+)
+def test_a_page_that_shows_what_is_not_so_fails(block, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(f"# Page\n\n{block}\n")
+    with pytest.raises(AssertionError, match=message):
+        Page(page).run()
 
 
 @pytest.mark.parametrize("name", RUNNING)
-def test_pages_begin_with_what_one_will_have(name):
-    opening = (DOCS / name).read_text(encoding="utf-8").split("\n\n")[1]
-    assert opening.startswith("At its end "), opening
+def test_a_page_begins_with_what_one_will_have(name):
+    assert (DOCS / name).read_text(encoding="utf-8").split("\n\n")[1].startswith("At its end you will ")
+
+
+def test_the_navigation_has_every_page():
+    navigation = (ROOT / ".site/mkdocs.yml").read_text(encoding="utf-8")
+    assert all(f"- {name}\n" in navigation for name in RUNNING)
+
+
+def test_the_notebook_gives_what_it_shows_and_readme_its_picture():
+    import nbformat
+
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "tests/tour.py"), "--check"], capture_output=True, text=True, check=False
+    )
+    assert not done.returncode, done.stderr
+    assert tour.NOTEBOOK.stat().st_size < 300_000
+    assert tour.picture(nbformat.read(tour.NOTEBOOK, as_version=4)) == tour.PICTURE.read_bytes()
+    assert json.loads(tour.NOTEBOOK.read_text(encoding="utf-8"))["metadata"]["kernelspec"]["name"] == "python3"

@@ -1,4 +1,7 @@
-"""Runs examples/tour.ipynb anew and keeps its outputs, and README's picture: `python tests/tour.py`."""
+"""Runs examples/tour.ipynb anew and keeps its outputs, and README's picture: `python tests/tour.py`.
+
+`--check` writes nothing, and fails where a cell prints anything else than the notebook shows.
+"""
 
 import base64
 import os
@@ -45,11 +48,21 @@ def picture(notebook: Any) -> bytes:
     return base64.b64decode(png)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run, and keep or compare."""
     import nbformat
 
-    done = run()
+    shown, done = nbformat.read(NOTEBOOK, as_version=4), run()
+    if "--check" in sys.argv:
+        for cell, before, now in zip(done.cells, texts(shown), texts(done), strict=True):
+            if before != now:
+                raise SystemExit(f"{cell.source}\nshows\n{before}\nand gives\n{now}\nrun python tests/tour.py")
+        return
     nbformat.write(done, NOTEBOOK)
     PICTURE.parent.mkdir(exist_ok=True)
     PICTURE.write_bytes(picture(done))
-    print(*(path.relative_to(ROOT) for path in (NOTEBOOK, PICTURE)), file=sys.stdout)
+    print(*(path.relative_to(ROOT) for path in (NOTEBOOK, PICTURE)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,12 +1,8 @@
-"""The site's own pages run, and the notebook gives what it shows."""
+"""The site's own pages run, and show what is so."""
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-import tour
 from pages import ENVIRONMENT, Page
 
 ROOT = Path(__file__).parents[1]
@@ -49,15 +45,3 @@ def test_a_page_begins_with_what_one_will_have(name):
 def test_the_navigation_has_every_page():
     navigation = (ROOT / ".site/mkdocs.yml").read_text(encoding="utf-8")
     assert all(f"- {name}\n" in navigation for name in RUNNING)
-
-
-def test_the_notebook_gives_what_it_shows_and_readme_its_picture():
-    import nbformat
-
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "tests/tour.py"), "--check"], capture_output=True, text=True, check=False
-    )
-    assert not done.returncode, done.stderr
-    assert tour.NOTEBOOK.stat().st_size < 300_000
-    assert tour.picture(nbformat.read(tour.NOTEBOOK, as_version=4)) == tour.PICTURE.read_bytes()
-    assert json.loads(tour.NOTEBOOK.read_text(encoding="utf-8"))["metadata"]["kernelspec"]["name"] == "python3"

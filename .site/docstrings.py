@@ -7,7 +7,8 @@ from typing import Any
 
 from griffe import Extension, Object
 
-NAMED = re.compile(r"^(\w+(?:, \w+)*): ")  # "count: how many", at the beginning of a line
+NAMES = r"[a-z_]\w*(?:, \w+)*: "  # "count: how many", or "low, high: the range", where a sentence begins
+BEGINS = re.compile(rf"(?:^|(?<=\. ))(?={NAMES})")
 
 
 class Prose(Extension):
@@ -20,10 +21,10 @@ class Prose(Extension):
 
 
 def _paragraph(text: str) -> str:
-    """A session in a fence, names at the beginning of lines as a list, anything else as it is."""
+    """A session in a fence, what begins with a name as a list, anything else as it is."""
     if text.startswith(">>> "):
         return f"```pycon\n{text}\n```"
-    if not NAMED.match(text) or text.startswith("    "):
+    if not re.match(NAMES, text):
         return text
-    items = [f"- {line}" if NAMED.match(line) else line for line in text.splitlines()]
-    return "\n".join(NAMED.sub(r"**\1**: ", item[2:]).join(["- ", ""]) if item[:2] == "- " else item for item in items)
+    items = BEGINS.split(" ".join(text.split()))
+    return "\n".join(re.sub(rf"^({NAMES[:-2]}):", r"- **\1**:", item.strip()) for item in items if item)

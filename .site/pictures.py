@@ -19,6 +19,15 @@ def _result(name: str) -> Any:
     return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
 
 
+def _trained() -> list[dict[str, Any]]:
+    """The networks of Table I after each of their first twenty epochs, as `draw_efficiency` takes curves."""
+    return [
+        {"dataset": dataset, "by": "epochs", "system": row["system"], "points": found["points"][:20]}
+        for row in _result("table1-networks")["rows"]
+        for dataset, found in row["sets"].items()
+    ]
+
+
 def draw(folder: Path) -> None:
     """Draw all of them into a folder."""
     for dataset in ("BioTac-20", "RoboSkin-20"):
@@ -34,5 +43,5 @@ def draw(folder: Path) -> None:
         title = f"{dataset}, {found['embedding']['name']}, {found['schedule']}"
         lines = PUBLISHED.get(dataset, {})
         draw_continual(folder / f"continual-{name}.png", found["means"], title=title, lines=lines)
-    draw_efficiency(folder / "efficiency.png", _result("efficiency")["curves"])
+    draw_efficiency(folder / "efficiency.png", [*_result("efficiency")["curves"], *_trained()])
     draw_transfer(folder / "transfer-tasks.png", _result("transfer-tasks")["rows"])

@@ -1,6 +1,7 @@
 """What several tests of the studies share."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -42,23 +43,30 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-@pytest.fixture
-def gelsight(tmp_path: Path) -> Path:
+@pytest.fixture(scope="session")
+def striped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder laid out as PhysiCLeAR: three objects of stripes, three videos of four frames each, and attributes."""
     image = pytest.importorskip("PIL.Image")
+    home = tmp_path_factory.mktemp("striped")
     rng = np.random.default_rng(0)
     for i, name in enumerate(("apple", "pen", "rug")):
-        (tmp_path / "physiclear" / name).mkdir(parents=True)
+        (home / "physiclear" / name).mkdir(parents=True)
         for video in (0, 3, 5):
             for frame in range(4):
                 pixels = rng.normal(100, 2, (240, 320, 3))
                 pixels[:, np.arange(320) // (4 << i) % 2 == 0] += 60
-                path = tmp_path / "physiclear" / name / f"{name}_{video}_{frame}.jpg"
+                path = home / "physiclear" / name / f"{name}_{video}_{frame}.jpg"
                 image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(path)
     grades = {"apple": 2, "rug": 0, "pen": 1, "skin": 1}
     kinds = {"hardness": grades, "roughness": grades, "texture": grades | {"pen": 2}, "materials": {"apple": "food"}}
-    (tmp_path / "physiclear" / "attributes.json").write_text(json.dumps(kinds))
-    return tmp_path
+    (home / "physiclear" / "attributes.json").write_text(json.dumps(kinds))
+    return home
+
+
+@pytest.fixture
+def gelsight(striped: Path, tmp_path: Path) -> Path:
+    """A copy of `striped`, which the test may change."""
+    return shutil.copytree(striped, tmp_path, dirs_exist_ok=True)
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from paper_touches import PAD, PATCH, pressed, recorded, slid
 
 from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.options import SETS
-from examples.paper.studies import fleet_study
+from examples.paper.studies import activation, fleet_study
 from examples.paper.studies.metrics import ContinualMetrics
 from examples.paper.studies.peers import ACIL, RanPAC
 from examples.paper.studies.unlearning import Unlearning
@@ -24,13 +24,18 @@ from scroll_tactile.embeddings.resnet import ResNet
 
 @pytest.fixture(scope="module", autouse=True)
 def small() -> Iterator[None]:
-    """Fewer features and epochs where a study takes the usual ones: most of its time goes into systems of these."""
+    """Fewer features and epochs where a study takes the usual ones, and no kept touches: nine tenths of a fit.
+
+    What kept touches do for an answer is a matter of tests/prediction and tests/matching.
+    """
     fewer = {1008: 128, 2000: 200}
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scroll_tactile.recipe.default_kept_touches", lambda sensor, *, views: 0)
         patch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 128)
         for made in (ContinualMetrics, Unlearning, ACIL, RanPAC):
             usual = made.__init__.__defaults__
             patch.setattr(made.__init__, "__defaults__", tuple(fewer.get(value, value) for value in usual))
+        patch.setattr(activation, "STEPS", 6)
         patch.setattr(fleet_study, "PLANS", {"1 round": (1, 4), "20 rounds": (2, 2)})
         yield
 

@@ -1,6 +1,7 @@
 """Checkpoints as zarr writes them, byte for byte, a hundred times as fast: most tests write some by the way.
 
-tests/storage has zarr write them, as the store does; `test_quick_checkpoints` there compares the files of both.
+Tests of the writing have zarr write them, as the store does (see conftest.py); tests/storage/test_quick_checkpoints.py
+compares the files of both.
 """
 
 import json

@@ -47,6 +47,7 @@ CAMERA = Sensor(
     camera=True,
 )
 NAMES = ["cork", "felt", "silk", "wool"]
+KEPT = 8  # touches: so many are held out of a fit, which takes as much less time
 
 
 def touch(material, repetition, sensor=PAD, readings=None):
@@ -63,7 +64,7 @@ def touch(material, repetition, sensor=PAD, readings=None):
 
 
 def learner_of(sensor=PAD, repetitions=5, names=NAMES, **settings):
-    learner = TactileLearner(sensor=sensor, embedding=SMALL, **settings)
+    learner = TactileLearner(**{"sensor": sensor, "embedding": SMALL, "kept_touches": KEPT} | settings)
     feel(learner, repetitions, names)
     return learner
 
@@ -75,7 +76,7 @@ def feel(learner, repetitions=5, names=NAMES):
 
 
 def opened(path, **settings):
-    return TactileLearner.open(path, **{"sensor": PAD, "embedding": SMALL} | settings)
+    return TactileLearner.open(path, **{"sensor": PAD, "embedding": SMALL, "kept_touches": KEPT} | settings)
 
 
 def bits(prediction):

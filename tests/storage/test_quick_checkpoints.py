@@ -42,7 +42,6 @@ def test_every_file_has_the_bytes_that_zarr_gives_it(tmp_path, level):
 
 
 def test_the_store_writes_through_zarr_here(tmp_path, monkeypatch):
-    """In this room nothing is in zarr's place."""
     monkeypatch.setattr("zarr.create_group", None)
     with pytest.raises(TypeError):
         write_checkpoint(tmp_path, 1, CheckpointDraft({"a": np.ones(3)}, 1, "{}", 3), {})

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_checkpoints import write_zarr
 from real_sets import CACHE
 
 from scroll_tactile.matching.likelihood import Likelihood, Noise, Table
@@ -57,4 +58,17 @@ def shared_tables() -> Iterator[None]:
         patch.setattr(
             Likelihood, "_made", lambda self, noise: table(noise, self.spread.tobytes(), self.weights.tobytes())
         )
+        yield
+
+
+BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_hostile_checkpoints", "test_quick_checkpoints")
+"""What is about the writing itself."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_checkpoints(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Checkpoints are written without zarr, to the same bytes, but in the tests of their writing."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.stem not in BY_ZARR:
+            patch.setattr("store.checkpoint_files._write_zarr", write_zarr)
         yield

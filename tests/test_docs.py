@@ -13,9 +13,17 @@ from commands import run
 from readme import TEXT as README
 from readme import command_lines, lay_out, promised, run_session, set_up_lines
 
-from scroll_tactile import Kernels
+from scroll_tactile import Kernels, recipe
 
 ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def cheap_fits(monkeypatch):
+    """Fewer features and few kept touches, where others are not asked for: a fit takes a tenth of the time."""
+    monkeypatch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 256)
+    default = recipe.default_kept_touches
+    monkeypatch.setattr(recipe, "default_kept_touches", lambda *of, **given: min(6, default(*of, **given)))
 
 
 def test_the_session_gives_what_it_shows(tmp_path, monkeypatch):
@@ -52,7 +60,7 @@ def test_an_old_python_is_refused_in_one_sentence_before_anything_is_made(line, 
 
 @BUCKETS
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
-def test_every_command_line_runs_as_it_stands(tmp_path, monkeypatch):
+def test_every_command_line_runs_as_it_stands(tmp_path, monkeypatch, cheap_fits):
     lay_out(tmp_path)
     monkeypatch.chdir(tmp_path)
     lines = [words for words in command_lines() if words[1] != "ros2"]  # which tests/ros2 runs
@@ -76,8 +84,7 @@ def test_every_example_is_short_and_among_those_that_run():
 
 
 @pytest.mark.parametrize("name", SHOWN)
-def test_examples_run(name, capsys, monkeypatch):
-    monkeypatch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 256)  # a fit takes a tenth of the time
+def test_examples_run(name, capsys, cheap_fits):
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
     assert SHOWN[name] in capsys.readouterr().out
 

@@ -47,6 +47,7 @@ CAMERA = Sensor(
     camera=True,
 )
 NAMES = ["cork", "felt", "silk", "wool"]
+KEPT = 8  # touches: so many are held out of a fit, which takes as much less time
 
 
 def touch(material, repetition, sensor=PAD, readings=None):
@@ -63,7 +64,7 @@ def touch(material, repetition, sensor=PAD, readings=None):
 
 
 def learner_of(sensor=PAD, repetitions=5, names=NAMES, **settings):
-    learner = TactileLearner(sensor=sensor, embedding=SMALL, **settings)
+    learner = TactileLearner(**{"sensor": sensor, "embedding": SMALL, "kept_touches": KEPT} | settings)
     feel(learner, repetitions, names)
     return learner
 
@@ -75,7 +76,7 @@ def feel(learner, repetitions=5, names=NAMES):
 
 
 def opened(path, **settings):
-    return TactileLearner.open(path, **{"sensor": PAD, "embedding": SMALL} | settings)
+    return TactileLearner.open(path, **{"sensor": PAD, "embedding": SMALL, "kept_touches": KEPT} | settings)
 
 
 def bits(prediction):
@@ -211,16 +212,15 @@ def test_a_scene_that_cannot_be_is_refused(felt, scene, error, said):
         felt.predict(touch("wool", 9), scene=scene)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.5])
-def test_false_alarms_decide_what_is_known_and_nothing_else(share):
-    learner, other = learner_of(repetitions=6, false_alarms=share), learner_of(repetitions=6)
-    assert learner.digest() == other.digest()
+def test_false_alarms_decide_what_is_known_and_nothing_else():
     streams = [touch(name, 30 + i) for i in range(10) for name in NAMES]
-    ours, theirs = [learner.predict(one) for one in streams], [other.predict(one) for one in streams]
-    assert [one.ranking for one in ours] == [one.ranking for one in theirs]
-    assert [one.novelty for one in ours] == [one.novelty for one in theirs]
-    alarms, usual = sum(one.known is False for one in ours), sum(one.known is False for one in theirs)
-    assert alarms <= usual if share < 0.05 else alarms > usual
+    learners = [learner_of(repetitions=6, kept_touches=0, false_alarms=share) for share in (0.01, 0.05, 0.5)]
+    assert len({learner.digest() for learner in learners}) == 1
+    few, usual, many = ([learner.predict(one) for one in streams] for learner in learners)
+    for said in (few, many):
+        assert [(one.ranking, one.novelty) for one in said] == [(one.ranking, one.novelty) for one in usual]
+    alarms = [sum(one.known is False for one in said) for said in (few, usual, many)]
+    assert alarms[0] <= alarms[1] < alarms[2]
 
 
 # Streams of every kind
@@ -385,7 +385,7 @@ def test_global_random_generators_are_left_alone():
 
 
 def test_threads_that_observe_and_predict_together():
-    learner = TactileLearner(sensor=PAD, embedding=SMALL)
+    learner = TactileLearner(sensor=PAD, embedding=SMALL, kept_touches=0)  # tests/faults/threads.py keeps them
     failures = []
 
     def work(name):

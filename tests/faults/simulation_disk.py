@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numcodecs import zstd
+from quick_checkpoints import write_zarr
 
 import store.checkpoint_files
 import store.checkpoints
@@ -23,14 +22,11 @@ import store.rows
 from faults import shim as watch
 from faults.disks import STYLES, Disk, Event, File, Folder, Style, events, rebuild
 from faults.shim import Shim
-from store.checkpoint_files import CheckpointDraft
-from store.chunks import ArrayContent
 
 AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
 EVERY = 4  # rows that are put into an index
 LAST_BYTES = 600
 NUMBER = re.compile(rb"(?<=[ \[])\d+(?=[,\]}])")
-ARRAY = {"zarr_format": 3, "node_type": "array", "fill_value": 0, "storage_transformers": []}
 
 
 class Disks(Disk):
@@ -125,49 +121,11 @@ class Held:
         self.run()
 
 
-class _Group:
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def update_attributes(self, known: Mapping[str, Any]) -> None:
-        text = json.dumps({"attributes": known, "zarr_format": 3, "node_type": "group"})
-        (self._path / "zarr.json").write_text(text)
-
-
-def write_zarr(path: Path, draft: CheckpointDraft, described: Mapping[str, ArrayContent], level: int | None) -> Any:
-    """What zarr writes, file for file, a hundred times as fast; the arrays are of one chunk."""
-    path.mkdir()
-    for name, array in draft.arrays.items():
-        content = described[name]
-        plain: dict[str, Any] = {"name": "bytes"}
-        if content.plain.itemsize > 1:
-            plain["configuration"] = {"endian": "little"}
-        packer = [] if level is None else [{"name": "zstd", "configuration": {"level": level, "checksum": False}}]
-        about = ARRAY | {
-            "shape": list(content.plain_shape),
-            "data_type": content.plain.name,
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(content.chunk)}},
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-            "codecs": [plain, *packer],
-            "attributes": {"dtype": array.dtype.str},
-        }
-        (path / name).mkdir()
-        (path / name / "zarr.json").write_text(json.dumps(about))
-        places = list(content.places(content.chunk))
-        assert len(places) <= 1, "a simulated array has one chunk"
-        for place in places:
-            file = (path / name).joinpath("c", *map(str, place))
-            file.parent.mkdir(parents=True, exist_ok=True)
-            data = np.ascontiguousarray(content.to_plain(array)).tobytes()
-            file.write_bytes(data if level is None else zstd.compress(data, level))
-    return _Group(path)
-
-
 def prepare() -> None:
     """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
     store.log_writer.AHEAD = AHEAD
     store.rows.EVERY = store.open_log.EVERY = EVERY
-    store.checkpoint_files._write_zarr = write_zarr
+    store.checkpoint_files._write_zarr = partial(write_zarr, indent=None)  # numbers stand between commas
     store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
     store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
 

@@ -39,7 +39,8 @@ def described(shares):
 
 
 def observed(names, touches=8, **settings):
-    learner = TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=128), **settings)
+    made = {"sensor": SKIN, "embedding": Kernels(seed=0, dimension=128), "kept_touches": 12}
+    learner = TactileLearner(**made | settings)
     for at in range(touches):
         for name in names:
             learner.observe(name, touch(mixtures()[name], at))

@@ -31,6 +31,7 @@ OBSERVED = tuple((name, seed) for seed in range(8) for name in "abc")
 FEWER = OBSERVED[:15]
 PROBES = (("a", 50, 60), ("b", 51, 25), ("c", 52, 6))
 FIT = Draft.fit
+SETTINGS = {"sensor": PAD, "embedding": SMALL, "kept_touches": 6}  # with few kept ones a fit takes a third of the time
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -51,7 +52,7 @@ def stream(material, seed, readings=60):
 
 def fed(observed, **settings):
     """A memory without a path that observed these touches."""
-    learner = TactileLearner(sensor=PAD, embedding=SMALL, **settings)
+    learner = TactileLearner(**SETTINGS | settings)
     for material, seed in observed:
         learner.observe(material, stream(material, seed))
     return learner
@@ -246,7 +247,7 @@ def failing(monkeypatch, what, name, error):
     ("what", "name"), [(Draft, "of"), (Draft, "fit"), (Model, "follow"), (Model, "judge"), (System, "solve")]
 )
 def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, monkeypatch, what, name):
-    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
         for touch in FEWER:
             learner.observe(touch[0], stream(*touch))
         if name in ("follow", "judge"):
@@ -260,7 +261,7 @@ def test_without_memory_the_answer_is_an_error_and_the_next_is_right(tmp_path, m
         require_followed(learner)
         learner.settle()
         settled = bits(learner)
-    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as again:
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as again:
         assert bits(again) == settled == expected((*FEWER, ("a", 90), ("b", 91)))
 
 
@@ -367,7 +368,7 @@ def test_a_forked_process_waits_for_no_thread_of_its_parent(fitting):
 ENDS = """
 import os, signal, sys, threading, time
 sys.path[:0] = sys.argv[3:]
-from prediction.test_current import PAD, SMALL, stream
+from prediction.test_current import SETTINGS, stream
 from scroll_tactile import TactileLearner
 from scroll_tactile.prediction.fitting import Draft, Renewal
 
@@ -378,7 +379,7 @@ def slow(draft, extractor):
         time.sleep(1.0)
     return fit(draft, extractor)
 Draft.fit = slow
-learner = TactileLearner.open(sys.argv[1], sensor=PAD, embedding=SMALL)
+learner = TactileLearner.open(sys.argv[1], **SETTINGS)
 for i in range(8):
     for name in "ab":
         learner.observe(name, stream(name, i))
@@ -404,6 +405,6 @@ def test_a_process_may_end_in_any_way_while_a_fit_runs(tmp_path, how, code):
     )
     assert done.stdout == "fitting\n", done.stderr
     assert done.returncode in code, done.stderr
-    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as learner:
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
         observed = *((name, i) for i in range(8) for name in "ab"), *(("a", 90 + i) for i in range(3))
         assert bits(learner) == expected(observed)

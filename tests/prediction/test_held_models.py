@@ -19,6 +19,7 @@ from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.statistics.sample import TouchSample
 from store import StoreClosedError
 
+SETTINGS = {"sensor": PAD, "embedding": SMALL, "kept_touches": 8}  # with few kept ones a fit takes less
 TOUCHES = 5  # of each material: a model is followed for some touches, and fitted anew after more
 
 
@@ -40,7 +41,7 @@ def teach(learner):
 
 @cache
 def taught():
-    return teach(TactileLearner(sensor=PAD, embedding=SMALL))
+    return teach(TactileLearner(**SETTINGS))
 
 
 def learned():
@@ -166,7 +167,7 @@ def many(monkeypatch, tmp_path):
     for module in ("prediction.model", "readouts.readout"):
         monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 2)
     monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SampleOfTwo)
-    with TactileLearner.open(tmp_path / "many", sensor=PAD, embedding=SMALL) as learner:
+    with TactileLearner.open(tmp_path / "many", **SETTINGS) as learner:
         for seed in range(3):
             for name in MANY:
                 learner.observe(name, of_many(name, seed), source=f"{name}.csv")
@@ -195,7 +196,7 @@ def observing(learner, names, tmp_path):
 
 
 def merging(learner, names, tmp_path, compacted=False):
-    with TactileLearner.open(tmp_path / "other", sensor=PAD, embedding=SMALL) as other:
+    with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
         for name in names:
             for seed in range(4):
                 other.observe(name, touch("n", 10 + seed))
@@ -340,14 +341,14 @@ def test_tables_are_there_for_any_number_of_threads():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("kept") / "m"
-    with TactileLearner.open(path, sensor=PAD, embedding=SMALL) as learner:
+    with TactileLearner.open(path, **SETTINGS) as learner:
         teach(learner)
     return path
 
 
 @pytest.fixture
 def kept(folder, tmp_path):
-    with TactileLearner.open(shutil.copytree(folder, tmp_path / "m"), sensor=PAD, embedding=SMALL) as learner:
+    with TactileLearner.open(shutil.copytree(folder, tmp_path / "m"), **SETTINGS) as learner:
         yield learner
 
 

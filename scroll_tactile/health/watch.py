@@ -56,15 +56,15 @@ class Cell(NamedTuple):
 
     def joined(self, other: Cell) -> Cell:
         """The cell with the rows of another behind its own."""
-        rows, scores = (np.concatenate(each) for each in zip(self[:2], other[:2], strict=True))
+        rows, scores = np.concatenate([self.rows, other.rows]), np.concatenate([self.scores, other.scores])
         return Cell(rows, scores, self.total + other.total)
 
     def bounded(self) -> Cell:
         """Without the older half where it is full, so that those that are left get others."""
         if len(self.rows) <= MOST_ROWS:
             return self
-        rows, scores = (each[MOST_ROWS // 2 :].copy() for each in self[:2])
-        return Cell(rows, scores, rows.sum(axis=0, dtype=np.int64))
+        rows = self.rows[MOST_ROWS // 2 :].copy()
+        return Cell(rows, self.scores[MOST_ROWS // 2 :].copy(), rows.sum(axis=0, dtype=np.int64))
 
 
 class Watch:

@@ -148,7 +148,7 @@ class _Seen:
         levels = np.ascontiguousarray(levels.T)
         parts = np.array_split(levels, max(1, min(STRETCHES, len(readings) // 2)), axis=1)
         signed = (low < 0) & (high > 0) & (sensor is not None)
-        return cls(levels, low, high, sensor is not None, channels_of(parts, [""] * len(parts), signed, ordered=True))
+        return cls(levels, low, high, sensor is not None, channels_of(parts, signed, ordered=True))
 
 
 def _range(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -168,7 +168,7 @@ def _channels(seen: _Seen | None) -> str:
     if seen is None:
         return note("Not shown: these are pictures, or too few readings.")
     caption = (
-        "Each row is a channel, 1 at the top; time runs to the right. Dark is the least mean level that the channel "
+        "Each row is a channel, 0 at the top; time runs to the right. Dark is the least mean level that the channel "
         "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
     )
     words = (

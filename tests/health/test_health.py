@@ -242,7 +242,12 @@ def test_the_command_says_what_changed_and_what_to_do(changed: Path) -> None:
 def test_the_page_shows_the_evidence_as_it_grew(changed: Path, tmp_path: Path) -> None:
     with TactileLearner.open(changed, mode="read") as learner:
         page = memory_page(learner)
+        alike = memory_page(learner, risk=0.1)
+        since = learner.health().since
     assert "Evidence that the sensor changed" in page and "channel 3: says nothing any more" in page
+    strip = alike[alike.index('id="channels"') :]
+    rows = re.findall(r"<td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td>", strip)
+    assert (rows[0], rows[1][1]) == (("3", f"dead since observation {since}"), "fine")
 
 
 def test_what_is_said_of_each_kind_names_what_changed() -> None:

@@ -72,8 +72,8 @@ class Watch:
 
     bound: of the probability that it ever alarms where all rows are exchangeable within their cells: a material, a
     length, a level. alarmed: the row that raised the alarm; None as long as there is none. evidence: the logarithm of
-    the mean martingale after the last row; grew: after each, of which copies share the list. taken: how many rows
-    counted. The rest is what a copy on disk needs: see `validation.stored_watch`.
+    the mean martingale after the last row; grew: after each, to base ten, in a list that copies share. taken: how many
+    rows counted. The rest is what a copy on disk needs: see `validation.stored_watch`.
     """
 
     def __init__(self, channels: int, bound: float) -> None:
@@ -130,7 +130,7 @@ class Watch:
         np.minimum(logs, self.least, out=self.least)
         most = float(logs.max())
         self.evidence = most + math.log(float(np.add.reduce(np.exp(logs - most))) / len(logs))
-        self.grew.append((sequence, self.evidence))
+        self.grew.append((sequence, self.evidence / math.log(10)))
         if self.evidence < -math.log(self.bound):
             return
         self.alarmed, top = sequence, int(logs.argmax())

@@ -98,8 +98,7 @@ class WatchedRows:
 
     def _made(self, time_of: Callable[[int], float | None]) -> Health:
         watch, change = self.watch, self.watch.change
-        grew = tuple((sequence, evidence / math.log(10)) for sequence, evidence in watch.grew)
-        evidence = math.exp(min(watch.evidence, 700.0))
+        grew, evidence = tuple(watch.grew), math.exp(min(watch.evidence, 700.0))
         if change is None:
             return Health(None, None, (), "", evidence, watch.bound, watch.taken, None, (), grew)
         found = (change.since, time_of(change.since), change.channels, change.kind)

@@ -116,8 +116,8 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | 
         "the channel had, yellow the most. A dead channel is a stripe of one colour."
     )
     words = (
-        f"Dead: never changes in {DEAD:.0%} of the touches (or no touch ever reached it). Saturated: {SATURATED:.0%} of "
-        "its readings lie at the end of its range. What changed since an observation is what the memory's health tells."
+        f"Dead: never changes in {DEAD:.0%} of the touches (or no touch ever reached it). Saturated: {SATURATED:.0%} "
+        "of its readings lie at the end of its range. Since an observation: what the memory's health says changed."
     )
     unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
     low, high = (np.broadcast_to(limit, (sensor.channels,)).astype(np.float64) for limit in sensor.limits)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -54,7 +54,7 @@ def watch_to_arrays(watched: WatchedRows) -> tuple[dict[str, npt.NDArray[Any]], 
     }
     arrays["recent"] = arrays["recent"].reshape(-1, 3)
     attributes = {"made_by": MADE_BY, "rules": asdict(watched.rules), "names": names, "last": watched.last}
-    attributes |= {"taken": watch.taken, "scattered": watch.scatter.count}
+    attributes |= {"taken": watch.taken, "scattered": watch.scatter.count, "evidence": watch.evidence}
     return arrays, attributes | {"change": None if change is None else asdict(change)}
 
 
@@ -94,7 +94,9 @@ class _WatchReader(ArrayReader):
         rows = self.rows_of_journal("grew", None)
         evidence = self.floats("evidence", (len(rows),), -LARGEST, LARGEST)
         watch.grew = list(zip(rows.tolist(), evidence.tolist(), strict=True))
-        watch.evidence = watch.grew[-1][1] if watch.grew else 0.0
+        last = self._about.get("evidence")
+        expect(isinstance(last, float) and abs(last) < LARGEST, "evidence", "a number", last)
+        watch.evidence = cast(float, last)
         watch.taken = whole("taken", self._about.get("taken"), len(rows), LARGEST)
         if watch.grew and watch.evidence >= -math.log(bound):
             watch.alarmed, watch.change = watch.grew[-1][0], self._change(channels)

@@ -33,8 +33,8 @@ class Noting(Protocol):
 class HealthNotes:
     """Notes the rest before each touch, and touches that were decided, are known and were not learned.
 
-    learner: whose memory it is. changed: called once with what `health` says, when it sees a change; again only after it
-    saw none. warn: called with a text for each kind of failure once: a full disk must not end a session. materials:
+    learner: whose memory it is. changed: called once with what `health` says, when it sees a change; again only after
+    it saw none. warn: called with a text for each kind of failure once: a full disk must not end a session. materials:
     whether answers are by materials, without which touches have no name.
 
     Raises InputError as `TactileLearner.health` does: it needs a memory on disk.
@@ -51,7 +51,8 @@ class HealthNotes:
         self._learner, self._changed, self._warn, self._materials = learner, changed, warn, materials
         self._warned: set[type[Exception]] = set()
         self._last: LiveTouch | None = None  # until another ended: meanwhile it may be learned
-        self._since: int | None = learner.health().since
+        self._told = False
+        learner.health()  # or raises
 
     def take(self, ended: LiveTouch | None) -> None:
         """Take the touch that ended; None where the session did: note the touch before it and the rest, and look."""
@@ -66,8 +67,8 @@ class HealthNotes:
             self._warn_once(error)
             return
         if self._changed is not None and found is not None:
-            before, self._since = self._since, found.since
-            if before is None and found.since is not None:
+            before, self._told = self._told, found.since is not None
+            if self._told and not before:
                 self._changed(found)
 
     def _tells(self, touch: LiveTouch) -> bool:

@@ -90,23 +90,23 @@ class Peer:
     orders: int = 1000
 
 
-def _powers(first: int, last: int) -> tuple[float, ...]:
-    return tuple(10.0**-power for power in range(first, last + 1))
+SMALL = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10)
+GREAT = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 
 
 PEERS = (
-    Peer("ADWIN", "river", _powers(1, 12), lambda river, delta: river.ADWIN(delta=delta, clock=1)),
-    Peer("KSWIN", "river", _powers(4, 12), lambda river, alpha: river.KSWIN(alpha=alpha, seed=0), orders=3),
+    Peer("ADWIN", "river", SMALL, lambda river, delta: river.ADWIN(delta=delta, clock=1)),
+    Peer("KSWIN", "river", SMALL[2::2], lambda river, alpha: river.KSWIN(alpha=alpha, seed=0), orders=2),
     Peer(
         "Page-Hinkley",
         "river",
-        (1, 2, 3, 4, 6, 8, 12, 16, 24),
+        GREAT,
         lambda river, most: river.PageHinkley(min_instances=5, threshold=most),
     ),
-    Peer("ADWIN", "capymoa", _powers(1, 12), lambda moa, delta: moa.ADWIN(delta=delta)),
-    Peer("CUSUM", "capymoa", (1, 2, 3, 4, 6, 8, 12, 16, 24), lambda moa, most: moa.CUSUM(5, 0.1, most), sides=2),
-    Peer("HDDM-A", "capymoa", _powers(2, 12), lambda moa, confidence: moa.HDDMAverage(confidence)),
-    Peer("HDDM-W", "capymoa", _powers(2, 12), lambda moa, confidence: moa.HDDMWeighted(confidence)),
+    Peer("ADWIN", "capymoa", SMALL, lambda moa, delta: moa.ADWIN(delta=delta)),
+    Peer("CUSUM", "capymoa", GREAT, lambda moa, most: moa.CUSUM(5, 0.1, most), sides=2),
+    Peer("HDDM-A", "capymoa", SMALL, lambda moa, confidence: moa.HDDMAverage(confidence)),
+    Peer("HDDM-W", "capymoa", SMALL, lambda moa, confidence: moa.HDDMWeighted(confidence)),
 )
 MODULES = {"river": "river.drift", "capymoa": "capymoa.drift.detectors"}
 

@@ -70,9 +70,9 @@ class Order:
         every = np.array(noted.values)
         return cls(every[:, channel::channels][:, :SCORES], places, half, own, every)
 
-    def delay(self, at: int | None) -> int | None:
-        """Touches from the change to an alarm; None without one, 0 for a false one."""
-        return None if at is None else max(0, at - self.half + 1)
+    def delay(self, at: int) -> int:
+        """Touches from the change to an alarm."""
+        return at - self.half + 1
 
 
 @dataclass(frozen=True)

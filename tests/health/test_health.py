@@ -316,6 +316,6 @@ def test_p_values_are_those_of_crepes() -> None:
     martingales = pytest.importorskip("crepes.martingales")
     scores = np.random.default_rng(0).integers(0, 9, 40).astype(float)
     theirs = martingales.semi_online_p_values(scores, seed=7)
-    ties = np.random.RandomState(7).random_sample(len(scores))  # noqa: NPY002  # by which crepes breaks its ties
+    ties = np.random.RandomState(7).random_sample(len(scores))  # by which crepes breaks its ties
     ours = [betting.ranks(-scores[: i + 1, None], tie)[0] for i, tie in enumerate(ties)]
     np.testing.assert_allclose(ours, theirs, rtol=1e-15)

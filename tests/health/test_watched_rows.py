@@ -16,7 +16,8 @@ from scroll_tactile.health.watch import Watch
 from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.validation import stored_watch
 from scroll_tactile.validation.expected import Unexpected
-from store import Checkpoint
+from store import Checkpoint, StoreError, StoreFullError
+from store.log_writer import LogWriter
 
 PAD = Sensor(name="pad", channels=4, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)
@@ -159,6 +160,26 @@ def test_the_memory_is_free_while_rows_are_read_and_may_change(memory: Path, cou
         found, _ = counted.rows(learner.health)
         counted.then = {}
         assert found.touches == 150
+    assert fresh(memory) == found
+
+
+def test_rows_of_a_batch_that_was_lost_are_not_there(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise StoreFullError("no space left")
+
+    with TactileLearner.open(memory) as learner:
+        before = learner.health()
+        with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
+            for i in range(4):
+                learner.sense(SCENE.touch(NAMES[0], 80 + i), NAMES[0])
+            assert learner.health().touches == before.touches + 4
+            monkeypatch.setattr(LogWriter, "stage", full)
+            with pytest.raises(StoreFullError):
+                learner.sense(SCENE.touch(NAMES[0], 84), NAMES[0])
+        monkeypatch.undo()
+        for i in range(4):  # these have the same places in the journal
+            learner.sense(SCENE.touch(NAMES[1], 90 + i), NAMES[1])
+        found = learner.health()
     assert fresh(memory) == found
 
 

@@ -103,18 +103,14 @@ def test_a_session_calls_back(memory: Path) -> None:
                 state = session.end()
             noted = state.touches[0].decided and state.touches[0].prediction.known is True
         assert learner.health().touches >= before + (2 if noted else 0)
-        dead = SCENE.touch(NAMES[0], 80).readings.copy()
-        dead[:, 3] = 0
         with learner.batch():
-            for i in range(40):
-                own = SCENE.touch(NAMES[i % 3], 300 + i).readings.copy()
-                own[:, 3] = 0
-                learner.sense(own, NAMES[i % 3])
+            for i in range(100):
+                learner.sense(rest(1.0 if i < 40 else 0.85))
         assert learner.health().since is not None
         with learner.live(contact="manual", changed=told.append) as session:
             for _ in range(2):
                 session.begin()
-                session.push(dead)
+                session.push(SCENE.touch(NAMES[0], 80).readings)
                 session.end()
             assert told == [learner.health()]  # once a session, also what was seen before it
     with pytest.raises(errors.InputError, match="without a path"):

@@ -219,15 +219,24 @@ def beside_peers(touches: Touches, sound: list[Any], orders: int, seed: int) -> 
 
 
 def run_health(
-    data: Path | None, *, orders: int, peers: int, seed: int, cache: Path | None, note: Callable[[str], None]
+    data: Path | None,
+    *,
+    only: str = "",
+    orders: int,
+    peers: int,
+    seed: int,
+    cache: Path | None,
+    note: Callable[[str], None],
 ) -> Record:
-    """A record for each set and case. cache: a file of what was measured already, one line an order."""
+    """A record for each set and case. cache: a file of what was measured already, one line an order. only: the set."""
     done: dict[tuple[Any, ...], Record] = {}
     if cache is not None and cache.is_file():
         done = {tuple(key): value for key, value in map(text.loads, cache.read_text("utf-8").splitlines())}
     records, compared, oracles = list[Record](), list[Record](), list[Record]()
     with one_thread():
         for touches in read_sets(data, seed):
+            if not touches.name.startswith(only):
+                continue
             sound = [channel_numbers(stream) for stream in touches.streams]
             if peers:
                 note(f"{touches.name}: others' detectors")
@@ -253,6 +262,7 @@ def health(
     context: typer.Context,
     data: Annotated[Path | None, typer.Option(help="Folder of FabricSlide and biotac_slide_20_50.")] = None,
     orders: Annotated[int, typer.Option(min=0, help="Of the touches of each set, for each case.")] = 100,
+    only: Annotated[str, typer.Option(help="Only the set whose name begins so.")] = "",
     peers: Annotated[int, typer.Option(min=0, help="Orders for which others' detectors run beside it.")] = 0,
     cache: Annotated[Path | None, typer.Option(help="A file to go on from after an interruption.")] = None,
     seed: Seed = 0,
@@ -260,7 +270,7 @@ def health(
 ) -> None:
     """Change the sensor behind recorded touches: how soon that is noticed, and named."""
     with progress_bar() as progress:
-        how: dict[str, Any] = {"orders": orders, "peers": peers, "seed": seed, "cache": cache}
+        how: dict[str, Any] = {"only": only, "orders": orders, "peers": peers, "seed": seed, "cache": cache}
         result = run_health(data, **how, note=lambda what: progress(what, 0, 1))
     columns = {"set": "{./set}", "case": "{./case}", "orders": "{./orders}", "false": "{./false}"}
     columns |= {"found": "{?./found}", "median": "{?./median|.0f}", "95 %": "{?./most|.0f}"}

@@ -27,19 +27,16 @@ NEVER = 1e-300  # a bound that no evidence reaches
 
 
 class _Noted(Bets):
-    """Bets that note the p-values (SCORES n,) of each touch; of the first one in a cell there are none."""
+    """Bets that note the p-values (5 n,) of each touch; of the first one in a cell there are none."""
 
     def __init__(self, count: int) -> None:
         super().__init__(count)
         self.values: list[Floats] = []
-        self._row = np.empty(0)
 
     def take(self, ranks: Floats, first: int) -> None:
         """Note the p-values of a touch, and bet on them."""
         super().take(ranks, first)
-        self._row = ranks if first == 0 else np.concatenate([self._row, ranks])
-        if first:
-            self.values.append(self._row)
+        self.values.append(ranks)
 
 
 @dataclass(frozen=True)

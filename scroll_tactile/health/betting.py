@@ -154,7 +154,7 @@ def resting_scores(rows: Rows) -> Whole:
     return np.concatenate([whole[:, :n] + whole[:, -1:], whole[:, 2 * n : 3 * n]], axis=1)
 
 
-def beside_level(scores: Floats | Whole, levels: Rows) -> Floats:
+def beside_level(scores: Floats, levels: Rows) -> Floats:
     """What the level of a touch does not explain of its scores (k, count), by the line through the rows of a cell.
 
     levels: (k,). Rows are treated alike, so that they stay exchangeable: the line is drawn with the touch itself. It is
@@ -162,7 +162,8 @@ def beside_level(scores: Floats | Whole, levels: Rows) -> Floats:
     """
     away = levels - np.add.reduce(levels, dtype=np.float64) / len(levels)
     slope = (away @ scores) / (float(away @ away) + FLAT)
-    return np.asarray(scores - np.dot(away[:, None], slope[None]))
+    explained = np.dot(away[:, None], slope[None])
+    return np.asarray(np.subtract(scores, explained, out=explained))
 
 
 def coarse(scores: Floats) -> Floats:

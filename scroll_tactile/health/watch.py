@@ -117,9 +117,10 @@ class Watch:
         n, random, among = self.channels, tie_break(sequence), len(cell.rows) - 1
         if material:
             self.scatter.take(away, among)
-            levels = cell.rows[:, -1]
-            self.bets.take(ranks(beside_level(self.scatter.scores(cell.rows), levels), random), 0)
-            self.bets.take(ranks(coarse(beside_level(cell.scores, levels)), random), KINDS * n)
+            scores = np.concatenate([self.scatter.scores(cell.rows), cell.scores], axis=1)
+            scores = beside_level(scores, cell.rows[:, -1])
+            scores[:, KINDS * n :] = coarse(scores[:, KINDS * n :])
+            self.bets.take(ranks(scores, random), 0)
         else:
             self.bets.take(ranks(cell.scores, random), SCORES * n)
         self.recent.append(Deviation(sequence, material, away, among))

@@ -21,7 +21,7 @@ from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.prediction.reembedding import embed_again
 from scroll_tactile.recipe import Recipe, RecipeRequest
-from scroll_tactile.results import Composition, Estimate, Prediction, Receipt
+from scroll_tactile.results import Composition, Estimate, Health, Prediction, Receipt
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, names_of, require_name, require_source
 from scroll_tactile.signals.copies import Augmented
@@ -281,26 +281,28 @@ class TactileLearner(MemoryKeeper):
         scene: Sequence[str] | None = None,
         of: str | None = None,
         widths: Mapping[str, float] | None = None,
+        changed: Callable[[Health], object] | None = None,
     ) -> LiveSession:
         """Begin to take readings as they come; see `LiveSession.push`.
 
         risk: the share of wrong answers among those that are decided. contact: "auto" finds touches by the sensor's own
         noise at rest, which it learns first: for two seconds nothing may touch it. "manual" leaves that to
         `LiveSession.begin` and `end`. false_contacts: an hour, that noise alone may make. scene, of: as for `predict`.
-        widths: quantity → how narrow its interval is to be, in its unit, before `LiveState.settled` says so.
-        By labels nothing is estimated.
-
-        Each touch is predicted by the memory as it was when it began, and by itself unless `LiveSession.again` says
-        that it is of the same thing as the last.
+        widths: quantity → how narrow its interval is to be, in its unit, before `LiveState.settled` says so. By labels
+        nothing is estimated. changed: called when `health` sees a change; for that rest and known touches are noted as
+        by `sense`. Each touch is predicted by the memory as it was when it began, and by itself unless
+        `LiveSession.again` says that it is of the same thing as the last.
 
         Raises InputError for values that cannot be, and for "auto" with frames that have no resting image;
         UnknownMaterialError for a scene that names a material never observed; AnnotationError for an axis that no
         touch has a label on.
         """
         from scroll_tactile.live.session import LiveSession
+        from scroll_tactile.live.watching import HealthNotes
 
         session: dict[str, Any] = {"risk": risk, "contact": contact, "false_contacts": false_contacts, "scene": scene}
-        return LiveSession(self._by(of), **session, widths=widths)
+        notes = None if changed is None else HealthNotes(self, changed, logger.warning, materials=of is None)
+        return LiveSession(self._by(of), **session, widths=widths, notes=notes)
 
     def _by(self, axis: str | None) -> Predictor:
         """What answers by the labels on an axis; by materials where it is None."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json as text
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from time import process_time
 from typing import Annotated, Any
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
+from examples.benchmarks.health_peers import Order, lacking, oracle_difference, peer_records
 from examples.paper.readers import biotac_slide, fabric_slide
 from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.options import Json, Seed
@@ -46,7 +46,6 @@ NAMED = dict(zip(ONE, ("gain", "offset", "dead", "noisier"), strict=True))
 LATE = 0.3  # of the touches: the firm ones, the short ones …
 ACTIVE = 0.005  # of the range: a channel below it in the mean is not chosen
 RESTING, WANDER = 50, 0.002  # readings at rest before a touch; the zero's standard deviation, of the range
-PEERS = {"ADWIN, KSWIN of river": "river", "those of CapyMOA": "capymoa"}
 
 
 @dataclass(frozen=True)
@@ -148,19 +147,30 @@ class Change:
         return order[np.concatenate([first, last])], len(first)
 
 
-def run_order(touches: Touches, sound: list[Any], case: str, seed: int) -> Record:
-    """One order: the touches up to the alarm behind the change; before it, and where nothing changed, it is false."""
-    change = Change(touches, case, np.random.default_rng([seed, 35]))
-    order, half = change.order()
-    watch, resting, began = Watch(touches.sensor.channels, BOUND), case.endswith("at rest"), process_time()
+Touched = tuple[int, str, int, Any]
+"""The place of a touch in an order, its material, its readings, and its numbers."""
+
+
+def touched(change: Change, sound: list[Any], order: npt.NDArray[np.int64], half: int) -> Iterator[Touched]:
+    """The touches of an order, from `half` on by the changed sensor."""
+    touches = change.touches
     unchanged = change.case in NONE and change.case != "half as long"
-    at = len(order)
     for place, i in enumerate(order.tolist()):
         stream, numbers = touches.streams[i], sound[i]
         if place >= half and not unchanged:
             stream = change.applied(stream.readings.astype(np.float64))
             numbers = channel_numbers(stream)
-        watch.take(2 * place + 1, str(touches.materials[i]), len(stream), numbers)
+        yield place, str(touches.materials[i]), len(stream), numbers
+
+
+def run_order(touches: Touches, sound: list[Any], case: str, seed: int) -> Record:
+    """One order: the touches up to the alarm behind the change; before it, and where nothing changed, it is false."""
+    change = Change(touches, case, np.random.default_rng([seed, 35]))
+    order, half = change.order()
+    watch, resting, began = Watch(touches.sensor.channels, BOUND), case.endswith("at rest"), process_time()
+    at = len(order)
+    for place, *touch in touched(change, sound, order, half):
+        watch.take(2 * place + 1, *touch)
         if resting:
             read = change.resting()
             rest = change.sound(read) if place < half else change.applied(read)
@@ -195,16 +205,44 @@ def summed(name: str, case: str, orders: list[Record]) -> Record:
     return found
 
 
-def run_health(data: Path | None, *, orders: int, seed: int, cache: Path | None, note: Callable[[str], None]) -> Record:
-    """A record for each set and case. cache: a file of what was measured already, one line an order."""
+def beside_peers(touches: Touches, sound: list[Any], orders: int, seed: int) -> tuple[list[Record], Record]:
+    """Delays of others' detectors on one channel's p-values, and how far others' martingales are from ours on all."""
+    cases = dict[str, list[Order]]()
+    for case in ("none", *ONE):
+        cases[case] = []
+        for number in range(seed, seed + orders):
+            change = Change(touches, case, np.random.default_rng([number, 35]))
+            order, half = change.order()
+            rows = touched(change, sound, order, half)
+            cases[case].append(Order.of(rows, touches.sensor.channels, change.channel, half, BOUND))
+    return peer_records(touches.name, cases), {"set": touches.name} | oracle_difference(cases["none"][0])
+
+
+def run_health(
+    data: Path | None,
+    *,
+    only: str = "",
+    orders: int,
+    peers: int,
+    seed: int,
+    cache: Path | None,
+    note: Callable[[str], None],
+) -> Record:
+    """A record for each set and case. cache: a file of what was measured already, one line an order. only: the set."""
     done: dict[tuple[Any, ...], Record] = {}
     if cache is not None and cache.is_file():
         done = {tuple(key): value for key, value in map(text.loads, cache.read_text("utf-8").splitlines())}
-    records = []
+    records, compared, oracles = list[Record](), list[Record](), list[Record]()
     with one_thread():
         for touches in read_sets(data, seed):
+            if not touches.name.startswith(only):
+                continue
             sound = [channel_numbers(stream) for stream in touches.streams]
-            for case in (*NONE, *ONE, *MANY, *AT_REST):
+            if peers:
+                note(f"{touches.name}: others' detectors")
+                others, oracle = beside_peers(touches, sound, peers, seed)
+                compared, oracles = compared + others, [*oracles, oracle]
+            for case in (*NONE, *ONE, *MANY, *AT_REST) if orders else ():
                 note(f"{touches.name}: {case}")
                 own = []
                 for order in range(seed, seed + orders):
@@ -216,23 +254,31 @@ def run_health(data: Path | None, *, orders: int, seed: int, cache: Path | None,
                                 file.write(text.dumps([key, done[key]]) + "\n")
                     own.append(done[key])
                 records.append(summed(touches.name, case, own))
-    skipped = {peer: f"{module} is not installed" for peer, module in PEERS.items() if find_spec(module) is None}
-    return {"bench": "health", "bound": BOUND, "records": records, "skipped": skipped}
+    found = {"bench": "health", "bound": BOUND, "records": records, "peers": compared, "oracles": oracles}
+    return found | ({"skipped": lacking()} if peers else {})
 
 
 def health(
     context: typer.Context,
     data: Annotated[Path | None, typer.Option(help="Folder of FabricSlide and biotac_slide_20_50.")] = None,
-    orders: Annotated[int, typer.Option(min=1, help="Of the touches of each set, for each case.")] = 100,
+    orders: Annotated[int, typer.Option(min=0, help="Of the touches of each set, for each case.")] = 100,
+    only: Annotated[str, typer.Option(help="Only the set whose name begins so.")] = "",
+    peers: Annotated[int, typer.Option(min=0, help="Orders for which others' detectors run beside it.")] = 0,
     cache: Annotated[Path | None, typer.Option(help="A file to go on from after an interruption.")] = None,
     seed: Seed = 0,
     json: Json = None,
 ) -> None:
     """Change the sensor behind recorded touches: how soon that is noticed, and named."""
     with progress_bar() as progress:
-        result = run_health(data, orders=orders, seed=seed, cache=cache, note=lambda what: progress(what, 0, 1))
+        how: dict[str, Any] = {"only": only, "orders": orders, "peers": peers, "seed": seed, "cache": cache}
+        result = run_health(data, **how, note=lambda what: progress(what, 0, 1))
     columns = {"set": "{./set}", "case": "{./case}", "orders": "{./orders}", "false": "{./false}"}
     columns |= {"found": "{?./found}", "median": "{?./median|.0f}", "95 %": "{?./most|.0f}"}
     columns |= {"named": "{?./named}", "kind": "{?./kind}", "ms": "{./milliseconds|.2f}"}
-    show("touches until a change is noticed", columns, result["records"])
+    if orders:
+        show("touches until a change is noticed", columns, result["records"])
+    if peers:
+        beside = {"set": "{./set}", "case": "{./case}", "by": "{./peer}", "orders": "{?./orders}"}
+        beside |= {"false": "{?./false}", "found": "{?./found}", "median": "{?./median|.0f}"}
+        show("the same, by others' detectors on the changed channel's p-values", beside, result["peers"])
     write(context, result)

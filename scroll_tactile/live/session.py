@@ -21,6 +21,7 @@ from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event
 from scroll_tactile.live.pressing import PressDetector
 from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows
+from scroll_tactile.live.watching import HealthNotes
 from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor
@@ -56,6 +57,7 @@ class LiveSession:
         false_contacts: float,
         scene: Sequence[str] | None,
         widths: Mapping[str, float] | None = None,
+        notes: HealthNotes | None = None,
     ) -> None:
         if contact not in ("auto", "manual"):
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
@@ -69,7 +71,7 @@ class LiveSession:
         model = frozen.model
         candidates_of(scene, model.names, model.known)
         self._scene, self._widths = scene, _checked(predictor, widths)
-        self._manual = contact == "manual"
+        self._manual, self._notes = contact == "manual", notes
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
             self._detector = (
@@ -190,6 +192,8 @@ class LiveSession:
         self._closed = True
         with suppress(StreamError):
             self._end("closed")
+        if self._notes is not None:
+            self._notes.take(None)
         self._detector = None
         self._recent = Recent(1, self.sensor.shape, self._dtype)
 
@@ -344,6 +348,8 @@ class LiveSession:
         rest = None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
         self._ended.append(LiveTouch(stream, prediction, *said, rest))
         self._settled = touch.settled
+        if self._notes is not None:
+            self._notes.take(self._ended[-1])
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""

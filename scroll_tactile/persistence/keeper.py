@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.errors import InputError
-from scroll_tactile.health.watch import WatchRules
+from scroll_tactile.health.watched_rows import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
@@ -21,8 +21,9 @@ from scroll_tactile.persistence.adapting import adapt_to, known_touches
 from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
-from scroll_tactile.persistence.observations import health_of, observations
+from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.persistence.watching import health_of
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Adaptation, Compacted, Health, Merged, Observation, Receipt
 from scroll_tactile.sensors import Sensor
@@ -141,12 +142,7 @@ class MemoryKeeper(ABC):
         Raises InputError for values that cannot be, and in a memory without a path; StoreError.
         """
         require_arguments({"bound": bound, "after": after}, {"until": until})
-        rules = WatchRules(float(bound), after, until, source)
-        ledger = self._ledger
-        with ledger.lock:
-            store, memory = ledger.require_store("tell how its sensor is"), ledger.memory
-            ledger.watched = health_of(store, memory, self.sensor.channels, rules, ledger.watched)
-            return ledger.watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
+        return health_of(self._ledger, self.sensor.channels, WatchRules(float(bound), after, until, source))
 
     def adapt(
         self,

@@ -5,18 +5,13 @@ from __future__ import annotations
 from typing import Literal, cast
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.health.channel_numbers import from_text
-from scroll_tactile.health.watch import Watch, WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
-    CHANNELS,
     DECLARE,
     MEMBER,
     OBSERVE,
-    RETRACT,
     RETRACTS,
-    SENSE,
     SOURCE,
     active_rows,
     annotation_of,
@@ -29,7 +24,7 @@ from store import Head, Record, Store
 __all__ = [
     "adaptation_of",
     "compaction_point",
-    "health_of",
+    "is_from",
     "observation_of",
     "observations",
     "observations_from",
@@ -170,32 +165,3 @@ def compaction_point(store: Store, memory: Memory, keep: int) -> int:
         return store.last
     sequences = [head.sequence for head in _retractable(store, memory)]
     return memory.compacted if len(sequences) <= keep else sequences[-keep] - 1
-
-
-def health_of(
-    store: Store, memory: Memory, channels: int, rules: WatchRules, before: WatchedRows | None
-) -> WatchedRows:
-    """The watch over the rows that rules choose, in the journal's order; retracted ones are not there.
-
-    before: the rows that were watched last; the same rules go on from there, unless something was retracted since.
-    """
-    last = memory.sequence if rules.until is None else min(rules.until, memory.sequence)
-    if before is not None and (before.rules != rules or before.last > last or before.compacted != store.compacted):
-        before = None
-    if before is not None and store.last > before.last and any(store.heads(before.last, kind=RETRACT)):
-        before = None
-    gone = memory.is_gone if before is None else (lambda sequence: False)
-    watched = before or WatchedRows(rules, Watch(channels, rules.bound), rules.after, store.compacted)
-    for head in store.heads(watched.last):
-        if head.sequence > last:
-            break
-        watched.last = head.sequence
-        if head.kind not in (OBSERVE, SENSE) or gone(head.sequence):
-            continue
-        if rules.source is not None and not is_from(_source(head), rules.source):
-            continue
-        numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
-        if numbers is not None:
-            watched.watch.take(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
-    watched.last = max(watched.last, last)
-    return watched

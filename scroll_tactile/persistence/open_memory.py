@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.health.watch import WatchedRows
+from scroll_tactile.health.watched_rows import WatchedRows
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.contents import ListedContents, StoredContents
@@ -47,7 +47,8 @@ class OpenMemory:
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
     grows with each change of a description. added: if `follow` is set, the touches observed and retracted since the
     list was last cleared; None where these are too many, or something else has changed. followers: are called with the
-    same at each change. watched: the rows that health was last told from. saves:
+    same at each change. watched: the rows that health was last told from;
+    None while they are read. lost: grows where a change was cut short, whose rows may not be in the journal. saves:
     whether checkpoints are written; the journal alone has every row, too.
     """
 
@@ -76,6 +77,7 @@ class OpenMemory:
         self._undo: Callable[[], None] | None = None
         self._batching = False
         self.watched: WatchedRows | None = None
+        self.lost = 0
 
     @property
     def memory(self) -> Memory:
@@ -86,6 +88,7 @@ class OpenMemory:
             else:
                 self._memory = self._load()
             self._whole = True
+            self.lost += 1
             self._changed()
         return self._memory
 

@@ -26,6 +26,7 @@ from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.replaying import load
+from scroll_tactile.persistence.watching import health_to_store
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
@@ -41,6 +42,7 @@ from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
+from scroll_tactile.validation.stored_watch import NAME as HEALTH
 
 __all__ = ["LogitsReader", "Predictor", "estimates_of", "nothing_known"]
 
@@ -327,7 +329,8 @@ class Predictor:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
             models = {NAME: self, **{axis_name(NAME, axis): predictor for axis, predictor in self._axes.items()}}
-            self.ledger.close({name: partial(own.current.arrays_to_store, own.ledger) for name, own in models.items()})
+            derived = {name: partial(own.current.arrays_to_store, own.ledger) for name, own in models.items()}
+            self.ledger.close({**derived, HEALTH: partial(health_to_store, self.ledger)})
             for predictor in models.values():
                 predictor.current.close()
 

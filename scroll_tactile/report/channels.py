@@ -1,36 +1,47 @@
-"""Whether each channel of a sensor still measures: by the touches that a memory keeps, or by one recording."""
+"""Whether each channel of a sensor measures: by the touches that a memory keeps and its health, or by one recording."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.results import ChangeKind, Health
 
-__all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "ChannelSummary", "channels_of", "drift"]
+__all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "ChannelSummary", "changed_in", "channels_of", "drift"]
 
 FloatArray = npt.NDArray[np.float64]
 
 DEAD = 0.8  # of the touches, in which a channel never changes
 SATURATED = 0.05  # of the readings, at an end of the range
-DRIFTING = 0.05  # of the range, from the first touch to the last …
+DRIFTING = 0.05  # of the range, from the first part of a recording to the last …
 CERTAIN = 4.0  # … and as many standard errors
-LATELY = 20  # touches: a channel that died is seen in these
-STEADY = 0.5  # of a channel that lives, in as many touches at most it may be still
+LATELY = 20  # parts: a channel that died is seen in these
+STEADY = 0.5  # of a channel that lives, in as many parts at most it may be still
+CHANGED: dict[ChangeKind, str] = {
+    "gain": "another gain",
+    "offset": "another offset",
+    "dead": "dead",
+    "noisier": "noisier",
+    "slower": "slower",
+    "gains": "another gain",
+    "all gains": "another gain",
+    "all offsets": "another offset",
+}
 
 
 @dataclass(frozen=True)
 class ChannelSummary:
     """One channel, its levels as shares of its range.
 
-    number: from 1. middle: the median; low, high: where 5 and 95 % of the readings lie. still: share of the touches in
+    number: from 0. middle: the median; low, high: where 5 and 95 % of the readings lie. still: share of the touches in
     which it never changes, and of the last ones. bottom, top: share of its readings at either end of the range. signed:
-    whether zero lies inside the range, so that its bottom is an end, too. missing: share that was not read. drift: from
-    the first touch to the last, beside what the materials explain, and its standard error; None where it cannot be
-    measured.
+    whether zero lies inside the range, so that its bottom is an end, too. missing: share that was not read. drift: of a
+    recording, from its first part to its last, and its standard error; None where it cannot be measured. change: what
+    the memory's health says became of it; "" where nothing did.
     """
 
     number: int
@@ -44,12 +55,15 @@ class ChannelSummary:
     signed: bool
     missing: float
     drift: tuple[float, float] | None
+    change: str = ""
 
     @property
     def faults(self) -> list[str]:
         """What is wrong with it, in words."""
         found = []
-        if self.still >= DEAD:
+        if self.change:
+            found.append(self.change)
+        elif self.still >= DEAD:
             found.append("dead")
         elif self.still_lately >= DEAD and self.still_lately - self.still > STEADY / 2:
             found.append("died lately")
@@ -69,12 +83,10 @@ class ChannelSummary:
         )
 
 
-def channels_of(
-    touches: Sequence[LevelArray], materials: Sequence[str], signed: npt.NDArray[np.bool_], *, ordered: bool
-) -> list[ChannelSummary]:
-    """The channels of some touches, levels (C, T) each.
+def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *, ordered: bool) -> list[ChannelSummary]:
+    """The channels of some touches, or of the parts of one recording, levels (C, T) each.
 
-    signed: whether zero lies inside the range of each, (C,). ordered: whether the touches come as they were observed.
+    signed: whether zero lies inside the range of each, (C,). ordered: whether they follow each other, as parts do.
     """
     count = len(touches[0])
     still = np.array([_still(levels) for levels in touches])
@@ -83,7 +95,7 @@ def channels_of(
     for levels in touches:
         placed = np.arange(count)[:, None] * 256 + levels
         counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
-    drifts = drift(means, materials) if ordered else [None] * count
+    drifts = drift(means) if ordered else [None] * count
     lately = still[-LATELY:].mean(axis=0) if ordered else still.mean(axis=0)
     return [
         _channel(i, counts[i], (float(still[:, i].mean()), float(lately[i])), drifts[i], signed=bool(signed[i]))
@@ -104,7 +116,7 @@ def _channel(
     low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
     bottom, top = float(read[0]) / max(int(read.sum()), 1), float(read[LEVELS - 1]) / max(int(read.sum()), 1)
     missing = float(counts[MISSING]) / max(total, 1)
-    return ChannelSummary(i + 1, middle, low, high, *still, bottom, top, signed, missing, moved)
+    return ChannelSummary(i, middle, low, high, *still, bottom, top, signed, missing, moved)
 
 
 def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
@@ -122,28 +134,29 @@ def _mean(levels: LevelArray) -> FloatArray:
         return np.asarray(sums / read.sum(axis=1) / (LEVELS - 1))
 
 
-def drift(means: FloatArray, materials: Sequence[str]) -> list[tuple[float, float] | None]:
-    """How far each channel's level moves from the first touch to the last, and its standard error.
+def drift(means: FloatArray) -> list[tuple[float, float] | None]:
+    """How far each channel's level moves from the first part of a recording to the last, and its standard error.
 
-    means: (touches, C), in the order of observation. It is the slope over the place in that order of what the materials
-    do not explain (Frisch and Waugh 1933): materials taught one after the other do not look like drift, and where each
-    was touched at one time only there is nothing to see it by.
+    means: (parts, C), in order: the slope over the place in that order.
     """
     count = len(means)
-    none: list[tuple[float, float] | None] = [None] * means.shape[1]
+    found: list[tuple[float, float] | None] = [None] * means.shape[1]
     if count < LATELY:
-        return none
-    own = np.unique(np.array(materials), return_inverse=True)[1]
+        return found
     place = np.linspace(-0.5, 0.5, count)
-    place = place - (np.bincount(own, place) / np.bincount(own))[own]
-    free, spread = count - int(own.max()) - 2, float(place @ place)
-    if free < 8 or spread < 0.01 * count / 12:
-        return none
-    found = none
+    spread = float(place @ place)
     for i, level in enumerate(means.T):
         if np.isfinite(level).all():
-            rest = level - (np.bincount(own, level) / np.bincount(own))[own]
+            rest = level - level.mean()
             slope = float(place @ rest) / spread
             left = rest - slope * place
-            found[i] = slope, float(np.sqrt(max(left @ left, 0.0) / free / spread))
+            found[i] = slope, float(np.sqrt(max(left @ left, 0.0) / (count - 2) / spread))
     return found
+
+
+def changed_in(channels: Sequence[ChannelSummary], health: Health | None) -> list[ChannelSummary]:
+    """The channels, and what a memory's health says became of them."""
+    if health is None or health.since is None or health.kind not in CHANGED:
+        return list(channels)
+    what = f"{CHANGED[health.kind]} since observation {health.since}"
+    return [replace(own, change=what) if own.number in health.channels else own for own in channels]

@@ -71,14 +71,14 @@ def memory_page(
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
         *([("estimated", "What it measures", estimated(facts))] if facts.estimator is not None else []),
-        ("channels", "Channels", channel_section(sensor, facts.kept, ordered=facts.ordered)),
         *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
+        ("channels", "Channels", channel_section(sensor, facts.kept, found, ordered=facts.ordered)),
         ("when", "When it was taught", _over_time(facts)),
     ]
     for i, axis in enumerate(learner.axes):
         by = facts.by(axis)
         sections.append((f"axis-{i}", f"By {axis}", mixed_up(by, alike(by)[1]) + calibration_plots(by)))
-    channels = channel_card(sensor, facts.kept, ordered=facts.ordered)
+    channels = channel_card(sensor, facts.kept, found)
     summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels, *health_cards(found)])
     if facts.missing:
         reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))

@@ -179,7 +179,7 @@ class _Seen:
         levels = np.ascontiguousarray(levels.T)
         parts = np.array_split(levels, max(1, min(STRETCHES, len(readings) // 2)), axis=1)
         signed = (low < 0) & (high > 0) & (sensor is not None)
-        return cls(levels, low, high, channels_of(parts, [""] * len(parts), signed, ordered=True))
+        return cls(levels, low, high, channels_of(parts, signed, ordered=True))
 
     def sensor(self, recording: Recording) -> Sensor | None:
         """One that the readings could be of, for contacts; None where they have no rate, or numbers beyond reason."""
@@ -218,7 +218,7 @@ def _channels(seen: _Seen | None, whose: Whose) -> str:
     if seen is None:
         return note("Not shown: these are pictures, or too few readings.")
     caption = (
-        "Each row is a channel, 1 at the top; time runs to the right. Dark is the least mean level that the channel "
+        "Each row is a channel, 0 at the top; time runs to the right. Dark is the least mean level that the channel "
         "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
     )
     words = (

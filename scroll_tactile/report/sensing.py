@@ -12,7 +12,7 @@ from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.report.channels import DEAD, DRIFTING, LATELY, SATURATED, ChannelSummary, channels_of
+from scroll_tactile.report.channels import DEAD, SATURATED, ChannelSummary, changed_in, channels_of
 from scroll_tactile.report.charts import evidence
 from scroll_tactile.report.drawing import as_counted, brief, clipped_name, png, shown
 from scroll_tactile.report.page import Card, figure, name_of, note, table
@@ -70,13 +70,14 @@ def health_section(found: Health) -> str:
     return told + figure(evidence(found.grew, alarm), caption)
 
 
-def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> Card:
-    """What is to be seen first of the channels."""
+def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> Card:
+    """What is to be seen first of the channels. health: of the memory; None where it has none."""
     if sensor.camera:
         return "none", "Channels", "a camera", "Its pixels are not looked at one by one."
     if not kept:
         return "none", "Channels", "not known", "No readings are kept that could show it."
-    return card_of(_channels(sensor, kept, ordered), f"{len(kept)} kept touches")
+    compared = f" and the health of {health.touches} touches and rest readings" if health and health.grew else ""
+    return card_of(_channels(sensor, kept, health), f"{len(kept)} kept touches{compared}")
 
 
 def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
@@ -86,21 +87,20 @@ def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
         for fault in channel.faults:
             wrong.setdefault(fault, []).append(channel)
     if not wrong:
-        return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or drifting, by {by}."
-    worst = "dead" in wrong or "died lately" in wrong
+        return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or changed, by {by}."
+    worst = any(fault.startswith(("dead", "died")) for fault in wrong)
     answer = "; ".join(f"{len(own)} {fault}" for fault, own in sorted(wrong.items()))
     more = ". ".join(f"{fault.capitalize()}: {listed(own)}" for fault, own in sorted(wrong.items()))
     return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
-def _channels(sensor: Sensor, kept: Sequence[KeptTouch], ordered: bool) -> list[ChannelSummary]:
+def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
-    levels, materials = [touch.levels for touch in kept], [touch.material for touch in kept]
-    return channels_of(levels, materials, (low < 0) & (high > 0), ordered=ordered)
+    return changed_in(channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False), health)
 
 
-def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool) -> str:
-    """All channels, and their levels over the touches."""
+def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None, *, ordered: bool) -> str:
+    """All channels, and their levels over the touches. ordered: whether these come as they were observed."""
     if sensor.camera:
         return note("Not shown: a camera has no channels that could be dead one by one; look at its frames below.")
     if not kept:
@@ -108,18 +108,16 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], *, ordered: bool)
             "Not shown: no readings of touches are kept. A memory has some once it observed touches, unless it was "
             "made with kept_touches=0."
         )
-    found = _channels(sensor, kept, ordered)
+    found = _channels(sensor, kept, health)
     means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)
     order = "in the order of observation" if ordered else "by material"
     caption = (
-        f"Each row is a channel, 1 at the top; each column a touch, {order}. Dark is the least mean level that "
-        "the channel had, yellow the most. A dead channel is a stripe of one colour; a drifting one changes from left "
-        "to right."
+        f"Each row is a channel, 0 at the top; each column a touch, {order}. Dark is the least mean level that "
+        "the channel had, yellow the most. A dead channel is a stripe of one colour."
     )
     words = (
-        f"Dead: never changes in {DEAD:.0%} of the touches, or in so many of the last {LATELY} (or no touch ever "
-        f"reached it). Saturated: {SATURATED:.0%} of its readings lie at the end of its range. Drifting: its level "
-        f"moves by {DRIFTING:.0%} of the range from the first touch to the last, beside what the materials explain."
+        f"Dead: never changes in {DEAD:.0%} of the touches (or no touch ever reached it). Saturated: {SATURATED:.0%} "
+        "of its readings lie at the end of its range. Since an observation: what the memory's health says changed."
     )
     unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
     low, high = (np.broadcast_to(limit, (sensor.channels,)).astype(np.float64) for limit in sensor.limits)
@@ -133,13 +131,13 @@ def state_rows(
     """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
     faulty = [channel for channel in found if channel.faults]
     others = [channel for channel in found if not channel.faults] if len(found) <= MOST_ROWS else []
-    rows = []
+    rows, drifts = [], any(channel.drift for channel in found)
     for channel in [*faulty, *others][:MOST_ROWS]:
-        bottom, top = float(low[channel.number - 1]), float(high[channel.number - 1])
+        bottom, top = float(low[channel.number]), float(high[channel.number])
         median, least, most = (
             brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
         )
-        moved = "" if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
+        moved = None if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
         rows.append(
             [
                 channel.number,
@@ -149,7 +147,7 @@ def state_rows(
                 f"{channel.still:.0%}",
                 f"{channel.bottom:.1%}",
                 f"{channel.top:.1%}",
-                moved or None,
+                *([moved] if drifts else []),
             ]
         )
     header = [
@@ -160,7 +158,7 @@ def state_rows(
         "never changes",
         "at bottom",
         "at top",
-        "drift",
+        *(["drift"] if drifts else []),
     ]
     left = len(found) - len(rows)
     return table(header, rows, "channels") + (

@@ -11,9 +11,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import FieldError, InputError, ScrollTactileError
+from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.live.answers import LiveState, LiveTouch
+from scroll_tactile.live.answers import LiveState
+from scroll_tactile.live.watching import HealthNotes
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
@@ -22,7 +23,6 @@ from scroll_tactile.ros2.answers import Answer, answer_of, ended, under_way
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.ranges import all_clipped
 from scroll_tactile.signals.stream import Stream
-from store import StoreError
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
@@ -91,10 +91,7 @@ class Bridge:
         self.paused = False
         self._learned: list[Receipt] = []  # by this bridge, and not taken back
         self._answer, self._warn = answer, warn
-        if watch:
-            learner.health()  # or raises: it needs a memory on disk
-        self._watch = watch
-        self._unlearned: LiveTouch | None = None  # the last touch, until it is learned or another ended
+        self._notes = HealthNotes(learner, None, warn, materials=of is None) if watch else None
         self._by: dict[str, Any] = {} if of is None else {"of": of}
         self._pictures = learner.sensor.camera and self.field.text == "data"
         self._header: FieldPath | None = FieldPath("header.stamp.{sec,nanosec}")
@@ -164,7 +161,6 @@ class Bridge:
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
         receipt = self.learner.observe(material, touch)
-        self._unlearned = None  # its row tells of its channels, too
         if receipt.repeated:
             return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         self._learned.append(receipt)
@@ -273,23 +269,8 @@ class Bridge:
     def close(self) -> None:
         """End the touch under way, if any; the learner stays open."""
         self.session.close()
-        self._note_health(None)
-
-    def _note_health(self, ended: LiveTouch | None) -> None:
-        """Note the touch before, if its material is as good as certain, and the rest before the one that ended now.
-
-        A failure, such as a full disk, must not end the session: it is warned of once.
-        """
-        touch, self._unlearned = self._unlearned, ended
-        try:
-            if touch is not None and not self._by:  # by an axis, its name is no material
-                name = touch.prediction.material
-                if touch.decided and touch.prediction.known and name is not None:
-                    self.learner.sense(touch.stream, name)
-            if ended is not None and ended.rest is not None:
-                self.learner.sense(ended.rest)
-        except (ScrollTactileError, StoreError) as error:
-            self._warn_once(error, f"the health of the sensor is not noted: {error}")
+        if self._notes is not None:
+            self._notes.take(None)
 
     def _reading(self, message: object) -> npt.NDArray[Any]:
         found = picture(message) if self._pictures else None
@@ -328,8 +309,8 @@ class Bridge:
         before, self.state = self.state, now
         for touch in now.touches:
             self._answer(ended(touch, self.stamp, self._by))
-            if self._watch:
-                self._note_health(touch)
+            if self._notes is not None:
+                self._notes.take(touch)
         if now.contact:
             fresh = not before.contact or bool(now.touches)
             if now.decided and (fresh or not before.decided):

@@ -12,6 +12,7 @@ import pytest
 from commands import run
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
+from scroll_tactile.health import betting
 from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text, to_text
 from scroll_tactile.health.watch import Watch
@@ -242,7 +243,12 @@ def test_the_command_says_what_changed_and_what_to_do(changed: Path) -> None:
 def test_the_page_shows_the_evidence_as_it_grew(changed: Path, tmp_path: Path) -> None:
     with TactileLearner.open(changed, mode="read") as learner:
         page = memory_page(learner)
+        alike = memory_page(learner, risk=0.1)
+        since = learner.health().since
     assert "Evidence that the sensor changed" in page and "channel 3: says nothing any more" in page
+    strip = alike[alike.index('id="channels"') :]
+    rows = re.findall(r"<td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td>", strip)
+    assert (rows[0], rows[1][1]) == (("3", f"dead since observation {since}"), "fine")
 
 
 def test_what_is_said_of_each_kind_names_what_changed() -> None:
@@ -257,3 +263,59 @@ def test_what_is_said_of_each_kind_names_what_changed() -> None:
             assert text.startswith("since observation 7, 1970-01-01 00:00 UTC channels 1, 2: ")
             assert "--after 12" in advice(found)
     assert "nothing can be told yet" in in_words(Health(None, None, (), "", 1.0, 0.01, 1, None, (), ()))
+
+
+def test_one_material_alone_and_fewer_touches_than_channels() -> None:
+    name = NAMES[0]
+    alone = [(name, touch(name, i)) for i in range(100)]
+    assert watched(alone).alarmed is None
+    changed = [(name, touch(name, i, on_channel(lambda values: 0.9 * values))) for i in range(100, 160)]
+    change = watched([*alone, *changed]).change
+    assert change is not None  # no other material was touched that would show whether it is the material
+    assert (change.kind, change.channels, change.materials) == ("gain", (CHANNEL,), (name,))
+    few = watched(alone[:6])  # of eight channels
+    assert few.alarmed is None and np.isfinite(few.evidence) and len(few.grew) == 5
+
+
+def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    touches = [
+        (name, touch(name, i, None if i < 20 else on_channel(lambda values: 0 * values)))
+        for i in range(30)
+        for name in NAMES
+    ]
+    found = []
+    for jumps in (False, True):
+        with TactileLearner.open(tmp_path / str(jumps), sensor=PAD) as learner, learner.batch():
+            for i, (name, stream) in enumerate(touches):
+                now = 1e9 + i if not jumps else 2e9 - 1e7 * (i % 7)
+                monkeypatch.setattr("time.time", lambda now=now: now)
+                learner.sense(stream, name)
+            found.append(learner.health())
+    steady, jumped = found
+    assert steady.time == 1e9 + steady.since - 1
+    assert jumped.time == 2e9 - 1e7 * ((jumped.since - 1) % 7)
+    assert vars(steady) | {"time": jumped.time} == vars(jumped)
+
+
+def test_martingales_are_those_of_crepes() -> None:
+    martingales = pytest.importorskip("crepes.martingales")
+    random = np.random.default_rng(0)
+    values = np.concatenate([random.random((80, 6)), random.beta(0.4, 2, (60, 6))])
+    bets = betting.Bets(8)
+    for row in values:
+        bets.take(row, 2)
+    jumper = martingales.SimpleJumper(
+        J=betting.JUMP, bf=martingales.EpsilonBettingFunction(betting.STAKES[:, 0].tolist())
+    )
+    theirs = [np.log(jumper.apply(column)[-1]) for column in values.T]
+    np.testing.assert_allclose(bets.log[2:], theirs, rtol=1e-12, atol=1e-12)
+    assert (bets.log[:2] == 0).all()
+
+
+def test_p_values_are_those_of_crepes() -> None:
+    martingales = pytest.importorskip("crepes.martingales")
+    scores = np.random.default_rng(0).integers(0, 9, 40).astype(float)
+    theirs = martingales.semi_online_p_values(scores, seed=7)
+    ties = np.random.RandomState(7).random_sample(len(scores))  # by which crepes breaks its ties
+    ours = [betting.ranks(-scores[: i + 1, None], tie)[0] for i, tie in enumerate(ties)]
+    np.testing.assert_allclose(ours, theirs, rtol=1e-15)

@@ -1,0 +1,267 @@
+"""Health after a retraction, over restarts and beside writers: what a fresh reading of the journal would say."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
+from scroll_tactile.health import watched_rows
+from scroll_tactile.health.watch import Watch
+from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
+from scroll_tactile.validation import stored_watch
+from scroll_tactile.validation.expected import Unexpected
+from store import Checkpoint, StoreError, StoreFullError
+from store.log_writer import LogWriter
+
+PAD = Sensor(name="pad", channels=4, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
+SCENE = Scene(sensor=PAD, seed=3)
+NAMES = SCENE.materials[:3]
+RULES = WatchRules(0.01)
+
+
+def empty() -> WatchedRows:
+    return WatchedRows(RULES, Watch(2, RULES.bound), last=0, known=0, lost=0)
+
+
+def row(sequence: int, seed: int, shift: int) -> WatchedRow:
+    """A touch of one of two materials or the sensor at rest, or a row that does not count."""
+    random = np.random.default_rng([sequence, seed])
+    numbers = random.normal(0, 40, 7).astype(np.int16)
+    numbers[[2, 4]] += shift  # spread and noise of the first channel
+    material = ("a", "a", "b", "", None)[int(random.integers(5))]
+    return WatchedRow(sequence) if material is None else WatchedRow(sequence, material, 30, numbers)
+
+
+def taken(rows: list[WatchedRow], into: WatchedRows) -> WatchedRows:
+    for each in rows:
+        if each.sequence > into.last:
+            into.take(each)
+    return into
+
+
+def state(watched: WatchedRows) -> tuple[Any, ...]:
+    watch = watched.watch
+    arrays = watch.scatter.inverse, watch.bets.shares, watch.bets.log, watch.least, watch.since
+    parts = watch.grew, watch.evidence, watch.taken, watch.alarmed, watch.change
+    return *parts, *(part.tobytes() for part in arrays)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 9),
+    st.lists(st.tuples(st.integers(1, 70), st.floats(0, 1), st.sampled_from([0, 0, 300])), min_size=1, max_size=6),
+)
+def test_rows_taken_back_leave_the_state_of_a_fresh_reading(seed: int, steps: list[tuple[int, float, int]]) -> None:
+    rows, watched, sequence = list[WatchedRow](), empty(), 0
+    for more, place, shift in steps:
+        rows += [row(sequence + i, seed, shift) for i in range(1, more + 1)]
+        sequence += more
+        taken(rows, watched)
+        gone = 1 + round(place * (sequence - 1))
+        rows = [each if each.sequence != gone else WatchedRow(gone) for each in rows]
+        watched.take_back(gone)
+        assert state(taken(rows, watched)) == state(taken(rows, empty()))
+
+
+def test_few_copies_are_kept_and_few_rows_read_again() -> None:
+    rows = [row(sequence, 0, 0) for sequence in range(1, 3001)]
+    watched = taken(rows, empty())
+    assert watched.watch.alarmed is None
+    assert len(watched._earlier) <= 14
+    for gone in (3000, 2990, 2700, 2000):
+        watched.take_back(gone)
+        assert 2 * (3000 - watched.last) <= 4 * (3000 - gone) + 5 * watched_rows.EVERY
+        taken(rows, watched)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A memory of 150 touches, rest readings among them."""
+    path = tmp_path_factory.mktemp("watched") / "memory"
+    with TactileLearner.open(path, sensor=PAD, embedding=Kernels(dimension=64)) as learner, learner.batch():
+        for i in range(50):
+            for name in NAMES:
+                learner.observe(name, SCENE.touch(name, i), source=f"robot-{i % 2}/day.npy")
+    return path
+
+
+@pytest.fixture
+def memory(made: Path, tmp_path: Path) -> Path:
+    with TactileLearner.open(made, mode="read") as learner:
+        learner.backup(tmp_path / "memory")
+    return tmp_path / "memory"
+
+
+class Counted:
+    """How many rows watches took; before each, what is to happen."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.count, self.then = 0, dict[int, Callable[[], object]]()
+        take = Watch.take
+
+        def counted(watch: Watch, *row: Any) -> None:
+            self.count += 1
+            self.then.get(self.count, lambda: None)()
+            take(watch, *row)
+
+        patch.setattr(Watch, "take", counted)
+
+    def rows(self, what: Callable[[], Health]) -> tuple[Health, int]:
+        self.count = 0
+        return what(), self.count
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Counted:
+    return Counted(monkeypatch)
+
+
+def fresh(path: Path, **which: Any) -> Health:
+    with TactileLearner.open(path, mode="read") as learner:
+        return learner.health(**which)
+
+
+def test_an_undo_reads_few_rows_again(memory: Path, counted: Counted) -> None:
+    with TactileLearner.open(memory) as learner:
+        assert counted.rows(learner.health)[1] == 150
+        assert counted.rows(learner.health)[1] == 0
+        learner.retract(150)
+        after, count = counted.rows(learner.health)
+        assert count <= watched_rows.EVERY
+        learner.relabel(139, NAMES[1])
+        learner.forget(source="robot-1/day.npy")
+        learner.sense(SCENE.touch(NAMES[0], 99))
+        last, _ = counted.rows(learner.health)
+        learner.compact()
+        assert counted.rows(learner.health) == (last, 0)
+    assert after.touches == 149 and last.touches == 76
+    assert fresh(memory) == last
+
+
+def test_the_memory_is_free_while_rows_are_read_and_may_change(memory: Path, counted: Counted) -> None:
+    with TactileLearner.open(memory) as learner:
+
+        def observes() -> None:
+            learner.observe(NAMES[0], SCENE.touch(NAMES[0], 77))
+
+        def beside() -> None:
+            thread = threading.Thread(target=observes)
+            thread.start()
+            thread.join(30)
+            assert not thread.is_alive()
+
+        counted.then = {20: beside, 70: lambda: learner.retract(10), 80: learner.health}
+        found, _ = counted.rows(learner.health)
+        counted.then = {}
+        assert found.touches == 150
+    assert fresh(memory) == found
+
+
+def test_rows_of_a_batch_that_was_lost_are_not_there(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise StoreFullError("no space left")
+
+    with TactileLearner.open(memory) as learner:
+        before = learner.health()
+        with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
+            for i in range(4):
+                learner.sense(SCENE.touch(NAMES[0], 80 + i), NAMES[0])
+            assert learner.health().touches == before.touches + 4
+            monkeypatch.setattr(LogWriter, "stage", full)
+            with pytest.raises(StoreFullError):
+                learner.sense(SCENE.touch(NAMES[0], 84), NAMES[0])
+        monkeypatch.undo()
+        for i in range(4):  # these have the same places in the journal
+            learner.sense(SCENE.touch(NAMES[1], 90 + i), NAMES[1])
+        found = learner.health()
+    assert fresh(memory) == found
+
+
+def test_what_was_read_is_kept_over_restarts(memory: Path, counted: Counted) -> None:
+    with TactileLearner.open(memory) as learner:
+        found = learner.health()
+    with TactileLearner.open(memory, mode="read") as learner:
+        assert counted.rows(learner.health) == (found, 0)
+        assert counted.rows(lambda: learner.health(source="robot-0"))[1] == 75  # other rules, other rows
+    with TactileLearner.open(memory) as learner:
+        learner.retract(149)
+        learner.sense(SCENE.touch(NAMES[0], 99))
+        _, count = counted.rows(learner.health)
+        assert count == 150  # what is kept has no copies of before
+        learner.retract(3)  # not read again before it is kept
+    with TactileLearner.open(memory) as learner:
+        found, count = counted.rows(learner.health)
+        assert count == 149
+        learner.sense(SCENE.touch(NAMES[1], 99), NAMES[1])
+    with TactileLearner.open(memory, mode="read") as learner:
+        last, count = counted.rows(learner.health)
+        assert (last.touches, count) == (found.touches + 1, 1)
+    for kept in (memory / "derived").glob(stored_watch.NAME):
+        kept.unlink()
+    assert fresh(memory) == last
+
+
+def kept_of(rows: list[WatchedRow]) -> Checkpoint:
+    watched = taken(rows, empty())
+    arrays, attributes = stored_watch.watch_to_arrays(watched)
+    return Checkpoint(1, watched.last, attributes, arrays)
+
+
+CHANGED = [row(sequence, 1, 0 if sequence < 150 else 400) for sequence in range(1, 250)]
+
+
+def test_a_kept_watch_is_the_same_to_the_bit_and_an_alarm_is_kept() -> None:
+    whole = taken(CHANGED, empty())
+    assert whole.watch.change is not None
+    for count in (0, 1, 40, 249):
+        kept = stored_watch.watched_from(kept_of(CHANGED[:count]), 2, RULES, 0)
+        assert kept is not None
+        assert state(taken(CHANGED, kept)) == state(whole)
+    assert stored_watch.watched_from(kept_of(CHANGED), 2, WatchRules(0.1), 0) is None
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("inverse", np.full((7, 7), np.nan)),
+        ("shares", np.full((5, 14), 2.0)),
+        ("least", np.ones(14)),
+        ("since", np.full(14, 10**6)),
+        ("log", np.zeros(13)),
+        ("rows", np.zeros((3, 7), np.int16)),
+        ("cells", np.array([[9, 1, 1, 1]])),
+        ("recent", np.array([[1, 0, 0]])),
+        ("grew", np.array([7], np.int64)),
+        ("names", ["b", "a"]),
+        ("taken", -1),
+        ("last", 10**6),
+        ("made_by", "0.0.0, 1"),
+        ("change", None),
+        ("change", {"since": 1, "channels": [7], "kind": "gain", "materials": []}),
+        ("change", {"since": 1, "channels": [1], "kind": "gone", "materials": []}),
+    ],
+)
+def test_what_is_no_watch_is_refused(field: str, value: Any) -> None:
+    kept = kept_of(CHANGED)
+    arrays, about = dict(kept.arrays), dict(kept.attributes)
+    (arrays if field in arrays else about)[field] = value
+    with pytest.raises(Unexpected):
+        stored_watch.watched_from(Checkpoint(1, kept.last_sequence, about, arrays), 2, RULES, 0)
+
+
+def test_a_wrong_file_is_passed_over(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with TactileLearner.open(memory) as learner:
+        found = learner.health()
+        to_arrays = stored_watch.watch_to_arrays
+        wrong = {"inverse": np.zeros((3, 3))}
+        monkeypatch.setattr(
+            "scroll_tactile.persistence.watching.watch_to_arrays",
+            lambda watched: (to_arrays(watched)[0] | wrong, to_arrays(watched)[1]),
+        )
+    assert fresh(memory) == found

@@ -95,7 +95,6 @@ def test_continual_and_robustness_have_its_rows(made, tmp_path):
     assert result.exit_code == 0, result.output
     found = json.loads((tmp_path / "r.json").read_text())
     assert set(found[OWN]["roboskin-20"]["clean"]) == {"accuracy"}
-    assert f"right, {OWN}" in result.output.replace("\n", "") or "NearestMean" in result.output
 
 
 def test_metrics_and_unlearning_measure_it(recordings):
@@ -128,7 +127,7 @@ def test_a_library_that_is_missing_is_said_before_anything_is_measured(made, mon
 
 
 def test_rows_that_are_done_are_shown_and_quick_ones_are_not_compared(made, monkeypatch, tmp_path):
-    def fail(*_):
+    def fail(*_, **__):
         raise InputError("it cannot be fitted")
 
     words = "table1", "--sets", "roboskin-20", "--data", tmp_path, "--quick", "--systems", "svm", "--system", OWN

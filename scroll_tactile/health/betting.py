@@ -141,11 +141,11 @@ def own_scores(rows: Rows) -> Whole:
 
     A great change widens the scatter and hides in it, and shows here.
     """
-    n = rows.shape[1] // KINDS
-    lively = rows[:, n : 2 * n].astype(np.int32) + rows[:, 2 * n : 3 * n]
-    middle = np.partition(lively, [(n - 1) // 2, n // 2], axis=1)
-    lively -= np.rint((middle[:, [(n - 1) // 2]] + middle[:, [n // 2]]) / 2).astype(np.int32)
-    return np.concatenate([rows[:, :n], lively], axis=1)
+    n, whole = rows.shape[1] // KINDS, rows.astype(np.int32)
+    lively = whole[:, n : 2 * n] + whole[:, 2 * n : 3 * n]
+    ordered = np.sort(lively, axis=1)
+    lively -= np.rint((ordered[:, (n - 1) // 2] + ordered[:, n // 2]) / 2).astype(np.int32)[:, None]
+    return np.concatenate([whole[:, :n], lively], axis=1)
 
 
 def resting_scores(rows: Rows) -> Whole:

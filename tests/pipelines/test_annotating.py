@@ -310,7 +310,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(learner, before, tmp_pa
     for how, error, match in cases:
         with pytest.raises(error, match=match):
             annotate(learner, before, **({"output": out, "field": "pad"} | how))
-    with pytest.raises(RecordingError, match="it is no folder"):
+    with pytest.raises(RecordingError, match="there is no such folder"):
         annotate(learner, tmp_path / "none", output=out, field="pad")
     with pytest.raises(InputError, match="this one is empty"):
         annotate(TactileLearner(sensor=PAD, embedding=SMALL), before, output=out, field="pad")

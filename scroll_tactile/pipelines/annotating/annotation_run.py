@@ -131,7 +131,8 @@ def annotate(
 def _opened(dataset: str | os.PathLike[str], field: str | None, clock: str | None) -> LeRobot:
     path = Path(dataset)
     if not is_lerobot(path):
-        what = "there is no meta/info.json in it" if path.is_dir() else "it is no folder of this machine"
+        kinds = {True: "there is no meta/info.json in it", False: "there is no such folder on this machine"}
+        what = "it is a file" if path.is_file() else kinds[path.is_dir()]
         raise RecordingError(f"expected the folder of a LeRobot data set; came {path}: {what}")
     with guarded(str(path)):
         source = LeRobot(path, str(path), Request(field=field, clock=clock))

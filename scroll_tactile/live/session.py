@@ -261,10 +261,18 @@ class LiveSession:
             self._recent.clear()
 
     def _touched(self, rows: Array) -> bool:
-        """Whether the memory knows what came while rest was to be learned, in parts no longer than what it learned."""
+        """Whether what came while rest was to be learned is a touch: the memory knows half of it or more.
+
+        It is judged in parts no longer than what was learned. What is like a learned touch but for its level, or
+        through noise alone, is rest: it has no features but noise.
+        """
         model = self._predictor.frozen().model
-        parts = np.array_split(rows, -(-len(rows) // max(1, model.longest))) if model.names else []
-        return bool(parts) and all(self._predictor.predict((part,), None).known is True for part in parts)
+        if not model.names:
+            return False
+        parts = np.array_split(rows, -(-len(rows) // model.longest))
+        found = [self._predictor.predict((part,), None) for part in parts]
+        known = [each.known is True and not {"noisy", "zero moved"} & set(each.unusual) for each in found]
+        return 2 * sum(known) >= len(known)
 
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""

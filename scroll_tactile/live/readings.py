@@ -22,7 +22,7 @@ from scroll_tactile.signals.correction import Correction, corrected_stream
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 
-__all__ = ["GrowingTouch", "Recent", "TouchRows"]
+__all__ = ["GrowingTouch", "Recent", "TouchRows", "is_touch"]
 
 Array = npt.NDArray[Any]
 
@@ -184,3 +184,17 @@ class GrowingTouch:
             found = [(self.estimates[name].width, width) for name, width in self.widths.items()]
             narrow = [own is not None and own <= width for own, width in found]
             self.settled = self.settled or (bool(narrow) and all(narrow))
+
+
+def is_touch(predictor: Predictor, rows: Array) -> bool:
+    """Whether readings (k, n) that came while rest was to be learned are a touch, or hold a part of one.
+
+    They are judged in parts no longer than what was learned. What is like a learned touch but for its level, or through
+    noise alone, is rest: it has no features but noise.
+    """
+    model = predictor.frozen().model
+    if not model.names:
+        return False
+    parts = np.array_split(rows, -(-len(rows) // model.longest))
+    found = [predictor.predict((part,), None) for part in parts]
+    return any(each.known is True and not {"noisy", "zero moved"} & set(each.unusual) for each in found)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from numbers import Real
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -20,7 +21,7 @@ from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event
 from scroll_tactile.live.pressing import PressDetector
-from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows
+from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows, is_touch
 from scroll_tactile.live.watching import HealthNotes
 from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
@@ -77,7 +78,7 @@ class LiveSession:
             self._detector = (
                 PressDetector(sensor, self._rest)
                 if sensor.camera
-                else ContactDetector(sensor, false_contacts, self._touched)
+                else ContactDetector(sensor, false_contacts, partial(is_touch, predictor))
             )
         self.report = LiveReport(learning=not self._manual and not sensor.camera)
         self._clock = Clock(sensor.rate, self.report)
@@ -167,11 +168,9 @@ class LiveSession:
         self._again = True
 
     def adjust(self, *, risk: float, scene: Sequence[str] | None) -> None:
-        """Decide by another risk, and among the materials of another scene, from the next touch on.
+        """Decide by another risk, and among another scene, from the next touch on; a new risk may take seconds.
 
-        A risk that is new to the memory's model is measured first, which may take seconds. Raises InputError for a risk
-        that is none, for an empty scene, and after `close`; UnknownMaterialError for a scene that names a material
-        never observed. Then nothing has changed.
+        Raises what `TactileLearner.live` raises for these, and InputError after `close`. Then nothing has changed.
         """
         self._require_open()
         _require_risk(risk)
@@ -264,12 +263,6 @@ class LiveSession:
             self.report.relearned += 1
             self._leave(touch)
             self._recent.clear()
-
-    def _touched(self, rows: Array) -> bool:
-        """Whether the memory knows what came while rest was to be learned, in parts no longer than what it learned."""
-        model = self._predictor.frozen().model
-        parts = np.array_split(rows, -(-len(rows) // max(1, model.longest))) if model.names else []
-        return bool(parts) and all(self._predictor.predict((part,), None).known is True for part in parts)
 
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""

@@ -23,19 +23,27 @@ class Value:
 
 
 class Node:
-    def __init__(self, *, executable, arguments, name, namespace, parameters, output="log", autostart=None):
+    def __init__(self, *, executable, arguments, name, namespace, parameters, output="log"):
         self.words, self.name, self.namespace, self.parameters = [executable, *arguments], name, namespace, parameters
-        self.autostart = autostart
+
+
+class Event:
+    def __init__(self, **fields):
+        vars(self).update(fields)
 
 
 def doubles(monkeypatch):
     """Put the doubles where launch files import from."""
     names = {
         "launch": {"LaunchDescription": list},
-        "launch.actions": {"DeclareLaunchArgument": Argument},
+        "launch.actions": {"DeclareLaunchArgument": Argument, "EmitEvent": Event, "RegisterEventHandler": list},
+        "launch.events": {"matches_action": id},
         "launch.substitutions": {"LaunchConfiguration": Value},
         "launch_ros": {},
         "launch_ros.actions": {"Node": Node, "LifecycleNode": Node},
+        "launch_ros.event_handlers": {"OnStateTransition": lambda **fields: [Event(**fields)]},
+        "launch_ros.events": {},
+        "launch_ros.events.lifecycle": {"ChangeState": Event},
     }
     for name, found in names.items():
         module = ModuleType(name)
@@ -44,7 +52,7 @@ def doubles(monkeypatch):
 
 
 def launched(file, folder, **given):
-    """The words of the command that a launch file's node is, with these launch arguments, and the node."""
+    """The words of the command that a launch file's node is, with these launch arguments, and its transitions."""
     entities = runpy.run_path(str(file))["generate_launch_description"]()
     arguments = {each.name: given.get(each.name, each.default) for each in entities if isinstance(each, Argument)}
     assert given.keys() <= arguments.keys() and None not in arguments.values()
@@ -62,4 +70,9 @@ def launched(file, folder, **given):
             lines = [f"    {key}: {json.dumps(of(value))}\n" for key, value in each.items()]
             file.write_text(f"/**:\n  ros__parameters:\n{''.join(lines)}")
         words += ["--params-file", str(file if isinstance(each, dict) else of(each))]
-    return words, node
+    first = [each.event for each in entities if isinstance(each, Event)]
+    handled = [handler for each in entities if isinstance(each, list) for handler in each]
+    later = [entity.event for handler in handled for entity in handler.entities if handler.goal_state == "inactive"]
+    assert all(event.lifecycle_node_matcher == id(node) for event in (*first, *later))
+    assert all(handler.target_lifecycle_node is node for handler in handled)
+    return words, [event.transition_id for event in (*first, *later)]

@@ -186,12 +186,15 @@ def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeyp
         (tmp_path / "hand.yaml").write_text(text.replace("/rh/tactile", TOPIC))
         given = {"params": str(tmp_path / "hand.yaml")}
     file = EXAMPLES / "launch" / f"{name}.launch.py"
-    words, node = launching.launched(file, tmp_path, memory=str(own), namespace="/left", **given)
+    words, transitions = launching.launched(file, tmp_path, memory=str(own), namespace="/left", **given)
     assert words.pop(0) == "scroll-tactile"
     with command("-m", "scroll_tactile.cli", *words, stdout=subprocess.PIPE) as process:
         remote = Remote(spinning, "/left/scroll_tactile")
-        if node.autostart:
-            assert remote.state() == "unconfigured" and remote.go("configure") and remote.go("activate")
+        if transitions:
+            assert remote.state() == "unconfigured"
+        for transition in transitions:
+            assert remote.ask(ChangeState, "change_state", transition=Transition(id=transition)).success
+        assert remote.state() == "active"
         place = "" if name == "finger" else "thumb/"
         remote.listen(f"{place}answer")
         with publishing(500, 250):

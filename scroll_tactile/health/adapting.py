@@ -203,8 +203,8 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     """What became of each channel, by touches as shares of the range, (T, n) each, of these materials.
 
     The materials were taken into the reference. ends: the share of earlier readings of each channel that lie at an end
-    of the range, (n,): one that is clipped more often now is lost, as what it reads is not known. `before` and `after`
-    say whether it explains the touches better.
+    of the range, (n,): one that is clipped more often now is lost, as what it reads is not known.
+    `before` and `after` say whether it explains the touches better.
     """
     n, fit = reference.channels, _Fit(reference, touches, materials, ends)
     none = np.zeros(2 * n)

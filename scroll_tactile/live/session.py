@@ -337,9 +337,9 @@ class LiveSession:
         self.report.undecided += not touch.decided
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
-        said = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
+        outcome = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
         rest = None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
-        self._ended.append(LiveTouch(stream, prediction, *said, rest))
+        self._ended.append(LiveTouch(stream, prediction, *outcome, rest))
         self._settled = touch.settled
         if self._notes is not None:
             self._notes.take(self._ended[-1])
@@ -361,8 +361,8 @@ class LiveSession:
         if not ended:
             return _AT_REST
         last = ended[-1]
-        said = last.prediction, last.decided, True, ended, last.estimates, self._settled
-        return LiveState(False, last.stream.seconds, *said)
+        outcome = last.prediction, last.decided, True, ended, last.estimates, self._settled
+        return LiveState(False, last.stream.seconds, *outcome)
 
 
 def _require_risk(risk: float) -> None:
@@ -371,20 +371,20 @@ def _require_risk(risk: float) -> None:
 
 
 def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:
-    """Widths that were asked for, of quantities that were declared; the heads that estimate them are fitted."""
-    estimator, asked = predictor.estimator(), dict(widths or {})
-    for name, width in asked.items():
+    """The requested widths, of quantities that were declared; the heads that estimate them are fitted."""
+    estimator, requested = predictor.estimator(), dict(widths or {})
+    for name, width in requested.items():
         if not (isinstance(width, Real) and 0 < float(width) < math.inf):
             raise InputError(f"expected the width of {name!r} as a number above 0; came {width!r:.60}")
     if estimator is None:
-        if asked:
+        if requested:
             why = "none was declared, or answers are by labels"
-            raise InputError(f"expected widths of declared quantities; came {sorted(asked)}, and {why}")
+            raise InputError(f"expected widths of declared quantities; came {sorted(requested)}, and {why}")
         return {}
-    estimator.wanted(list(asked))
+    estimator.wanted(list(requested))
     for stage in range(estimator.last + 1):
         estimator.heads(stage)  # a touch under way should not wait for them
-    return asked
+    return requested
 
 
 def _says(prediction: Prediction) -> str | None:

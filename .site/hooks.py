@@ -136,12 +136,10 @@ def _overview() -> str:
 def _api_part(api: str, place: str) -> str:
     """The part of API.md that a page of the reference shows in another form; all of it for the first."""
     title = Path(place).stem.replace("-", ".")
-    return (
-        api
-        if title == "index"
-        else f"# {title}\n\n"
-        + (re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", api, re.MULTILINE | re.DOTALL) or [""])[1]
-    )
+    if title == "index":
+        return api
+    part = section(ROOT / "scroll_tactile/API.md", title)
+    return f"# {title}\n\nThe public names of `{title}`, and what their docstrings promise.\n\n{part}\n"
 
 
 def _decisions() -> str:

@@ -99,8 +99,7 @@ def notebook(path: Path) -> dict[str, str | bytes]:
 def about(text: str) -> tuple[str, str]:
     """Title and first sentence of a page."""
     title = re.search(r"^# (.+)$", text, re.MULTILINE)
-    rest = [
-        part for part in text[title.end() if title else 0 :].split("\n\n") if not part.strip(" \n").startswith(NO_TEXT)
-    ]
-    sentence = re.split(r"(?<=\.)\s(?=[A-Z])", " ".join(rest[0].split()))[0] if rest else ""
+    paragraphs = [part.strip(" \n") for part in text[title.end() if title else 0 :].split("\n\n")]
+    first = next((part for part in paragraphs if part and not part.startswith(NO_TEXT)), "")
+    sentence = re.split(r"(?<=\.)\s(?=[A-Z])", " ".join(first.split()))[0]
     return (title[1] if title else "Page"), re.sub(LINK, r"\2", sentence)

@@ -124,7 +124,7 @@ class _Served:
                 learner.close()
 
     def tried(self, *steps: Callable[[], None]) -> bool:
-        """Take steps of a transition; whether they could be taken. What hindered them is logged, and kept as `error`."""
+        """Take steps of a transition; whether they could be taken. What hinders them is logged, and is `error` then."""
         self.error = None
         try:
             for step in steps:

@@ -21,7 +21,7 @@ from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.cli.terminal import progress_bar
 from scroll_tactile.errors import InputError
-from scroll_tactile.ros2 import TactileNode
+from scroll_tactile.ros2 import Listener, TactileNode
 from scroll_tactile.ros2.interfaces import interface, require_rclpy
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import simulated_shift
@@ -71,8 +71,8 @@ def run_node(seconds: float, note: Callable[[str], None]) -> Record:
     return {"bench": "ros2", "records": [record]}
 
 
-class _Timed(TactileNode):
-    """A node that notes when it knows each state."""
+class _Timed(Listener):
+    """A listener that notes when what takes its messages knows each state."""
 
     latencies: list[float]
 
@@ -91,13 +91,14 @@ def _received(learner: TactileLearner, count: int) -> tuple[list[float], Mapping
         node = rclpy.create_node("scroll_tactile", context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
-        timed = _Timed(node, learner, TOPIC, "position")
+        timed = _Timed(node, TOPIC)
         timed.latencies = []
+        served = TactileNode(node, learner, TOPIC, "position", listener=timed)
         end = time.monotonic() + WAITED + count / sensors.BIOTAC.rate
         while len(timed.latencies) < count and time.monotonic() < end:
             executor.spin_once(timeout_sec=0.1)
-        timed.close()
-        return timed.latencies, timed.bridge.status()
+        served.close()
+        return timed.latencies, served.bridge.status()
     finally:
         rclpy.try_shutdown(context=context)
 

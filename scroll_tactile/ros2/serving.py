@@ -124,7 +124,7 @@ class _Served:
                 learner.close()
 
     def tried(self, *steps: Callable[[], None]) -> bool:
-        """Take steps of a transition; whether they could be taken. Otherwise all is let go but what was before it."""
+        """Take steps of a transition; whether they could be taken. What hinders them is logged, and is `error` then."""
         self.error = None
         try:
             for step in steps:
@@ -138,9 +138,9 @@ class _Served:
         from rcl_interfaces.msg import SetParametersResult
 
         for parameter in parameters:
-            known = next((each for each in STATIC if each.name == parameter.name), None)
+            known = next((each for each in (*STATIC, *DYNAMIC) if each.name == parameter.name), None)
             why = "" if known is None else refused(known, parameter.value)
-            if known is not None and self.learner is not None and not why:
+            if known in STATIC and self.learner is not None and not why:
                 node = self.node.get_fully_qualified_name()
                 why = (
                     f"parameter {parameter.name} is read when the node is configured: ros2 lifecycle set {node} "

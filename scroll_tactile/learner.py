@@ -297,8 +297,8 @@ class TactileLearner(MemoryKeeper):
         UnknownMaterialError for a scene that names a material never observed; AnnotationError for an axis that no
         touch has a label on.
         """
+        from scroll_tactile.live.health_notes import HealthNotes
         from scroll_tactile.live.session import LiveSession
-        from scroll_tactile.live.watching import HealthNotes
 
         session: dict[str, Any] = {"risk": risk, "contact": contact, "false_contacts": false_contacts, "scene": scene}
         notes = None if changed is None else HealthNotes(self, changed, logger.warning, materials=of is None)

@@ -1,4 +1,4 @@
-"""`scroll-tactile live`: readings from a file or another program, and the answer as it grows."""
+"""`scroll-tactile live` and `annotate`: answers as they grow, shown, or written beside what a robot recorded."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +14,18 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.options import Axis, Clock, Columns, Field, MemoryFolder, Preset, Topic
-from scroll_tactile.cli.terminal import console, estimate_text, opened, percent, say, say_json, shown, verdict
+from scroll_tactile.cli.options import AsJson, Axis, Clock, Columns, Field, MemoryFolder, Preset, Topic, materials_of
+from scroll_tactile.cli.terminal import (
+    console,
+    estimate_text,
+    opened,
+    percent,
+    progress_bar,
+    say,
+    say_json,
+    shown,
+    verdict,
+)
 from scroll_tactile.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,12 +34,13 @@ if TYPE_CHECKING:
 
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
+    from scroll_tactile.pipelines.annotating.annotation_run import Annotated as Done
     from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
     from scroll_tactile.results import Estimate
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.viewer.touch_log import TouchLog
 
-__all__ = ["live"]
+__all__ = ["annotate", "live"]
 
 SHOWN = 5  # materials
 BAR = 30  # characters of a probability of one
@@ -261,3 +273,79 @@ def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
     ]
     if irregular:
         say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in irregular))
+
+
+class TouchCut(StrEnum):
+    """Where touches begin and end in an episode."""
+
+    EPISODES = "episodes"
+    CONTACT = "contact"
+
+
+def annotate(
+    dataset: Annotated[Path, typer.Argument(help="The folder of a LeRobot data set, v3.", show_default=False)],
+    memory: Annotated[Path, typer.Option(help="The folder of the memory that answers.", show_default=False)],
+    output: Annotated[
+        Path | None, typer.Option(help="A new folder for the data set with answers; DATASET-annotated without it.")
+    ] = None,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Change the data set itself; meta.before keeps its meta/ as it was.")
+    ] = False,
+    forms: Annotated[str, typer.Option("--as", help="numbers, language, or both with a comma between.")] = (
+        "numbers,language"
+    ),
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Answer anew where answers are there; events of others stay.")
+    ] = False,
+    field: Field = None,
+    columns: Columns = None,
+    clock: Clock = None,
+    cut: Annotated[
+        TouchCut, typer.Option(help="Each episode is one touch; or they are found by contact, after 2 s at rest in it.")
+    ] = TouchCut.EPISODES,
+    risk: Annotated[float, typer.Option(help="The share of wrong answers among those that are decided.")] = 0.05,
+    scene: Annotated[
+        str | None, typer.Option(help="The materials that can be here, separated by commas; all of them otherwise.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write into a LeRobot data set what the memory answers at each frame, knowing no more than the frames before it.
+
+    Columns observation.touch.material (a number; meta/info.json has the names), .probability, .known and .QUANTITY, and
+    events in language_events. All else stays as it is. Interrupt it, type it again, and it goes on.
+    """
+    from scroll_tactile.pipelines.annotating.annotation_run import annotate as annotated
+
+    with opened(memory, mode="read") as learner, progress_bar() as progress:
+        done = annotated(
+            learner,
+            dataset,
+            output=output,
+            in_place=in_place,
+            replace=replace,
+            forms=[form.strip() for form in forms.split(",")],
+            field=field,
+            columns=columns,
+            clock=clock,
+            cut=cut.value,
+            risk=risk,
+            scene=materials_of(scene),
+            progress=progress,
+        )
+    _report(done, as_json)
+
+
+def _report(done: Done, as_json: bool) -> None:
+    if as_json:
+        kept = None if done.kept is None else str(done.kept)
+        say_json(vars(done) | {"output": str(done.output), "kept": kept})
+        return
+    say(
+        f"[bold]annotated:[/] {done.episodes} episodes, {done.touches} touches; of {done.frames} frames "
+        f"{done.answered} have an answer, {done.events} an event"
+    )
+    if not done.touches:
+        say("[yellow]no touch was found[/]: with --cut contact each episode has to begin with two seconds at rest")
+    if done.left_out:
+        say(f"[bold]left out:[/] {done.left_out} frames whose readings are NaN or infinite")
+    say(f"written: {shown(done.output)}" + (f"; as it was before: {shown(done.kept)}" if done.kept else ""))

@@ -20,9 +20,9 @@ from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event
+from scroll_tactile.live.health_notes import HealthNotes
 from scroll_tactile.live.pressing import PressDetector
 from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows, is_touch
-from scroll_tactile.live.watching import HealthNotes
 from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor

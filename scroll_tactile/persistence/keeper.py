@@ -17,13 +17,12 @@ from scroll_tactile.health.watched_rows import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.persistence.adapting import adapt_to, known_touches
 from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
-from scroll_tactile.persistence.watching import health_of
+from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Adaptation, Compacted, Health, Merged, Observation, Receipt
 from scroll_tactile.sensors import Sensor
@@ -156,7 +155,7 @@ class MemoryKeeper(ABC):
         more; or a mapping from materials to readings. until: the last row of the journal that the skin before it felt,
         such as the one before `Health.since`; None: all.
 
-        A gain and an offset of each channel are estimated from them, drawn to none (see `health.adapting`), and a
+        A gain and an offset of each channel are estimated from them, drawn to none (see `health.skin_fit`), and a
         channel that reads nothing any more is left out. Where that explains touches better which it was not estimated
         from, later ones are read through it: `observe`, `predict`, `estimate`, `compose`, `sense` and touches that
         begin in live sessions. What was learned stays as it is, to the byte; `retract` takes the adaptation back.

@@ -26,7 +26,7 @@ from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.replaying import load
-from scroll_tactile.persistence.watching import health_to_store
+from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings

@@ -10,7 +10,7 @@ import importlib
 import typing
 
 if typing.TYPE_CHECKING:
-    from scroll_tactile.ros2.answers import Answer
+    from scroll_tactile.ros2.answer_fields import Answer
     from scroll_tactile.ros2.bridge import Bridge, BridgeReport
     from scroll_tactile.ros2.interfaces import Quality
     from scroll_tactile.ros2.listening import Listener

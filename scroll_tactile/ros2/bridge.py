@@ -14,12 +14,12 @@ import numpy.typing as npt
 from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState
-from scroll_tactile.live.watching import HealthNotes
+from scroll_tactile.live.health_notes import HealthNotes
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
 from scroll_tactile.results import Receipt
-from scroll_tactile.ros2.answers import Answer, answer_of, ended, under_way
+from scroll_tactile.ros2.answer_fields import Answer, answer_of, ended, under_way
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.ranges import all_clipped
 from scroll_tactile.signals.stream import Stream

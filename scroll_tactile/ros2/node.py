@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from scroll_tactile.errors import FieldError, InputError, ScrollTactileError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.ros2.answers import Answer
+from scroll_tactile.ros2.answer_fields import Answer
 from scroll_tactile.ros2.bridge import Bridge
 from scroll_tactile.ros2.interfaces import Quality, interface
 from scroll_tactile.ros2.listening import Listener

@@ -8,7 +8,7 @@ from typing import Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.health.advice import advice, in_words
-from scroll_tactile.ros2.answers import Answer
+from scroll_tactile.ros2.answer_fields import Answer
 from scroll_tactile.ros2.bridge import RESTLESS, Bridge
 from scroll_tactile.ros2.interfaces import interface, kept
 from store import StoreError

@@ -261,7 +261,7 @@ def test_a_wrong_file_is_passed_over(memory: Path, monkeypatch: pytest.MonkeyPat
         to_arrays = stored_watch.watch_to_arrays
         wrong = {"inverse": np.zeros((3, 3))}
         monkeypatch.setattr(
-            "scroll_tactile.persistence.watching.watch_to_arrays",
+            "scroll_tactile.persistence.sensor_rows.watch_to_arrays",
             lambda watched: (to_arrays(watched)[0] | wrong, to_arrays(watched)[1]),
         )
     assert fresh(memory) == found

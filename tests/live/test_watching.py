@@ -8,7 +8,7 @@ import pytest
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
 from scroll_tactile.live.answers import LiveTouch
-from scroll_tactile.live.watching import HealthNotes
+from scroll_tactile.live.health_notes import HealthNotes
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream, validate
 from store import StoreError

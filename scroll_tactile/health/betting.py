@@ -2,8 +2,9 @@
 
 Of each channel three scores are ranked, by what a change of it would do: the linear statistics dᵀ P x that tell a
 gain, an offset and noise from what else moves, P the inverse of the scatter of touches within materials. P contains
-the touch itself and treats it as the others, so that its rank among the touches of its own material and length is
-uniform and independent of all before it, whatever mixture of materials comes (transductive, Mondrian: Vovk, Gammerman,
+the touch itself and treats it as the others, so that its rank among the touches of its own cell (material, length and
+level) is uniform and independent of all before it, whatever mixture of materials comes (transductive, Mondrian: Vovk,
+Gammerman,
 Shafer, Algorithmic Learning in a Random World, 2005). A simple jumper bets on each score (Volkhonskiy and others,
 COPA 2017): factors 1 + ε (p − 1/2), capital moved between the ε at a rate J. The mean of all martingales is one, too,
 and reaches 1/bound with a probability of at most the bound, ever (Ville).
@@ -41,7 +42,7 @@ Whole = npt.NDArray[np.int32]
 
 STAKES = np.array([-1.9, -0.95, 0.0, 0.95, 1.9])[:, None]  # below 2: a factor stays above 0
 JUMP = 0.01
-PRIOR = 0.02  # of a logarithm: what a number scatters by, as far as a touch for each of them, before any came
+PRIOR = 0.02  # of a logarithm: the assumed deviation of a number, which counts as one touch for each number
 COARSE = 0.7  # of a logarithm, a factor of two: changes of a mixture are smaller
 SCORES = 5  # of a channel
 LEVELS = 1 / 3  # of a logarithm: the width of a cell of the level of a touch
@@ -76,7 +77,8 @@ class Bets:
 
 
 class Scatter:
-    """The inverse of prior + Σ (x − mean of its cell)(x − mean)ᵀ, updated by each touch (Sherman, Morrison 1950)."""
+    """The inverse of the prior plus the scatter of touches about the means of their cells, updated by each touch
+    (Sherman, Morrison 1950)."""
 
     def __init__(self, channels: int) -> None:
         self.channels, size = channels, KINDS * channels + 1
@@ -139,7 +141,7 @@ class Scatter:
 def own_scores(rows: Rows) -> Whole:
     """Of rows (k, size) the level of each channel, and how lively it is beside the others, in `UNIT`, (k, 2 n).
 
-    A great change widens the scatter and hides in it, and shows here.
+    A large change widens the scatter, in which the linear scores hide it; these scores show it.
     """
     n, whole = rows.shape[1] // KINDS, rows.astype(np.int32)
     lively = whole[:, n : 2 * n] + whole[:, 2 * n : 3 * n]

@@ -48,7 +48,7 @@ def diagnose(
 ) -> SensorChange:
     """The change that the last touches show: the signatures that explain their mean.
 
-    One signature after another is taken that explains most of what is left of δᵀ P δ, as long as chance would not
+    Signatures are taken one by one, each time the one that explains most of what is left of δᵀ P δ, until chance would
     explain as much (matching pursuit; χ² with Bonferroni's bound). recent: touches, and behind: whether the martingale
     of the greatest score, top, had begun to grow. P is of the touches before them.
     """

@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 SIGMAS = (0.03, 0.12)  # of log gains: units of one make, and other ones
 TAUS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # of offsets, of what readings of a channel span
-OWN = 0.02  # of a logarithm: what a number scatters by besides
+OWN = 0.02  # of a logarithm: added, in squares, to the standard deviation of each number
 IDLE = 1.0  # times the floor of spreads: a channel below it says nothing of its gain
 CLIPPED, MOSTLY = 0.1, 0.4  # of the readings: more of them at an end of the range than before; that usually are there
 DEAD = -3.0  # of the logarithms of spread and noise, together: a channel that fell by so much reads nothing any more

@@ -30,7 +30,7 @@ from scroll_tactile.health.diagnosis import Deviation, SensorChange, diagnose, d
 
 __all__ = ["AT_REST", "MOST_ROWS", "RECENT", "Cell", "Place", "Watch"]
 
-MOST_ROWS = 256  # of a cell, then it is halved: ranks among rows that never change would be learned
+MOST_ROWS = 256  # rows of a cell; a fuller cell drops its older half, or ranks would be learned
 RECENT = 128  # touches from which a change is told
 
 Place = tuple[str, int, int]
@@ -60,7 +60,7 @@ class Cell(NamedTuple):
         return Cell(rows, scores, self.total + other.total)
 
     def bounded(self) -> Cell:
-        """Without the older half where it is full, so that those that are left get others."""
+        """The cell, without its older half where it is full, so that later rows are ranked among others."""
         if len(self.rows) <= MOST_ROWS:
             return self
         rows = self.rows[MOST_ROWS // 2 :].copy()

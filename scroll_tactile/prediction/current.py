@@ -113,10 +113,10 @@ class CurrentModel:
         return present
 
     def _present(self, ledger: Ledger) -> Model:
-        memory = ledger.memory  # first: reading it again after a change that was cut short counts as a version
+        memory = ledger.memory  # first: after an interrupted change this reads the memory again, a new version
         self._load_stored(ledger)
         self.take_in(ledger)
-        # No model while it is updated: an update that is cut short leaves it between two states.
+        # The model is None during the update: an interrupted update leaves a half-updated model.
         (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
         before = model
         if model is not None and (behind is None or self._due(model, memory)):
@@ -179,7 +179,8 @@ class CurrentModel:
         return made[0] | banks_to_arrays(self._reading.embedding), *made[1:]
 
     def prepare(self, ledger: Ledger) -> None:
-        """Start a fit or a renewal if enough touches came since the last. Raises nothing: the observation is stored."""
+        """Start a fit or a renewal if enough touches came since the last. A lack of memory or threads raises nothing
+        here."""
         self.take_in(ledger)
         model, memory = self._model, ledger.memory
         if model is None:
@@ -215,7 +216,7 @@ class CurrentModel:
         return self._model
 
     def examined(self, ledger: Ledger) -> Model:
-        """The model that predictions are made with, the caller's own, with its sampled touches held out of it."""
+        """A copy of the present model, with the scores of its sampled touches, each held out."""
         model = self._present(ledger)
         if model.fusion is None or self._exact:
             return model.copy()
@@ -239,7 +240,7 @@ class CurrentModel:
             )  # releases a snapshot, which would keep a copy of all that changes
         self._exact = False  # of an axis, a touch without a label changes the samples alone
         added = ledger.added if self._model is not None else None
-        # Unset until all is noted: cut short in between, a touch would be noted twice, or never.
+        # None until all changes are noted: if this is interrupted, a touch could be noted twice, or never.
         behind, jobs = self._behind, (self._fit, self._renewal)
         self._behind, self._fit, self._renewal = None, None, None
         self._version = ledger.version
@@ -301,7 +302,7 @@ class CurrentModel:
         return self._composer[3]
 
     def estimator(self, ledger: Ledger) -> Estimator:
-        """What estimates by the sampled touches of this memory; its heads stay while these are the same."""
+        """The estimator of this memory; it keeps its fitted heads while the sampled touches are the same."""
         self._estimator = estimator_of(ledger.memory, self._estimator)
         return self._estimator
 

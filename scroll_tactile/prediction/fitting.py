@@ -2,8 +2,8 @@
 
 A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its prefixes, and its versions at
 other paces, are made from its kept levels. Readouts and kept touches, both without it, judge all of these, as they will
-judge a new touch. The calibrations, and the weights of readouts and kept touches at each moment, are fitted to that,
-here and nowhere else: a prediction fits nothing, and the model is a function of the set of touches.
+judge a new touch. The calibrations (`readouts.calibration`) and the weights of readouts and kept touches at each moment
+(`fusion`) are fitted to these judgements. A prediction fits nothing, and the model is a function of the set of touches.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Draft:
             raise InputError(
                 f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"'
             )
-        # The ridge's reference is all materials, as in the paper; LDA's those with a sampled touch: all, while few.
+        # The ridge's reference materials are all, as in the paper; LDA's are those with a sampled touch.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
         judging = [scale for scale in statistics.scales if statistics.second(scale).rows]
         tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}

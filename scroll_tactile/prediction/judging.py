@@ -56,7 +56,8 @@ def answer(
 
     Probabilities and novelties of several touches add up as far as the touches are independent (see
     `readouts.dependence`), in any order to the same bits; a touch that comes twice counts once. The p of their
-    typicality is twice the mean of theirs, which holds however they depend on each other (Vovk and Wang 2020).
+    typicality is twice the mean of theirs, a bound that holds whatever the dependence between them (Vovk and Wang
+    2020).
     """
     once = {touch.stream.key: (touch, logits) for touch, logits in touches} if len(touches) > 1 else {b"": touches[0]}
     own = [once[key] for key in sorted(once)]

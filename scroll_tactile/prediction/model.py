@@ -68,9 +68,10 @@ def enough_memory() -> Iterator[None]:
 class Judgement:
     """The judgement of a touch by the readouts alone, or with the kept touches.
 
-    probability: of each candidate, shape (C,). novelty: see Prediction. moment: whose threshold the novelty has.
-    distance: the smallest ratio, over the scales that measure novelty, of the diagonal distance to the best-scoring
-    material and its median over held-out touches; 0 where none was measured. unusual: see Prediction.
+    probability: of each candidate, shape (C,). novelty: see Prediction. moment: the row of the table whose threshold
+    the novelty is compared with.
+    distance: the diagonal distance to the best-scoring material, divided by its median over held-out touches; the
+    smallest over the scales that measure novelty, 0 where none was measured. unusual: see Prediction.
     """
 
     probability: FloatArray
@@ -84,15 +85,16 @@ class Judgement:
 class Model:
     """Everything that predictions need of one state of a memory.
 
-    names: the materials, in alphabetical order; known: the same. stages: for each, the windows that judge there. views:
+    names: the materials, in alphabetical order; known: the same names, as a set. stages: for each, the windows that
+    judge there. views:
     the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are read,
     as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing was learned.
     conformal: conformal p-values by the kept touches. held_out: scale → scores of the sampled touches, each held out;
     sample: these touches. dependence: the correlations of touches of one thing. least: the 5th percentile of the
     learned touches' lengths in steps, longest: the maximum. fitted_to: the touches that it was fitted to.
 
-    Any number of threads may use it at once; if it `reads_memory`, only the one that holds the memory's lock. `follow`
-    changes it in place: while any thread uses it, a copy follows.
+    Several threads may use it at once; if it `reads_memory`, only the thread that holds the memory's lock may. `follow`
+    changes it in place: update a copy while another thread uses it.
     """
 
     kind: ReadoutName
@@ -145,12 +147,12 @@ class Model:
             readout.statistics = statistics
 
     def freeze(self, statistics: Statistics) -> None:
-        """Stay the model of these statistics as they are now, until it follows what came since."""
+        """Keep answering from these statistics as they are now, until the next `follow`."""
         if self.reads_memory:
             self.read(statistics.snapshot())
 
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
-        """Take in touches that came and went, which the memory has already; False where it has to be fitted again.
+        """Update by touches that were observed or retracted, which the memory has already; False where it cannot.
 
         The readouts then rest on all observations; calibration and shrinkage stay as they were fitted.
         """
@@ -198,8 +200,8 @@ class Model:
     def scales(self, hypothesis: Hypothesis, stage: int) -> list[Scale]:
         """The scales that judge a touch at a stage.
 
-        Windows judge a prefix, views a touch at another pace, both a complete one. Before the last stage windows
-        alone judge.
+        Windows judge a prefix, views judge a touch at another pace, and both judge a complete one. Before the last
+        stage, and without views, windows alone judge.
         """
         if hypothesis == "prefix" or not self.views or stage < len(self.calibrations) - 1:
             return list(self.stages[stage])
@@ -232,7 +234,8 @@ class Model:
         means: for each of the scales of `scales_for`, mean features in grid units, (d,). steps: observed so far.
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
-        Each stage weighs the candidates that have rows there. Those without rows at a later stage keep their
+        Each stage that is the last one of some candidate weighs the candidates that have rows there. Those without rows
+        at a later stage keep their
         probability; the later stages divide the remaining probability among the others.
         """
         moment = self.moment(hypothesis, steps)

@@ -145,7 +145,7 @@ class Predictor:
         scene: Sequence[str] | None,
         reader_of: Callable[[Predictor], LogitsReader | None] | None = None,
     ) -> Prediction:
-        """As `TactileLearner.predict`. reader_of: gives the reader of the tuned model, if that is to answer."""
+        """As `TactileLearner.predict`. reader_of: makes the reader of f*; None if f* is not to answer."""
         if not streams:
             raise InputError("expected a stream to predict, or several of one thing; came none")
         touches = [self.stream(stream) for stream in streams]
@@ -200,7 +200,7 @@ class Predictor:
     ) -> tuple[Prediction, dict[str, Estimate]]:
         """As `TactileLearner.predict` and `estimate`, of a touch that is encoded once.
 
-        scene, axis: of the prediction; the estimates rest on what the touch is among all materials.
+        scene, axis: of the prediction alone; the estimates use a prediction among all materials.
         """
         touch = self.stream(readings)
 
@@ -313,7 +313,7 @@ class Predictor:
                 predictor.current.prepare(predictor.ledger)
 
     def prepare_to_store(self) -> None:
-        """Make the models for `close` to store, unless there are some: each process that opens the memory reads them.
+        """Fit the models that do not exist yet, so that `close` stores them and later processes read them.
 
         For a writer that learned many touches and predicted none. Where a fit fails, as without memory for it, the
         touches are learned all the same, and a warning is logged.
@@ -343,7 +343,8 @@ class Predictor:
             return model
 
     def examined(self) -> Model:
-        """The model that answers, with its sampled touches, each held out of it: for pages. It fits only where none is.
+        """A copy of the answering model with the scores of its sampled touches, each held out, for pages. It fits a
+        model only if there is none.
 
         Raises what `frozen` raises.
         """

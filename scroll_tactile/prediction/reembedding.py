@@ -65,7 +65,8 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     """The re-embedding of the memory in a store. embedding: None for its own, made again."""
     made = Identity.read(store)
     chosen = made.own_embedding(store.path) if embedding is None else embedding
-    # As many kept touches as its maker requested, none included; by default as many as the new embedding's default.
+    # As many kept touches as the memory was made with, also none; if that was the default, the default of the new
+    # recipe.
     default = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
     kept = Settings(exemplars=made.exemplars, kept_touches=None if default else made.kept_touches)
     recipe = Recipe.of(made.sensor, chosen, made.augmentation, kept)

@@ -61,7 +61,8 @@ OF_MOMENT = (
     "mean_excess_loss",
     "loss_spread",
 )
-# Of many materials. No array of places: those are checked once, and whoever has the file could change what is mapped.
+# Arrays that are mapped where the materials are too many to hold. Places are never mapped: they are checked once, and
+# another process could change a mapped file after that.
 MAPPED = ("rows", "triangle", *(f"table-{name}" for name in PruningTable.parts(0, 0)))
 OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties", "novelties_if_new")
 

@@ -51,7 +51,7 @@ class Quality:
 
 
 def kept(depth: int) -> Any:
-    """The quality of service of what is kept for those who subscribe later; any subscriber can have it."""
+    """The quality of service of topics whose last messages a late subscriber gets, if it is transient_local, too."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)

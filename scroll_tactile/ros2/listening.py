@@ -13,7 +13,7 @@ from scroll_tactile.ros2.interfaces import PICTURES, Quality, interface, kind_of
 __all__ = ["Listener"]
 
 LOOKED = 0.2  # seconds between looks for a topic that is not there yet
-MISSED = 5.0  # seconds after which a topic that is not there, or silent, is named; then after twice as long, and so on
+MISSED = 5.0  # seconds until the first warning about a missing or silent topic; each next wait is twice as long
 LONGEST = 600.0
 WAITING = 10_000  # messages that wait for the first who takes them: ten seconds at 1 kHz, some tens of MB
 PICTURED = 120  # of pictures, which are large

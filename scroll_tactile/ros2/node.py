@@ -32,7 +32,8 @@ class TactileNode:
     taken at once; otherwise `activate` does, and `deactivate` ends it: in a lifecycle node call them from on_activate
     and on_deactivate. `close` ends all.
 
-    Topics; those who subscribe later get the last of each:
+    Topics. A late subscriber that is transient_local gets the last values, and of answers up to ten; of `/diagnostics`
+    it gets the next, within a second:
 
     - `~/answer`, std_msgs/String: an answer as JSON (see `Bridge`), when something changed.
     - `~/status`, diagnostic_msgs/DiagnosticArray: the same by name; its header has the stamp of the last reading.

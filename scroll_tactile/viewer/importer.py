@@ -1,4 +1,5 @@
-"""`rerun-importer-scroll-tactile`: what Rerun starts for a file or folder that it does not know, to write it for it.
+"""`rerun-importer-scroll-tactile`: the program that Rerun starts for a path that it does not know; it writes to Rerun
+what the path holds.
 
 Rerun starts every executable on PATH with this beginning for a folder and for each file in it, all at once, so what is
 not ours has to be known before anything is imported. Rerun reads `.mcap` itself and asks nobody; of such a bag it is
@@ -107,7 +108,8 @@ def _is_memory(folder: Path) -> bool:
 
 
 def _import(chosen: argparse.Namespace, kind: Kind, memory: str | None, named: bool) -> int:
-    """Write it; returns the exit code. What is no sound memory or recording is an error, another sensor's is not."""
+    """Write it; returns the exit code. An unsound memory or recording is an error; a recording of another sensor is
+    not."""
     from scroll_tactile.errors import ChannelCountError, FieldError, ScrollTactileError
     from store import StoreError
 

@@ -37,7 +37,7 @@ from scroll_tactile.recordings.recording import only_columns
 __all__ = ["Annotated", "annotate"]
 
 RECORD = "annotation.json"
-WORK = ".annotating"  # behind the name of the folder that is made, of the folder in which it is made
+WORK = ".annotating"  # the suffix of the folder that is worked in, behind the name of the one that is made
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ def annotate(
 
     learner: the memory; it is settled, and stays as it is. dataset: its folder. output: a new one; without it
     `<dataset>-annotated`. in_place: change the data set itself, and keep a copy of `meta/` in `meta.before`. replace:
-    answers that are there already give way; rows of others in `language_events` stay. forms: "numbers", "language", or
+    overwrite the answers of an earlier annotation; rows that others wrote in `language_events` stay. forms: "numbers",
+    "language", or
     both.
     field, columns, clock: as of `recordings.read`, field being a column of readings of the learner's sensor. cut:
     "episodes" takes each as one touch; "contact" finds touches in them, which then begin with two seconds at rest.

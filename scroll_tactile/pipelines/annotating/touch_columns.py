@@ -16,7 +16,7 @@ __all__ = ["EVENTS", "PREFIX", "WRITER", "TouchColumns", "statistics_of", "toget
 
 PREFIX = "observation.touch."
 EVENTS = "language_events"
-WRITER = "scroll-tactile"  # by this, under "written by", features that may be replaced are told from others
+WRITER = "scroll-tactile"  # the value under "written by" in a feature's info; only these may be replaced
 _ROLE, _STYLE = "tool", "interjection"  # of LeRobot's styles of events the one that no camera belongs to
 _FIELDS = ("role", "content", "style", "camera", "tool_calls")
 _SHARES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}

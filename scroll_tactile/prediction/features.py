@@ -304,11 +304,17 @@ class FeatureExtractor:
 
 
 def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
-    """The readings that kept levels stand for; a missing value repeats the last one before it."""
+    """The readings that kept levels stand for.
+
+    A missing value repeats the last one before it, or where there is none the first that was read; a channel without
+    any lies at the low end of its range.
+    """
     low, high = sensor.limits
     lacking = levels == MISSING
     if lacking.any():
-        last = np.maximum.accumulate(np.where(lacking, 0, np.arange(levels.shape[1])), axis=1)
-        levels = np.take_along_axis(levels, last, axis=1)
+        last = np.maximum.accumulate(np.where(lacking, -1, np.arange(levels.shape[1])), axis=1)
+        first = lacking.argmin(axis=1)[:, None]  # 0 of a channel without any
+        levels = np.take_along_axis(levels, np.where(last < 0, first, last), axis=1)
+        levels[lacking.all(axis=1)] = 0
     readings = low + (high - low) * (levels.T.astype(np.float32) / np.float32(LEVELS - 1))
     return validate(readings.clip(low, high), sensor)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.matching.likelihood import MISSING
+from scroll_tactile.prediction.features import stream_of
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.simulation.scene import Scene
 
@@ -232,3 +234,10 @@ def test_answers_are_the_same_bytes_for_any_order_of_the_touches():
         learner.settle()
         answers.append([learner.predict(values) for values in asked])
     assert answers[0] == answers[1]
+
+
+def test_a_value_that_is_missing_from_the_start_is_the_first_that_was_read():
+    pad = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=254.0, unit="1", duration=1.0)
+    levels = np.array([[MISSING, 7, MISSING, 9], [5, MISSING, 6, MISSING], [MISSING] * 4], dtype=np.uint8)
+    readings = stream_of(levels, pad).readings
+    assert readings.T.tolist() == [[7, 7, 7, 9], [5, 5, 6, 6], [0, 0, 0, 0]]

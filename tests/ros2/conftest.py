@@ -49,7 +49,7 @@ def spinning(alone):
             executor.add_node(made)
             return made
 
-        def until(self, there, seconds=20.0):
+        def until(self, there, seconds=60.0):
             end = time.monotonic() + seconds
             while not there():
                 assert time.monotonic() < end, "it never came"

@@ -57,9 +57,9 @@ def spinning(alone):
 
         def ask(self, node, kind, name, **request):
             client = node.create_client(kind, name)
-            self.until(client.service_is_ready, 60)
+            self.until(client.service_is_ready, 300)
             future = client.call_async(kind.Request(**request))
-            self.until(future.done, 60)
+            self.until(future.done, 300)
             node.destroy_client(client)
             return future.result()
 

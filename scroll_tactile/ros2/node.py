@@ -183,8 +183,7 @@ class TactileNode:
 
     def _checked(self, parameters: Sequence[Any]) -> Any:
         """Whether parameters can have these values; ROS sets them where nobody else says no."""
-        from rcl_interfaces.msg import SetParametersResult
-
+        result = interface("rcl_interfaces/msg/SetParametersResult")
         values = {each.name: each.value for each in parameters}
         why = "; ".join(filter(None, (refused(each, values[each.name]) for each in DYNAMIC if each.name in values)))
         if not why and values.keys() & {"risk", "scene"}:
@@ -192,7 +191,7 @@ class TactileNode:
                 self.bridge.check(self._wanted(values)["scene"])
             except InputError as error:
                 why = str(error)
-        return SetParametersResult(successful=not why, reason=why)
+        return result(successful=not why, reason=why)
 
     def _adjusted(self, parameters: Sequence[Any]) -> None:
         """Answer by what the parameters are now."""

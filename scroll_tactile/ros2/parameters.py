@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.ros2.interfaces import DURABILITIES, RELIABILITIES
+from scroll_tactile.ros2.interfaces import DURABILITIES, RELIABILITIES, interface
 
 __all__ = ["DYNAMIC", "STATIC", "Parameter", "declare", "refused", "texts"]
 
@@ -102,9 +102,8 @@ def texts(value: object) -> list[str]:
 
 
 def _descriptor(each: Parameter) -> Any:
-    from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-
-    made = ParameterDescriptor(
+    of = {name: interface(f"rcl_interfaces/msg/{name}") for name in ("FloatingPointRange", "IntegerRange")}
+    made = interface("rcl_interfaces/msg/ParameterDescriptor")(
         name=each.name, description=each.about, read_only=each.fixed, dynamic_typing=each.several
     )
     if each.choices:
@@ -112,7 +111,7 @@ def _descriptor(each: Parameter) -> Any:
     elif each.several:
         made.additional_constraints = "a text, or a list of texts"
     if each.bounds is not None and isinstance(each.default, float):
-        made.floating_point_range = [FloatingPointRange(from_value=each.bounds[0], to_value=each.bounds[1])]
+        made.floating_point_range = [of["FloatingPointRange"](from_value=each.bounds[0], to_value=each.bounds[1])]
     elif each.bounds is not None:
-        made.integer_range = [IntegerRange(from_value=int(each.bounds[0]), to_value=int(each.bounds[1]), step=1)]
+        made.integer_range = [of["IntegerRange"](from_value=int(each.bounds[0]), to_value=int(each.bounds[1]), step=1)]
     return made

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.ros2.fingers import Finger, fingers_of, new_sensor
-from scroll_tactile.ros2.interfaces import Quality, require_rclpy
+from scroll_tactile.ros2.interfaces import Quality, interface, require_rclpy
 from scroll_tactile.ros2.listening import Listener
 from scroll_tactile.ros2.parameters import DYNAMIC, STATIC, declare, refused, texts
 from store import StoreError
@@ -135,8 +135,7 @@ class _Served:
         return self.error is None
 
     def _checked(self, parameters: Sequence[Any]) -> Any:
-        from rcl_interfaces.msg import SetParametersResult
-
+        result = interface("rcl_interfaces/msg/SetParametersResult")
         for parameter in parameters:
             known = next((each for each in (*STATIC, *DYNAMIC) if each.name == parameter.name), None)
             why = "" if known is None else refused(known, parameter.value)
@@ -147,8 +146,8 @@ class _Served:
                     "deactivate and cleanup first, and configure and activate after it"
                 )
             if why:
-                return SetParametersResult(successful=False, reason=why)
-        return SetParametersResult(successful=True)
+                return result(successful=False, reason=why)
+        return result(successful=True)
 
 
 def _node(rclpy: Any, context: Any) -> tuple[Any, bool]:

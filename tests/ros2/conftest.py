@@ -49,7 +49,7 @@ def spinning(alone):
             executor.add_node(made)
             return made
 
-        def until(self, there, seconds=20.0):
+        def until(self, there, seconds=60.0):
             end = time.monotonic() + seconds
             while not there():
                 assert time.monotonic() < end, "it never came"
@@ -57,9 +57,9 @@ def spinning(alone):
 
         def ask(self, node, kind, name, **request):
             client = node.create_client(kind, name)
-            self.until(client.service_is_ready, 60)
+            self.until(client.service_is_ready, 300)
             future = client.call_async(kind.Request(**request))
-            self.until(future.done, 60)
+            self.until(future.done, 300)
             node.destroy_client(client)
             return future.result()
 

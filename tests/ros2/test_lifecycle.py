@@ -60,7 +60,7 @@ class Remote:
         [result] = self.ask(SetParameters, "set_parameters", parameters=[message]).results
         return "" if result.successful else result.reason or "no reason"
 
-    def touched(self, material, seconds=120):
+    def touched(self, material, seconds=300):
         """Wait until the last touch was one of a material, whatever was published before anybody subscribed."""
         end = time.monotonic() + seconds
         while True:
@@ -107,7 +107,7 @@ def test_a_manager_takes_the_node_through_its_states_and_parameters_are_checked(
         assert not remote.set("scene", "a, b") and not remote.set("scene", "")
         assert remote.go("activate")
         with publishing(500, 250):
-            spinning.until(lambda: len(remote.ended()) == 2, 120)
+            spinning.until(lambda: len(remote.ended()) == 2, 300)
         assert json.loads(remote.call("predict").message)["material"] == "b"
         assert remote.go("deactivate") and remote.state() == "inactive"
         spinning.until(lambda: not remote.node.count_subscribers(TOPIC))
@@ -135,7 +135,7 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
         assert reply.success and "learned as observation" in reply.message
         remote.answers.clear()
         with publishing(200, 100):  # its first touch begins after 120 readings
-            spinning.until(lambda: any(answer["contact"] for answer in remote.answers), 120)
+            spinning.until(lambda: any(answer["contact"] for answer in remote.answers), 300)
             process.send_signal(signal.SIGKILL)
             process.wait()
     with TactileLearner.open(own, mode="read") as kept:
@@ -198,7 +198,7 @@ def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeyp
         place = "" if name == "finger" else "thumb/"
         remote.listen(f"{place}answer")
         with publishing(500, 250):
-            spinning.until(lambda: len(remote.ended()) == 2, 120)
+            spinning.until(lambda: len(remote.ended()) == 2, 300)
         assert [answer["material"] for answer in remote.ended()] == ["a", "b"]
         assert remote.call(f"{place}learn", "felt").success
         if name == "hand":

@@ -29,6 +29,7 @@ from examples.paper.studies.schedules import SCHEDULES, arrange, part_ends, si_b
 from examples.paper.studies.unlearning import Unlearning, relative_error, requests, ridge_from_scratch
 from scroll_tactile import Kernels
 from scroll_tactile.errors import InputError
+from scroll_tactile.recipe import default_kept_touches
 
 HERE = Path(__file__).resolve().parents[2]
 NAMES = [f"m{number}" for number in range(8) for _ in range(3)]
@@ -237,6 +238,7 @@ class TestRobustness:
 
     def test_another_checkout_answers_the_same_touches(self, monkeypatch):
         monkeypatch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 1008)  # as a process of its own has it
+        monkeypatch.setattr("scroll_tactile.recipe.default_kept_touches", default_kept_touches)
         sets = recorded(PATCH, materials=3, each=6)
         train = [(name, stream.readings) for name, stream in zip(sets.materials[::2], sets.streams[::2], strict=True)]
         tests = {"whole": [stream.readings for stream in sets.streams[1::6]], "none": [sets.streams[3].readings[:2]]}

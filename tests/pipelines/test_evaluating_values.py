@@ -37,7 +37,7 @@ def written(folder, asked, heading=HEADING, force="{}"):
 @pytest.fixture(scope="module")
 def memory(tmp_path_factory):
     folder = tmp_path_factory.mktemp("values")
-    TactileLearner.open(folder / "m", **SETTINGS).close()
+    TactileLearner.open(folder / "m", **SETTINGS, kept_touches=8).close()
     table, files = written(folder, LEARNED)
     assert run("learn", folder / "m", *files, *table).exit_code == 0
     return folder / "m"

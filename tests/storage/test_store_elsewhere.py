@@ -201,7 +201,6 @@ def test_where_there_are_no_locks_that_is_said_and_no_other_kind_is_taken(tmp_pa
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(fcntl, "flock", missing)
-    monkeypatch.setattr("filelock._unix.fcntl.flock", missing)
     for path in (tmp_path / "s", tmp_path / "new"):
         with pytest.raises(StoreError, match="has no locks") as caught:
             Store.open(path, identity={})

@@ -1,8 +1,8 @@
 """Others' detectors of change, and others' martingales, on the p-values that `health` bets on.
 
 Each score has a detector of its own, and the first that alarms counts. The most sensitive setting is taken that has no
-more false alarms than `health`, over the same orders; `health` has no such choice. KSWIN takes 1 ms a value: it gets the
-five scores of the channel that changes alone, and so is told which one to look at.
+more false alarms than `health`, over the same orders; `health` has no such choice. KSWIN takes 1 ms a value: it gets
+the five scores of the channel that changes alone, and so is told which one to look at.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ class Order:
 class Peer:
     """A detector. settings: from the most sensitive. make: it, from its library's module, with a setting.
 
-    sides: 2 where it sees growing values alone. orders: as many at most, and `alone` on the channel that changes, of one
-    that takes long.
+    sides: 2 where it sees growing values alone. orders: as many at most, of one that takes long. alone: whether it gets
+    the channel that changes alone.
     """
 
     name: str

@@ -45,7 +45,7 @@ PRIOR = 0.02  # of a logarithm: what a number scatters by, as far as a touch for
 COARSE = 0.7  # of a logarithm, a factor of two: changes of a mixture are smaller
 SCORES = 5  # of a channel
 LEVELS = 1 / 3  # of a logarithm: the width of a cell of the level of a touch
-FLAT = 8 * (LEVELS / UNIT) ** 2 / 12  # the squares of the levels of eight touches about their mean, if uniform in a cell
+FLAT = 8 * (LEVELS / UNIT) ** 2 / 12  # squares of the levels of eight touches about their mean, uniform in a cell
 
 
 class Bets:

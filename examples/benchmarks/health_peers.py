@@ -1,7 +1,8 @@
 """Others' detectors of change, and others' martingales, on the p-values that `health` bets on.
 
-Each detector gets the five scores of the channel that changes, and no other of some eighty: it is told which one to
-look at. Its most sensitive setting counts that has no more false alarms than `health`, over the same orders.
+Each score has a detector of its own, and the first that alarms counts. The most sensitive setting is taken that has no
+more false alarms than `health`, over the same orders; `health` has no such choice. KSWIN takes 1 ms a value: it gets
+the five scores of the channel that changes alone, and so is told which one to look at.
 """
 
 from __future__ import annotations
@@ -76,7 +77,8 @@ class Order:
 class Peer:
     """A detector. settings: from the most sensitive. make: it, from its library's module, with a setting.
 
-    sides: 2 where it sees growing values alone. orders: as many at most, of one that takes long.
+    sides: 2 where it sees growing values alone. orders: as many at most, of one that takes long. alone: whether it gets
+    the channel that changes alone.
     """
 
     name: str
@@ -85,6 +87,11 @@ class Peer:
     make: Callable[[Any, float], Any]
     sides: int = 1
     orders: int = 1000
+    alone: bool = False
+
+    def streams(self, order: Order) -> Floats:
+        """The p-values that it gets, (k, streams)."""
+        return order.values if self.alone else order.all
 
 
 SMALL = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8, 1e-10)
@@ -93,17 +100,17 @@ GREAT = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 
 PEERS = (
     Peer("ADWIN", "river", SMALL, lambda river, delta: river.ADWIN(delta=delta, clock=1)),
-    Peer("KSWIN", "river", SMALL[2::2], lambda river, alpha: river.KSWIN(alpha=alpha, seed=0), orders=2),
+    Peer("KSWIN", "river", SMALL[2::2], lambda river, alpha: river.KSWIN(alpha=alpha, seed=0), orders=2, alone=True),
     Peer(
         "Page-Hinkley",
         "river",
         GREAT,
         lambda river, most: river.PageHinkley(min_instances=5, threshold=most),
     ),
-    Peer("ADWIN", "capymoa", SMALL, lambda moa, delta: moa.ADWIN(delta=delta)),
+    Peer("ADWIN", "capymoa", SMALL, lambda moa, delta: moa.ADWIN(delta=delta), sides=2),
     Peer("CUSUM", "capymoa", GREAT, lambda moa, most: moa.CUSUM(5, 0.1, most), sides=2),
-    Peer("HDDM-A", "capymoa", SMALL, lambda moa, confidence: moa.HDDMAverage(confidence)),
-    Peer("HDDM-W", "capymoa", SMALL, lambda moa, confidence: moa.HDDMWeighted(confidence)),
+    Peer("HDDM-A", "capymoa", SMALL, lambda moa, confidence: moa.HDDMAverage(confidence), sides=2),
+    Peer("HDDM-W", "capymoa", SMALL, lambda moa, confidence: moa.HDDMWeighted(confidence), sides=2),
 )
 MODULES = {"river": "river.drift", "capymoa": "capymoa.drift.detectors"}
 
@@ -113,10 +120,12 @@ def lacking() -> dict[str, str]:
     return {module: f"{module} is not installed" for module in MODULES if find_spec(module) is None}
 
 
-def _first_alarm(order: Order, made: list[Any], sides: int) -> int | None:
-    """The place at which one of the detectors of its scores alarms."""
-    for place, values in zip(order.places, order.values.tolist(), strict=True):
-        both = [*values, *(1 - value for value in values)] if sides == 2 else values
+def _first_alarm(order: Order, peer: Peer, setting: float) -> int | None:
+    """The place at which the detector of one of its scores alarms."""
+    module, streams = import_module(MODULES[peer.module]), peer.streams(order)
+    made = [peer.make(module, setting) for _ in range(streams.shape[1] * peer.sides)]
+    for place, values in zip(order.places, streams.tolist(), strict=True):
+        both = [*values, *(1 - value for value in values)] if peer.sides == 2 else values
         for detector, value in zip(made, both, strict=True):
             if hasattr(detector, "update"):
                 detector.update(value)
@@ -131,11 +140,11 @@ def _first_alarm(order: Order, made: list[Any], sides: int) -> int | None:
 
 def _measured(peer: Peer, setting: float, cases: dict[str, list[Order]], most: int) -> dict[str, Record] | None:
     """What a setting does; None where it has more false alarms than there may be."""
-    module, found, false = import_module(MODULES[peer.module]), dict[str, Record](), 0
+    found, false = dict[str, Record](), 0
     for case, orders in cases.items():  # those without a change come first
         delays = []
         for order in orders[: peer.orders]:
-            at = _first_alarm(order, [peer.make(module, setting) for _ in range(SCORES * peer.sides)], peer.sides)
+            at = _first_alarm(order, peer, setting)
             wrong = at is not None and (case == "none" or at < order.half)
             false += wrong
             if false > most:

@@ -46,7 +46,7 @@ PRIOR = 0.02  # of a logarithm: the assumed deviation of a number, which counts 
 COARSE = 0.7  # of a logarithm, a factor of two: changes of a mixture are smaller
 SCORES = 5  # of a channel
 LEVELS = 1 / 3  # of a logarithm: the width of a cell of the level of a touch
-FLAT = 4 * (LEVELS / UNIT) ** 2 / 12  # the squares of the levels of four touches about their mean, if uniform in a cell
+FLAT = 8 * (LEVELS / UNIT) ** 2 / 12  # squares of the levels of eight touches about their mean, uniform in a cell
 
 
 class Bets:
@@ -160,7 +160,7 @@ def beside_level(scores: Floats, levels: Rows) -> Floats:
     """What the level of a touch does not explain of its scores (k, count), by the line through the rows of a cell.
 
     levels: (k,). Rows are treated alike, so that they stay exchangeable: the line is drawn with the touch itself. It is
-    pulled to none as far as four touches spread over a cell would: through two touches a line explains all.
+    pulled to none as far as eight touches spread over a cell would: through two touches a line explains all.
     """
     away = levels - np.add.reduce(levels, dtype=np.float64) / len(levels)
     slope = (away @ scores) / (float(away @ away) + FLAT)

@@ -3,11 +3,13 @@
 import json
 import sqlite3
 from contextlib import closing, nullcontext
+from importlib.util import find_spec
 
+import numpy as np
 import pytest
 from commands import run
 
-from examples.benchmarks import appending, health, live_shift
+from examples.benchmarks import appending, health, health_peers, live_shift
 from examples.benchmarks.interleaved import AsIs
 from examples.benchmarks.live_shift import _scored
 from scroll_tactile import sensors
@@ -37,6 +39,42 @@ def test_a_study_of_changed_sensors_goes_on_from_its_cache(tmp_path, monkeypatch
     assert (record["case"], record["false"], record["found"], record["named"], record["kind"]) == ("dead", 0, 1, 1, 1)
     assert record["median"] <= 30
     assert measured(tmp_path, *words)[1]["records"] == result["records"]
+
+
+class Above:
+    """A detector that alarms above a value."""
+
+    def __init__(self, most):
+        self.most, self.drift_detected = most, False
+
+    def update(self, value):
+        self.drift_detected = value > self.most
+
+
+def test_a_detector_takes_its_most_sensitive_setting_that_has_no_more_false_alarms(monkeypatch):
+    calm, late = np.full((20, 5), 0.6), np.full((20, 5), 0.6)
+    late[12:, 3] = 0.9
+    orders = {
+        "none": [health_peers.Order(calm, list(range(20)), 10, None, calm)],
+        "dead": [health_peers.Order(late, list(range(20)), 10, 14, late)],
+    }
+    above = health_peers.Peer("above", "numpy", (0.5, 0.7, 0.95), lambda _, most: Above(most))
+    monkeypatch.setattr(health_peers, "PEERS", (above,))
+    monkeypatch.setattr(health_peers, "MODULES", {"numpy": "numpy"})
+    own, other = health_peers.peer_records("pad", orders)
+    assert (own["peer"], own["median"], own["false"], own["found"]) == ("health", 5, 0, 1)
+    assert (other["setting"], other["median"], other["false"], other["found"]) == (0.7, 3, 0, 1)
+    orders["none"][0] = health_peers.Order(late, list(range(20)), 10, None, late)
+    own, other = health_peers.peer_records("pad", orders)
+    assert (other["setting"], other["found"]) == (0.95, 0)  # the next one would be a false alarm
+
+
+def test_the_martingales_of_others_are_ours():
+    values = np.random.default_rng(0).random((40, 5))
+    order = health_peers.Order(values, list(range(40)), 20, None, values)
+    found = health_peers.oracle_difference(order)
+    assert all(difference < 1e-12 for difference in found.values())
+    assert "crepes" in found or find_spec("crepes") is None
 
 
 def test_each_way_of_appending_keeps_the_rows(tmp_path, monkeypatch):

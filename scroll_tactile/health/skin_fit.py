@@ -105,7 +105,7 @@ class Fitted:
     gained: float
 
 
-class _Fit:
+class _PosteriorFit:
     """Touches as shares of the range, (T, n) each, beside what is known of their materials."""
 
     def __init__(self, reference: Reference, touches: Sequence[Floats], materials: Sequence[str], ends: Floats) -> None:
@@ -206,7 +206,7 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     of the range, (n,): one that is clipped more often now is lost, as what it reads is not known.
     `before` and `after` say whether it explains the touches better.
     """
-    n, fit = reference.channels, _Fit(reference, touches, materials, ends)
+    n, fit = reference.channels, _PosteriorFit(reference, touches, materials, ends)
     none = np.zeros(2 * n)
     best, evidence, how, at = none, -np.inf, (SIGMAS[0], TAUS[0]), none
     for sigma in SIGMAS:

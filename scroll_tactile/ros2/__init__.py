@@ -21,7 +21,7 @@ __all__ = ["Answer", "Bridge", "BridgeReport", "Listener", "Quality", "TactileNo
 
 # Imported on first use: a topic should be heard before the libraries behind a learner are there.
 _MODULES = {
-    "Answer": "answers",
+    "Answer": "answer_fields",
     "Bridge": "bridge",
     "BridgeReport": "bridge",
     "Listener": "listening",

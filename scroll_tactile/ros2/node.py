@@ -13,7 +13,7 @@ from scroll_tactile.ros2.bridge import Bridge
 from scroll_tactile.ros2.interfaces import Quality, interface
 from scroll_tactile.ros2.listening import Listener
 from scroll_tactile.ros2.parameters import DYNAMIC, declare, refused, texts
-from scroll_tactile.ros2.publishing import Answers, Diagnostics
+from scroll_tactile.ros2.publishing import AnswerTopics, Diagnostics
 from store import StoreError
 
 __all__ = ["TactileNode"]
@@ -90,7 +90,7 @@ class TactileNode:
         declare(node, DYNAMIC, {"risk": risk, "scene": list(scene or ()) or ""})
         how: dict[str, Any] = {"contact": contact, "of": of, "watch": watch, **self._wanted({})}
         self.bridge = Bridge(learner, field, **how, answer=self._publish, warn=self._warn)
-        self._answers = Answers(node, finger, learner.sensor.name)
+        self._answers = AnswerTopics(node, finger, learner.sensor.name)
         self._diagnostics = Diagnostics(node, self.bridge, finger)
         self._services = self._offered()
         self._timer = node.create_timer(1.0, self._each_second)

@@ -13,7 +13,7 @@ from scroll_tactile.ros2.bridge import RESTLESS, Bridge
 from scroll_tactile.ros2.interfaces import interface, kept
 from store import StoreError
 
-__all__ = ["Answers", "Diagnostics", "stamp_of"]
+__all__ = ["AnswerTopics", "Diagnostics", "stamp_of"]
 
 KNOWN = {False: 0, True: 1, None: 2}  # as scroll_tactile_msgs/msg/TactileAnswer has it
 
@@ -26,7 +26,7 @@ def stamp_of(seconds: float) -> Any:
     return interface("builtin_interfaces/msg/Time")(sec=whole, nanosec=min(round((seconds - whole) * 1e9), 10**9 - 1))
 
 
-class Answers:
+class AnswerTopics:
     """Publishes answers under `~/`, or `~/FINGER/`; see `TactileNode`. sensor: whose readings they rest on."""
 
     def __init__(self, node: Any, finger: str, sensor: str) -> None:

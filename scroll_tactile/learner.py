@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -207,6 +207,9 @@ class TactileLearner(MemoryKeeper):
         before = [] if touch.raw is None else self._ledger.names(touch.raw.key)  # learned before it was adapted
         return list(dict.fromkeys([*before, *self._ledger.names(touch.key)]))
 
+    def _unknown(self, touches: Iterable[Stream]) -> int:
+        return sum(self.predict(touch).known is False for touch in touches)
+
     def reembed(
         self, embedding: Embedding | None = None, *, progress: Callable[[str, int, int], object] | None = None
     ) -> Path:
@@ -293,9 +296,8 @@ class TactileLearner(MemoryKeeper):
         by `sense`. Each touch is predicted by the memory as it was when it began, and by itself unless
         `LiveSession.again` says that it is of the same thing as the last.
 
-        Raises InputError for values that cannot be, and for "auto" with frames that have no resting image;
-        UnknownMaterialError for a scene that names a material never observed; AnnotationError for an axis that no
-        touch has a label on.
+        Raises InputError for values that cannot be, and for "auto" with frames that have no resting image; what
+        `predict` raises for scene and of.
         """
         from scroll_tactile.live.health_notes import HealthNotes
         from scroll_tactile.live.session import LiveSession
@@ -317,9 +319,8 @@ class TactileLearner(MemoryKeeper):
         probability, before the touch, that the material was never observed: 1 where that is certain, 0 where it cannot
         be.
 
-        For a material that was observed the estimate is the composition of the materials it feels like, for one that
-        was not that of heads over all described materials (see `prediction.composition`); the touch's novelty weighs
-        the two. A constituent that all materials have, or none, cannot be learned: `Constituent.unlearned` says so.
+        An observed material has the composition of those it feels like, a new one that of heads over all described ones
+        (see `prediction.composition`); the touch's novelty weighs the two. `Constituent.unlearned` says what cannot be.
 
         Raises StreamError; DescriptionError where nothing was described, or for a constituent that no description
         names; InputError for an unfamiliar that is no probability.
@@ -333,7 +334,6 @@ class TactileLearner(MemoryKeeper):
 
         scene: as for `predict`, at most 64 materials. Write it as C by `firmware.write_firmware`. It rests on windows
         alone: no kept touches, no views of a whole touch, no f*; it is of the memory as it is now.
-
         Raises UnknownMaterialError, InputError for an empty scene, a greater one, a camera, or an embedding that is not
         `Kernels`.
         """
@@ -385,9 +385,7 @@ class TactileLearner(MemoryKeeper):
     def close(self) -> None:
         """Write a checkpoint, so that opening replays nothing, and release the files; a second call does nothing.
 
-        Where a prediction or `settle` has fitted a model that is kept, too, and the first prediction after opening
-        fits nothing.
-
+        A model that a prediction or `settle` has fitted is kept, too: the first prediction after opening fits nothing.
         Nothing is lost without it: what `observe` acknowledged is in the journal. `predict` still answers afterwards,
         `observe` raises StoreClosedError.
         """

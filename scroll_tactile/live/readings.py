@@ -15,7 +15,8 @@ from scroll_tactile.errors import StreamError
 from scroll_tactile.live.decision import DecisionRule
 from scroll_tactile.prediction.current import FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
-from scroll_tactile.prediction.predictor import Predictor, estimates_of, nothing_known
+from scroll_tactile.prediction.judging import estimates_of
+from scroll_tactile.prediction.predictor import Predictor, nothing_known
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.correction import Correction, corrected_stream

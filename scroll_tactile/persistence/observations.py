@@ -63,6 +63,8 @@ def adaptation_of(store: Store, receipt: Receipt | Adaptation | int) -> Head | N
 
     Raises ObservationError for an adaptation that was not kept, and for one of another memory.
     """
+    if not isinstance(receipt, Receipt | Adaptation | int):
+        return None  # `observation_of` says what was expected
     sequence = receipt if isinstance(receipt, int) else receipt.sequence
     if sequence is None:
         raise ObservationError("this adaptation was not kept: there is nothing to retract")

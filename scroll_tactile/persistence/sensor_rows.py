@@ -35,7 +35,7 @@ from scroll_tactile.validation.gate import WRONG
 from scroll_tactile.validation.stored_watch import NAME, watch_to_arrays, watched_from
 from store import Head, Store, StoreError
 
-__all__ = ["adapt_to", "health_of", "health_to_store", "known_touches"]
+__all__ = ["adapt_to", "health_of", "health_to_store", "known_touches", "not_recognised"]
 
 logger = logging.getLogger(__name__)
 
@@ -225,6 +225,16 @@ def _refusal(found: Fitted) -> str:
     """Why a correction is not kept; "" where it is."""
     if found.gained < LIKELIER:
         return "the touches are explained no better with any correction: the skin reads as it did, or changed otherwise"
+    return ""
+
+
+def not_recognised(before: int, after: int, count: int) -> str:
+    """Why a correction is taken back, by how many of the touches that it was made of are unknown; "" where it stands.
+
+    before, after: without and with it. It is taken back where most are unknown, and no fewer than before.
+    """
+    if 2 * after > count and after >= before:
+        return f"{after} of {count} touches are unknown even so: gains and offsets do not explain the change"
     return ""
 
 

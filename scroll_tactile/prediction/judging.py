@@ -28,12 +28,13 @@ from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream
 from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
 from scroll_tactile.prediction.moment_table import WITHIN, match_scores, tempered
 from scroll_tactile.readouts.calibration import held_out_probabilities
+from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.leave_one_out import StageScores
-from scroll_tactile.results import Prediction, Unusual
+from scroll_tactile.results import Estimate, Prediction, Unusual
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["HeldOutTouch", "Touch", "answer", "held_out_touches", "judged"]
+__all__ = ["HeldOutTouch", "Touch", "answer", "estimates_of", "held_out_touches", "judged"]
 
 FloatArray = npt.NDArray[np.float64]
 Touch = tuple[Encoded, Mapping[str, float] | None]
@@ -282,3 +283,32 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
             names = tuple(held.names)
             answers[place] = HeldOutTouch(material, key, names, result.probability, result.novelty, threshold)
     return list(answers.values())
+
+
+def estimates_of(
+    estimator: Estimator,
+    wanted: Sequence[str],
+    encoded: Encoded | None,
+    extractor: FeatureExtractor,
+    prediction: Prediction,
+    risk: float,
+    known: bool | None,
+) -> dict[str, Estimate]:
+    """Estimate quantities of a touch with a prediction. encoded: None where the memory has observed nothing.
+
+    known: whether the intervals are those for a learned material; None: the prediction's `known` decides, and where
+    that is None they are those for a new one.
+    """
+    as_known = prediction.known is True if known is None else known
+    unusual = set(prediction.unusual)
+    if encoded is not None and estimator.stage(encoded.steps) < estimator.last:
+        unusual.discard("shorter")  # than complete ones: earlier heads are of touches cut at a milestone
+    inside = prediction.known is not False and not unusual
+    if encoded is None:
+        found = estimator.estimate(wanted, {}, 0, risk, known=as_known)
+    else:
+        length, means = estimator.length(encoded.steps), encoded.means
+        if length < encoded.steps:
+            means = extractor.means(encoded.image[:, :length], estimator.scales_for(encoded.steps))
+        found = estimator.estimate(wanted, means, encoded.steps, risk, known=as_known)
+    return {name: replace(own, inside=inside, seconds=prediction.seconds) for name, own in found.items()}

@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, Protocol, Self, TypeVar
 
@@ -31,7 +30,7 @@ from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.prediction.judging import Touch, answer
+from scroll_tactile.prediction.judging import Touch, answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.stored import NAME
 from scroll_tactile.readouts.estimation import Estimator
@@ -44,7 +43,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
 from scroll_tactile.validation.stored_watch import NAME as HEALTH
 
-__all__ = ["LogitsReader", "Predictor", "estimates_of", "nothing_known"]
+__all__ = ["LogitsReader", "Predictor", "nothing_known"]
 
 logger = logging.getLogger(__name__)
 
@@ -378,32 +377,3 @@ def _scales_for(
 def nothing_known(seconds: float) -> Prediction:
     """The prediction for so many seconds of touch without any candidate."""
     return Prediction(None, 0.0, (), float("inf"), False, seconds)
-
-
-def estimates_of(
-    estimator: Estimator,
-    wanted: Sequence[str],
-    encoded: Encoded | None,
-    extractor: FeatureExtractor,
-    prediction: Prediction,
-    risk: float,
-    known: bool | None,
-) -> dict[str, Estimate]:
-    """The estimates of a touch, of which nothing was encoded before any was observed, and its prediction.
-
-    known: which intervals are taken; None for those that the prediction says. Where it cannot tell they are those of a
-    new material.
-    """
-    as_known = prediction.known is True if known is None else known
-    unusual = set(prediction.unusual)
-    if encoded is not None and estimator.stage(encoded.steps) < estimator.last:
-        unusual.discard("shorter")  # than complete touches: its heads are of touches as they were at its milestone
-    inside = prediction.known is not False and not unusual
-    if encoded is None:
-        found = estimator.estimate(wanted, {}, 0, risk, known=as_known)
-    else:
-        length, means = estimator.length(encoded.steps), encoded.means
-        if length < encoded.steps:
-            means = extractor.means(encoded.image[:, :length], estimator.scales_for(encoded.steps))
-        found = estimator.estimate(wanted, means, encoded.steps, risk, known=as_known)
-    return {name: replace(own, inside=inside, seconds=prediction.seconds) for name, own in found.items()}

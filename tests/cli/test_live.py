@@ -81,7 +81,7 @@ def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
     replay.live(memory / "memory", replay.Path("-"), None, 0.05, False, True, True)
     answer = json.loads(lines[-2])
     assert (answer["event"], answer["material"]) == ("ended", expected.material)
-    assert answer["probability"] == expected.probability
+    assert answer["probability"] == expected.as_json()["probability"]
 
 
 def test_on_a_terminal_the_answer_grows(memory, monkeypatch):

@@ -68,7 +68,11 @@ def test_what_is_felt_known_and_to_be_touched_again(folder):
     with TactileLearner.open(folder / "memory", mode="read") as learner:
         expected, force = learner.predict(touch), learner.estimate(touch)["force"]
     felt, of_file, within, known, one, again = answers
-    assert (felt["material"], felt["probability"], felt["known"]) == ("b", expected.probability, expected.known)
+    assert (felt["material"], felt["probability"], felt["known"]) == (
+        "b",
+        expected.as_json()["probability"],
+        expected.known,
+    )
     assert felt["quantities"]["force"]["value"] == pytest.approx(force.value)
     assert of_file == felt
     assert set(within["ranking"]) == {"a", "c"}

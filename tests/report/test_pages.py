@@ -362,7 +362,7 @@ def test_what_a_page_says_of_a_recording(browser, tmp_path):
     assert "300 readings" in text
     assert "100 Hz" in text
     assert "1 gap, the longest 0.51 s" in text
-    assert "Dead: 2" in text
+    assert "Dead: 1" in text
     save(html, tmp_path / "page.html")
     for width in (390, 1280):
         browser.show(tmp_path / "page.html", width)

@@ -38,7 +38,7 @@ def test_answers_are_those_of_a_live_session():
     ended = [touch for i, row in enumerate(ROWS) for touch in session.push(row, 1000 + i / 50).touches]
     told = [answer for answer in answers if answer["event"] == "ended"]
     assert [answer["material"] for answer in told] == ["a", "b"] == [touch.prediction.material for touch in ended]
-    assert [answer["probability"] for answer in told] == [touch.prediction.probability for touch in ended]
+    assert [answer["probability"] for answer in told] == [touch.prediction.as_json()["probability"] for touch in ended]
     assert [answer["candidates"] for answer in told] == [touch.prediction.candidates() for touch in ended]
     assert [answer["seconds"] for answer in told] == [touch.stream.seconds for touch in ended]
     assert not warnings
@@ -205,7 +205,7 @@ def test_touches_of_one_thing_add_up():
         assert "adds up" in made.again()
     one, two = [answer for answer in answers if answer["event"] == "ended"]
     assert (one["touches"], two["touches"]) == (1, 2)
-    assert two["probability"] == learner().predict(*parts).probability
+    assert two["probability"] == learner().predict(*parts).as_json()["probability"]
 
 
 def test_pictures_are_readings_of_a_camera():

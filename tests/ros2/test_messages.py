@@ -191,7 +191,7 @@ def test_answers_fill_the_message_package_of_the_examples(monkeypatch):
     node = SimpleNamespace(
         get_name=lambda: "scroll_tactile", create_publisher=publisher, context=SimpleNamespace(ok=lambda: True)
     )
-    answers = said.Answers(node, "thumb", "pad")
+    answers = said.AnswerTopics(node, "thumb", "pad")
     answers._header = lambda answer: header(stamp(*divmod(round(answer["stamp"] * 1e9), 10**9)), "thumb")
     bare = {"event": "began", "stamp": 3.25, "contact": True, "seconds": 0.0, "decided": False}
     estimate = {"value": 1.5, "low": None, "high": 2.0, "unit": "N"}

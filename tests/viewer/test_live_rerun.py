@@ -51,16 +51,19 @@ def test_what_is_printed_is_what_is_streamed(folder, tmp_path):
         name: [value for _, (value,) in scalars(found, f"/answer/probability/{name}", "time") if not np.isnan(value)]
         for name in "abc"
     }
-    assert all(line["probability"] in written[line["material"]] for line in answers)
+    for line in answers:  # JSON has six digits
+        assert line["probability"] in [float(f"{value:.6g}") for value in written[line["material"]]]
     novelty = [value for _, (value,) in scalars(found, "/answer/novelty", "time") if not np.isnan(value)]
-    assert novelty == [line["novelty"] for line in answers]
+    assert novelty == pytest.approx([line["novelty"] for line in answers], rel=1e-5)
     forces = [value for _, value in scalars(found, "/estimate/force", "time")]
     given = [line["estimates"]["force"] for line in answers if line.get("estimates", {}).get("force")]
-    assert forces == [[own["value"], own["low"], own["high"]] for own in given if own["value"] is not None]
+    shown = [[own["value"], own["low"], own["high"]] for own in given if own["value"] is not None]
+    assert np.array(forces) == pytest.approx(np.array(shown), rel=1e-5)
     assert sum(text.startswith("touched") for text in texts(found, "/events")) == 3
     assert "is there already" in refused(*words)
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # of a viewer that is ended while it writes
 def test_a_viewer_that_listens_gets_it(folder, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -85,7 +85,7 @@ class Reference:
     def idle(self) -> npt.NDArray[np.bool_]:
         """The channels that hardly ever read anything, (n,)."""
         n = self.channels
-        spread = sum(self._sums.values())[n : 2 * n] * (UNIT / self.total)
+        spread = np.sum(list(self._sums.values()), axis=0)[n : 2 * n] * (UNIT / self.total)
         return np.asarray(spread < np.log((1 + IDLE) * FLOOR))
 
 
@@ -220,5 +220,5 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     limit = np.log(GREATEST_GAIN)
     gains = np.where(fit.known, np.exp(np.clip(best[:n], -limit, limit)), 1.0)
     offsets = np.where(fit.known, np.clip(best[n:] * reference.spans, -1.0, 1.0), 0.0)
-    means = (float(each.mean()) / fit.dimension for each in (before, after))
-    return Fitted(gains, offsets, fit.lost, *means, float((before - after).sum()) / 2)
+    first, second = (float(each.mean()) / fit.dimension for each in (before, after))
+    return Fitted(gains, offsets, fit.lost, first, second, float((before - after).sum()) / 2)

@@ -148,7 +148,7 @@ class Listener:
         if number is None:
             return 0
         publisher = bytes((about.get("publisher_gid") or {}).get("data") or b"")
-        lost = max(0, number - self._numbers.get(publisher, number - 1) - 1)
+        lost = max(0, int(number) - self._numbers.get(publisher, int(number) - 1) - 1)
         self._numbers[publisher] = number
         return lost
 

@@ -244,7 +244,7 @@ def serve(
             if served is not None:
                 served.clean_up()
             rclpy.try_shutdown(context=context)
-        return served.met
+        return {} if served is None else served.met
 
 
 def _start(served: _Served, managed: bool, running: Callable[[], bool]) -> None:

@@ -25,7 +25,7 @@ class Browser:
     def __init__(self):
         if CHROMIUM is None:
             pytest.skip("no Chromium on this machine: Debian's package is `chromium`")
-        self._folder = tempfile.TemporaryDirectory()
+        self._folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)  # it may still write
         (read, self._out), (self._in, write) = os.pipe(), os.pipe()
         options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
         words = [CHROMIUM, *options, f"--user-data-dir={self._folder.name}", "about:blank"]

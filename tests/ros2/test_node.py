@@ -197,7 +197,6 @@ def test_readmes_line_runs_as_it_stands(spinning, tmp_path):
         assert "memory: 0 materials" in ended_by_ctrl_c(process)
 
 
-@pytest.mark.skip(reason="not seen to end since the node has a lifecycle: the machine was too busy")
 def test_the_example_acts_on_what_it_feels(memory, tmp_path):
     with TactileLearner.open(memory, mode="read") as source:
         source.backup(tmp_path / "own")

@@ -58,7 +58,7 @@ class HealthNotes:
         """Take the touch that ended; None where the session did: note the touch before it and the rest, and look."""
         touch, self._last = self._last, ended
         try:
-            if touch is not None and self._tells(touch):
+            if touch is not None and self._counts(touch):
                 self._learner.sense(touch.stream, touch.prediction.material)
             if ended is not None and ended.rest is not None:
                 self._learner.sense(ended.rest)
@@ -71,10 +71,11 @@ class HealthNotes:
             if self._told and not before:
                 self._changed(found)
 
-    def _tells(self, touch: LiveTouch) -> bool:
-        said = touch.prediction
-        certain = self._materials and touch.decided and said.known is True and said.material is not None
-        return certain and not self._learner.names_of(touch.stream)  # its row tells of its channels, too
+    def _counts(self, touch: LiveTouch) -> bool:
+        """Whether a touch is noted: it was decided, is known, and was not learned, whose row has its channels, too."""
+        answer = touch.prediction
+        certain = self._materials and touch.decided and answer.known is True and answer.material is not None
+        return certain and not self._learner.names_of(touch.stream)
 
     def _warn_once(self, error: Exception) -> None:
         if type(error) not in self._warned:

@@ -6,7 +6,6 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +22,7 @@ from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
-from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches, not_recognised
+from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Adaptation, Compacted, Health, Merged, Observation, Receipt
 from scroll_tactile.sensors import Sensor
@@ -157,10 +156,10 @@ class MemoryKeeper(ABC):
         such as the one before `Health.since`; None: all.
 
         A gain and an offset of each channel are estimated from them, drawn to none (see `health.skin_fit`), and a
-        channel that reads nothing any more is left out. Where that explains touches better
-        which it was not estimated from, and most of them are then known, or more than before, later ones are read
-        through it: `observe`, `predict`, `estimate`, `compose`, `sense` and touches that begin in live sessions. What
-        was learned stays as it is, to the byte; `retract` takes the adaptation back.
+        channel that reads nothing any more is left out. Where that explains touches better which it was not estimated
+        from, and most of them are then known, or more than before, later ones are read through it: `observe`,
+        `predict`, `estimate`, `compose`, `sense` and touches that begin in live sessions. What was learned stays as it
+        is, to the byte; `retract` takes the adaptation back.
 
         A second one replaces the first: it is made from the readings as they came. It is of this unit: `merge` and
         `pack` leave it behind, a compaction, a backup and `reembed` keep it. An `exported` judge knows nothing of it.
@@ -171,13 +170,7 @@ class MemoryKeeper(ABC):
         """
         require_arguments({}, {"until": until})
         self._ledger.require_store("be adapted")
-        chosen = known_touches(touches, self.sensor)
-        before = self._unknown(chosen)
-        done = adapt_to(self._ledger, chosen, self.sensor, until)
-        if not done.kept or not (why := not_recognised(before, self._unknown(chosen), len(chosen))):
-            return done
-        self.retract(done)
-        return replace(done, kept=False, why=why, sequence=None)
+        return adapt_to(self._ledger, known_touches(touches, self.sensor), self.sensor, until, self._unknown)
 
     @abstractmethod
     def _unknown(self, touches: Iterable[Stream]) -> int:

@@ -63,14 +63,12 @@ def adaptation_of(store: Store, receipt: Receipt | Adaptation | int) -> Head | N
 
     Raises ObservationError for an adaptation that was not kept, and for one of another memory.
     """
-    if not isinstance(receipt, Receipt | Adaptation | int):
-        return None  # `observation_of` says what was expected
-    sequence = receipt if isinstance(receipt, int) else receipt.sequence
-    if sequence is None:
+    if isinstance(receipt, Adaptation) and receipt.sequence is None:
         raise ObservationError("this adaptation was not kept: there is nothing to retract")
-    if isinstance(sequence, bool) or not 1 <= sequence <= store.last or isinstance(receipt, Receipt):
-        return None
-    head = next(store.heads(sequence - 1), None)
+    sequence = receipt.sequence if isinstance(receipt, Adaptation) else receipt
+    if isinstance(sequence, bool) or not isinstance(sequence, int):
+        return None  # a receipt of an observation, or nothing at all: `observation_of` says what was expected
+    head = next(store.heads(sequence - 1), None) if 1 <= sequence <= store.last else None
     if head is not None and head.sequence == sequence and head.kind == ADAPT and RETRACTS not in head.attributes:
         return head
     if isinstance(receipt, Adaptation):

@@ -47,9 +47,9 @@ class OpenMemory:
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
     grows with each change of a description. added: if `follow` is set, the touches observed and retracted since the
     list was last cleared; None where these are too many, or something else has changed. followers: are called with the
-    same at each change. watched: the rows that health was last told from;
-    None while they are read. lost: grows where a change was cut short, whose rows may not be in the journal. saves:
-    whether checkpoints are written; the journal alone has every row, too.
+    same at each change. watched: the rows that health was last read from; None while they are read. lost: grows where
+    a change was cut short, whose rows may not be in the journal. saves: whether checkpoints are written; the journal
+    alone has every row, too.
     """
 
     def __init__(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -29,13 +29,13 @@ from scroll_tactile.persistence.open_memory import Derived, OpenMemory
 from scroll_tactile.results import Adaptation, Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name
-from scroll_tactile.signals.correction import Correction
+from scroll_tactile.signals.correction import Correction, corrected_stream
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.validation.gate import WRONG
 from scroll_tactile.validation.stored_watch import NAME, watch_to_arrays, watched_from
 from store import Head, Store, StoreError
 
-__all__ = ["adapt_to", "health_of", "health_to_store", "known_touches", "not_recognised"]
+__all__ = ["adapt_to", "health_of", "health_to_store", "known_touches"]
 
 logger = logging.getLogger(__name__)
 
@@ -164,8 +164,14 @@ def _pairs(touches: Any) -> list[tuple[str, Any]]:
         ) from None
 
 
-def adapt_to(ledger: Ledger, touches: Mapping[Stream, str], sensor: Sensor, until: int | None) -> Adaptation:
-    """As `TactileLearner.adapt`, for touches that `known_touches` gave."""
+def adapt_to(
+    ledger: Ledger,
+    touches: Mapping[Stream, str],
+    sensor: Sensor,
+    until: int | None,
+    unknown_of: Callable[[Iterable[Stream]], int],
+) -> Adaptation:
+    """As `TactileLearner.adapt`, for touches that `known_touches` gave. unknown_of: how many are called unknown."""
     with ledger.lock:
         store, memory = ledger.require_store("be adapted"), ledger.memory
         ledger.require_write_mode()
@@ -181,7 +187,7 @@ def adapt_to(ledger: Ledger, touches: Mapping[Stream, str], sensor: Sensor, unti
     correction = Correction(
         found.gains.astype(np.float32), (found.offsets * span).astype(np.float32), found.lost.astype(np.bool_)
     )
-    why = _refusal(found)
+    why = _refusal(found) or _not_recognised(touches, correction, unknown_of)
     return _result(correction, found, why, None if why else ledger.adapt(correction))
 
 
@@ -228,13 +234,13 @@ def _refusal(found: Fitted) -> str:
     return ""
 
 
-def not_recognised(before: int, after: int, count: int) -> str:
-    """Why a correction is taken back, by how many of the touches that it was made of are unknown; "" where it stands.
-
-    before, after: without and with it. It is taken back where most are unknown, and no fewer than before.
-    """
-    if 2 * after > count and after >= before:
-        return f"{after} of {count} touches are unknown even so: gains and offsets do not explain the change"
+def _not_recognised(
+    touches: Mapping[Stream, str], correction: Correction, unknown_of: Callable[[Iterable[Stream]], int]
+) -> str:
+    """Why a correction is not kept; "" unless most of its touches are unknown with it, and no fewer than without."""
+    after = unknown_of(corrected_stream(touch, correction) for touch in touches)
+    if 2 * after > len(touches) and after >= unknown_of(touches):
+        return f"{after} of {len(touches)} touches are unknown even so: gains and offsets do not explain the change"
     return ""
 
 

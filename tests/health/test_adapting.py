@@ -226,11 +226,23 @@ def test_a_second_one_replaces_the_first_until_it_is_retracted(path: Path) -> No
         for receipt in (second, 51, Adaptation(False, "", None, (), (), (), 1.0, 1.0)):
             with pytest.raises(errors.ObservationError):
                 learner.retract(receipt)
-        with pytest.raises(errors.ObservationError, match="one of another memory"):
-            learner.retract(Adaptation(True, "", 1, (), (), (), 1.0, 1.0))
+        for row in (1, 10**6):
+            with pytest.raises(errors.ObservationError, match="one of another memory"):
+                learner.retract(Adaptation(True, "", row, (), (), (), 1.0, 1.0))
         with pytest.raises(errors.ObservationError, match="of kind 'adapt'"):
             learner.retract(learner.memory.sequence)  # a retraction cannot be taken back
         assert one != two
+
+
+def test_what_the_memory_does_not_know_even_so_is_refused_before_there_is_a_row(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with TactileLearner.open(path) as learner:
+        rows, digest = learner.memory.sequence, learner.digest()
+        monkeypatch.setattr(TactileLearner, "_unknown", lambda learner, touches: len(list(touches)))
+        done = learner.adapt(five())
+        assert (done.kept, done.sequence) == (False, None) and "5 of 5 touches are unknown even so" in done.why
+        assert (learner.memory.sequence, learner.digest(), correction(learner)) == (rows, digest, None)
 
 
 def test_no_more_than_some_are_kept_to_come_back_to(path: Path) -> None:

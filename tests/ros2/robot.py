@@ -115,8 +115,11 @@ def publishing(count, rate, every=1, kind="JointState", topic=TOPIC):
     words = [sys.executable, ROBOT, topic, str(count), str(rate), str(every), kind]
     paths = os.pathsep.join([str(ROBOT.parents[1]), *sys.path])
     with subprocess.Popen(list(map(str, words)), env=os.environ | {"PYTHONPATH": paths}) as process:
-        yield process
-        process.wait(120)
+        try:
+            yield process
+            process.wait(120)
+        finally:  # it waits for a listener for ever
+            process.kill()
     assert process.returncode == 0
 
 

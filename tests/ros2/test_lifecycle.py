@@ -3,7 +3,6 @@
 import json
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import launching
@@ -15,6 +14,7 @@ from scroll_tactile.ros2.fingers import Finger, fingers_of
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters  # noqa: E402
@@ -60,14 +60,13 @@ class Remote:
         [result] = self.ask(SetParameters, "set_parameters", parameters=[message]).results
         return "" if result.successful else result.reason or "no reason"
 
-    def touched(self, material, seconds=300):
-        """Wait until the last touch was one of a material, whatever was published before anybody subscribed."""
-        end = time.monotonic() + seconds
-        while True:
-            reply = self.call("predict")
-            if reply.success and json.loads(reply.message)["material"] == material:
-                return
-            assert time.monotonic() < end, reply.message
+    def silent_after(self, publisher, seconds=300):
+        """Wait until a process has published all it had and the node says that nothing comes any more."""
+        heard = []
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+        self.nodes.until(lambda: publisher.poll() is not None, seconds)
+        heard.clear()  # what is said from here on is said after the last message
+        self.nodes.until(lambda: any(array.status[0].level == DiagnosticStatus.STALE for array in heard), seconds)
 
     def ended(self):
         return [answer for answer in self.answers if answer["event"] == "ended"]
@@ -129,8 +128,8 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
     """The publisher begins as soon as somebody listens; the node is killed within a touch, and started again."""
     remote = Remote(spinning)
     remote.listen()
-    with publishing(500, 250), node_command(own) as process:
-        remote.touched("b")
+    with publishing(500, 250) as publisher, node_command(own) as process:
+        remote.silent_after(publisher)
         reply = remote.call("learn", "felt")
         assert reply.success and "learned as observation" in reply.message
         remote.answers.clear()
@@ -158,8 +157,8 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
 
 
 def test_every_reading_since_the_topic_was_heard_is_counted(spinning, own):
-    with publishing(500, 250), node_command(own) as process:
-        Remote(spinning).touched("b")
+    with publishing(500, 250) as publisher, node_command(own) as process:
+        Remote(spinning).silent_after(publisher)
         output = ended_by_ctrl_c(process)
     assert "messages: 500" in output and "dropped" not in output
 

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scroll_tactile.health.channel_numbers import FLOOR, KINDS, UNIT, Numbers
 from scroll_tactile.signals.correction import GREATEST_GAIN, corrected
 
-__all__ = ["Fitted", "Reference", "fitted"]
+__all__ = ["Fitted", "Reference", "fitted", "guess_of_lost"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -222,3 +222,23 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     offsets = np.where(fit.known, np.clip(best[n:] * reference.spans, -1.0, 1.0), 0.0)
     first, second = (float(each.mean()) / fit.dimension for each in (before, after))
     return Fitted(gains, offsets, fit.lost, first, second, float((before - after).sum()) / 2)
+
+
+def guess_of_lost(touches: Sequence[Floats], lost: npt.NDArray[np.bool_], step: float) -> npt.NDArray[np.float32]:
+    """The weights (m, n − m + 1) by which m lost channels are guessed from the others, the last of each a constant.
+
+    Least squares over all readings of earlier touches, (T, n) each, shares of the range in steps of `step`; what
+    rounding to them adds, step² / 12, is the ridge. Where there are no touches the weights are 0.
+    """
+    n, m = len(lost), int(np.count_nonzero(lost))
+    count, total, squares = 0, np.zeros(n), np.zeros((n, n))
+    for shares in touches:
+        count, total, squares = count + len(shares), total + shares.sum(axis=0), squares + shares.T @ shares
+    if not count or not m:
+        return np.zeros((m, n - m + 1), np.float32)
+    mean = total / count
+    covariance = squares / count - np.outer(mean, mean)
+    others = covariance[np.ix_(~lost, ~lost)] + np.diag(np.full(n - m, step**2 / 12))
+    weights = np.linalg.solve(others, covariance[np.ix_(~lost, lost)]).T
+    constants = mean[lost] - weights @ mean[~lost]
+    return np.concatenate([weights, constants[:, None]], axis=1).astype(np.float32)

@@ -17,10 +17,10 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text
-from scroll_tactile.health.skin_fit import Fitted, Reference, fitted
+from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
 from scroll_tactile.health.watch import Watch
 from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
-from scroll_tactile.matching.likelihood import LEVELS
+from scroll_tactile.matching.likelihood import LEVELS, MISSING
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
@@ -177,24 +177,35 @@ def adapt_to(
         ledger.require_write_mode()
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
-        ends = _at_ends(memory, sensor.channels)
-        reference = _reference(store, memory, sensor.channels, {touch.key for touch in touches}, until)
+        own = {touch.key for touch in touches}
+        kept = _kept_before(store, memory, own, until)
+        ends = _at_ends(kept, sensor.channels)
+        reference = _reference(store, memory, sensor.channels, own, until)
     _require_known(reference, sorted(set(touches.values())), store)
     low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
     shares = [(touch.readings - low) / (high - low) for touch in touches]
     found = fitted(reference, shares, list(touches.values()), ends)
     span = np.broadcast_to(high - low, (sensor.channels,))
+    earlier = [(of[:, (of != MISSING).all(axis=0)] / (LEVELS - 1)).T for of in kept]
     correction = Correction(
-        found.gains.astype(np.float32), (found.offsets * span).astype(np.float32), found.lost.astype(np.bool_)
+        found.gains.astype(np.float32),
+        (found.offsets * span).astype(np.float32),
+        found.lost.astype(np.bool_),
+        guess_of_lost(earlier, found.lost, 1 / (LEVELS - 1)),
     )
     why = _refusal(found) or _not_recognised(touches, correction, unknown_of)
     return _result(correction, found, why, None if why else ledger.adapt(correction))
 
 
-def _at_ends(memory: Memory, channels: int) -> Floats:
-    """The share of kept readings of each channel that lie at an end of the range, (n,); 1 where none are kept."""
-    kept = [] if memory.kept is None else memory.kept.touches()
-    shares = [((touch.levels == 0) | (touch.levels == LEVELS - 1)).mean(axis=1) for touch in kept]
+def _kept_before(store: Store, memory: Memory, own: set[bytes], until: int | None) -> list[npt.NDArray[np.uint8]]:
+    """The levels, (n, T), of kept touches that were observed up to a row, but for some by their keys."""
+    out = own if until is None else own | {head.key for head in store.heads(until, kind=OBSERVE)}
+    return [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
+
+
+def _at_ends(kept: Sequence[npt.NDArray[np.uint8]], channels: int) -> Floats:
+    """The share of kept readings, (n, T), of each channel at an end of the range, (n,); 1 where none are kept."""
+    shares = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]
     return np.asarray(np.mean(shares, axis=0) if shares else np.ones(channels), np.float64)
 
 

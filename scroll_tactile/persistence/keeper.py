@@ -157,10 +157,10 @@ class MemoryKeeper(ABC):
 
         A gain and an offset of each channel are estimated from them, drawn to none (see `health.skin_fit`), and a
         channel that reads nothing any more is left out: whatever it reads, its values are missing, and the embedding
-        sees what the other channels say of it, as far as kept touches tell how they go together. Where that explains touches better which it was not estimated
-        from, and most of them are then known, or more than before, later ones are read through it: `observe`,
-        `predict`, `estimate`, `compose`, `sense` and touches that begin in live sessions. What was learned stays as it
-        is, to the byte; `retract` takes the adaptation back.
+        sees what the other channels say of it, as far as kept touches tell how they go together. Where that explains
+        touches better which it was not estimated from, and most of them are then known, or more than before, later ones
+        are read through it: `observe`, `predict`, `estimate`, `compose`, `sense` and touches that begin in live
+        sessions. What was learned stays as it is, to the byte; `retract` takes the adaptation back.
 
         A second one replaces the first: it is made from the readings as they came. It is of this unit: `merge` and
         `pack` leave it behind, a compaction, a backup and `reembed` keep it. An `exported` judge knows nothing of it.

@@ -33,6 +33,7 @@ OWN = 0.02  # of a logarithm: added, in squares, to the standard deviation of ea
 IDLE = 1.0  # times the floor of spreads: a channel below it says nothing of its gain
 CLIPPED, MOSTLY = 0.1, 0.4  # of the readings: more of them at an end of the range than before; that usually are there
 DEAD = -3.0  # of the logarithms of spread and noise, together: a channel that fell by so much reads nothing any more
+BLOCKS = 16  # of touches, one of which is left out: beyond, each is one of several
 STEP, ROUNDS, ENOUGH = 1e-3, 30, 1e-3  # of derivatives; of the search, and what is no progress
 
 
@@ -167,12 +168,12 @@ class _PosteriorFit:
         return self._joined(here) - self.means, found
 
     def mode(self, sigma: float, tau: float, start: Floats, leave: int | None = None) -> tuple[Floats, float]:
-        """The posterior mode (2 n,), log gains and offsets in spans, and the evidence; leave: a touch left out."""
+        """The posterior mode (2 n,), log gains and offsets in spans, and the evidence; leave: a block left out."""
         n, free = self.n, np.flatnonzero(np.tile(self.known, 2))
         prior = np.repeat([1 / sigma**2, 1 / tau**2], n)
         weights = self.weights.copy()
         if leave is not None:
-            weights[leave] = 0.0
+            weights[leave::BLOCKS] = 0.0
 
         def objective(at: Floats) -> float:
             return float(weights @ self.loss(at[:n], at[n:]) + (prior * at**2).sum()) / 2
@@ -215,8 +216,10 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
             if likely > evidence:
                 best, evidence, how = at, likely, (sigma, tau)
     before = fit.loss(none[:n], none[n:])
-    held = [fit.mode(*how, best, leave)[0] for leave in range(len(touches))]
-    after = np.array([fit.loss(at[:n], at[n:])[leave] for leave, at in enumerate(held)])
+    after = np.empty(len(touches))
+    for leave in range(min(len(touches), BLOCKS)):
+        held = fit.mode(*how, best, leave)[0]
+        after[leave::BLOCKS] = fit.loss(held[:n], held[n:])[leave::BLOCKS]
     limit = np.log(GREATEST_GAIN)
     gains = np.where(fit.known, np.exp(np.clip(best[:n], -limit, limit)), 1.0)
     offsets = np.where(fit.known, np.clip(best[n:] * reference.spans, -1.0, 1.0), 0.0)

@@ -48,7 +48,7 @@ def adapt(
     """Take over a changed skin, from about five touches of known materials felt with it; nothing is learned of them.
 
     Later touches are read through what was found; `memory retract` takes it back. The exit code is 1 where it was not
-    kept.
+    kept, or a source was refused, which is named then.
     """
     from scroll_tactile.pipelines.sources import Refused, find_sources, source_touches
 

@@ -8,9 +8,10 @@ import typer
 
 from scroll_tactile import __version__, native
 from scroll_tactile.cli.adapting import adapt
+from scroll_tactile.cli.annotating import annotate
 from scroll_tactile.cli.bulk import evaluate, fleet, learn
 from scroll_tactile.cli.everyday import compose, describe, inspect, observe, predict
-from scroll_tactile.cli.replay import annotate, live
+from scroll_tactile.cli.replay import live
 from scroll_tactile.cli.robot import PASSED_ON, mcp, ros2
 from scroll_tactile.cli.showing import demo, report
 from scroll_tactile.cli.terminal import Commands

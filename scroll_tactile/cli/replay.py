@@ -1,4 +1,4 @@
-"""`scroll-tactile live` and `annotate`: answers as they grow, shown, or written beside what a robot recorded."""
+"""`scroll-tactile live`: answers as they grow, shown, or written beside what a robot recorded."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from enum import StrEnum
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,13 +14,12 @@ import typer
 from rich.live import Live
 from rich.table import Table
 
-from scroll_tactile.cli.options import AsJson, Axis, Clock, Columns, Field, MemoryFolder, Preset, Topic, materials_of
+from scroll_tactile.cli.options import Axis, Clock, Columns, Field, MemoryFolder, Preset, Topic
 from scroll_tactile.cli.terminal import (
     console,
     estimate_text,
     opened,
     percent,
-    progress_bar,
     say,
     say_json,
     shown,
@@ -34,13 +33,12 @@ if TYPE_CHECKING:
 
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
-    from scroll_tactile.pipelines.annotating.annotation_run import Annotated as Done
     from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
     from scroll_tactile.results import Estimate
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.viewer.touch_log import TouchLog
 
-__all__ = ["annotate", "live"]
+__all__ = ["live"]
 
 SHOWN = 5  # materials
 BAR = 30  # characters of a probability of one
@@ -91,12 +89,16 @@ def live(
     rows = _rows(file, timed, {"preset": preset, "topic": topic, "field": field, "clock": clock})
     if columns is not None:
         rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
-    with opened(memory, mode="read") as learner, _in_rerun(rerun, learner.sensor) as shown_there:
-        session = learner.live(risk=risk, contact="manual" if touch else "auto", of=of)
-        growing = Live(console=screen, auto_refresh=False, transient=True)
-        with _log(mcap) as log, session, growing if screen.is_terminal and not as_json else nullcontext():
-            before: LiveState | None = None
-            for reading, now, at in _states(session, rows, touch):
+    growing, before = Live(console=screen, auto_refresh=False, transient=True), None
+    with (
+        opened(memory, mode="read") as learner,
+        learner.live(risk=risk, contact="manual" if touch else "auto", of=of) as session,
+    ):
+        states = _states(session, rows, touch)
+        first = list(islice(states, 1))  # what cannot be read, or does not fit, leaves no file behind
+        terminal = growing if screen.is_terminal and not as_json else nullcontext()
+        with _in_rerun(rerun, learner.sensor) as shown_there, _log(mcap) as log, terminal:
+            for reading, now, at in chain(first, states):
                 before = _shown(before, now, at, as_json, growing)
                 if log is not None:
                     log.note(now, at)
@@ -104,7 +106,7 @@ def live(
                     if reading is not None:
                         shown_there.take(reading, at)
                     shown_there.show(now, at)
-        _summed_up(session.report, as_json, whole=touch)
+    _summed_up(session.report, as_json, whole=touch)
     if mcap is not None and not as_json:
         say(f"written: {shown(mcap)}")
 
@@ -163,6 +165,10 @@ def _rows(
         for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
             yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
         return
+    if named := [f"--{name} {value}" for name, value in (where or {}).items() if value is not None]:
+        raise InputError(
+            f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
+        )
     for number, line in enumerate(sys.stdin, start=1):
         if not line.strip():
             continue
@@ -273,80 +279,3 @@ def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
     ]
     if irregular:
         say(", ".join(f"{name.replace('_', ' ')}: {counted[name]}" for name in irregular))
-
-
-class TouchCut(StrEnum):
-    """Where touches begin and end in an episode."""
-
-    EPISODES = "episodes"
-    CONTACT = "contact"
-
-
-def annotate(
-    dataset: Annotated[Path, typer.Argument(help="The folder of a LeRobot data set, v3.", show_default=False)],
-    memory: Annotated[Path, typer.Option(help="The folder of the memory that answers.", show_default=False)],
-    output: Annotated[
-        Path | None, typer.Option(help="A new folder for the data set with answers; DATASET-annotated without it.")
-    ] = None,
-    in_place: Annotated[
-        bool, typer.Option("--in-place", help="Change the data set itself; meta.before keeps its meta/ as it was.")
-    ] = False,
-    forms: Annotated[str, typer.Option("--as", help="numbers, language, mcap, with commas between.")] = (
-        "numbers,language"
-    ),
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Answer anew where answers are there; events of others stay.")
-    ] = False,
-    field: Field = None,
-    columns: Columns = None,
-    clock: Clock = None,
-    cut: Annotated[
-        TouchCut, typer.Option(help="Each episode is one touch; or they are found by contact, after 2 s at rest in it.")
-    ] = TouchCut.EPISODES,
-    risk: Annotated[float, typer.Option(help="The share of wrong answers among those that are decided.")] = 0.05,
-    scene: Annotated[
-        str | None, typer.Option(help="The materials that can be here, separated by commas; all of them otherwise.")
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Write into a LeRobot data set what the memory answers at each frame, knowing no more than the frames before it.
-
-    Columns observation.touch.material (a number; meta/info.json has the names), .probability, .known and .QUANTITY, and
-    events in language_events; with --as mcap a log of each episode in mcap/, for Foxglove and Rerun. All else stays as
-    it is. Interrupt it, type it again, and it goes on.
-    """
-    from scroll_tactile.pipelines.annotating.annotation_run import annotate as annotated
-
-    with opened(memory, mode="read") as learner, progress_bar() as progress:
-        done = annotated(
-            learner,
-            dataset,
-            output=output,
-            in_place=in_place,
-            replace=replace,
-            forms=[form.strip() for form in forms.split(",")],
-            field=field,
-            columns=columns,
-            clock=clock,
-            cut=cut.value,
-            risk=risk,
-            scene=materials_of(scene),
-            progress=progress,
-        )
-    _report(done, as_json)
-
-
-def _report(done: Done, as_json: bool) -> None:
-    if as_json:
-        kept = None if done.kept is None else str(done.kept)
-        say_json(vars(done) | {"output": str(done.output), "kept": kept})
-        return
-    say(
-        f"[bold]annotated:[/] {done.episodes} episodes, {done.touches} touches; of {done.frames} frames "
-        f"{done.answered} have an answer, {done.events} an event"
-    )
-    if not done.touches:
-        say("[yellow]no touch was found[/]: with --cut contact each episode has to begin with two seconds at rest")
-    if done.left_out:
-        say(f"[bold]left out:[/] {done.left_out} frames whose readings are NaN or infinite")
-    say(f"written: {shown(done.output)}" + (f"; as it was before: {shown(done.kept)}" if done.kept else ""))

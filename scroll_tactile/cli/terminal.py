@@ -205,7 +205,7 @@ def estimate_text(estimate: Estimate) -> str:
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A bar on the standard error; yields its update: (what is being done, steps done, steps in all)."""
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # names of files, which may have brackets
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

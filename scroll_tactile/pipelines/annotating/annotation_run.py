@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
-import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,22 +15,25 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments, silent
-from scroll_tactile.errors import FieldError, InputError, RecordingError, printable
+from scroll_tactile.errors import InputError, RecordingError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
 from scroll_tactile.pipelines.annotating.frame_answers import Cut, Episodes
+from scroll_tactile.pipelines.annotating.placing import MADE, RECORD, clear, place, require_own_folders
 from scroll_tactile.pipelines.annotating.rewriting import (
     copy_others,
     drafted,
     names_in,
+    own_files,
+    require_each_once,
     statistics_in,
     wanted_statistics,
     write_data,
     write_metadata,
 )
-from scroll_tactile.pipelines.annotating.touch_columns import EVENTS, WRITER, TouchColumns
+from scroll_tactile.pipelines.annotating.touch_columns import EVENTS, TouchColumns, is_written
 from scroll_tactile.pipelines.learning import Progress
-from scroll_tactile.pipelines.runfile import RunFile, alone_in
+from scroll_tactile.pipelines.runfile import RunFile, alone_in, differing
 from scroll_tactile.pipelines.sources import readings_of
 from scroll_tactile.recordings import Recording, Report
 from scroll_tactile.recordings.arrays.lerobot import LeRobot, is_lerobot
@@ -39,7 +42,6 @@ from scroll_tactile.recordings.recording import only_columns
 
 __all__ = ["Annotated", "annotate"]
 
-RECORD = "annotation.json"
 LOGS = "mcap"  # the folder of the episodes' logs
 WORK = ".annotating"  # the suffix of the folder that is worked in, behind the name of the one that is made
 
@@ -95,7 +97,8 @@ def annotate(
 
     Features, statistics and those of each episode are added. All else is copied as it is, videos as second names of
     the same files where the disk allows that. Equal memories give equal columns. An interrupted call is resumed by the
-    same one, file by file; the new folder is there only once it is whole.
+    same one, file by file; the new folder is there only once it is whole. Files that were being moved into a data set
+    are moved by any call for it, whatever else it asks for: InputError then says so.
 
     learner: the memory; it is settled, and stays as it is. dataset: its folder. output: a new one; without it
     `<dataset>-annotated`. in_place: change the data set itself, and keep a copy of `meta/` in `meta.before`. replace:
@@ -105,41 +108,75 @@ def annotate(
     with two seconds at rest. risk, scene: as of `TactileLearner.live`. progress: called with (what is being done, files
     done, files in all).
 
-    Raises InputError for a memory that holds nothing, an output that is there, or cannot be written; RecordingError and
-    FieldError for a data set that is not whole, or not v3; ChannelCountError for another sensor's; LockedError where
-    another call is at work there; MissingLibraryError for "mcap" without that package.
+    Raises InputError for a memory that holds nothing, an output that is there, or cannot be written, and frames that
+    come less than half or more than twice as often as the sensor's readings; RecordingError and FieldError for a data
+    set that is not whole, leads out of its folder, or is not v3; ChannelCountError for another sensor's; LockedError
+    where another call is at work there; MissingLibraryError for "mcap" without that package.
     """
     require_arguments({"path": dataset, "risk": risk}, {"progress": progress})
     if not learner.materials:
         raise InputError("expected a memory that has observed something; this one is empty, and would answer nothing")
-    source, target = _opened(dataset, field, clock), _target(Path(dataset), output, in_place)
+    _require_lerobot(Path(dataset))
+    target = _target(Path(dataset), output, in_place)
     learner.settle()
     how: dict[str, Any] = {"cut": cut, "risk": risk, "scene": None if scene is None else sorted(scene)}
     episodes = Episodes(learner, **how)
     about = {"memory": learner.digest(), **how}
     made = TouchColumns(episodes.names, episodes.quantities, forms, about)
-    plan = about | {"dataset": str(source.path.resolve()), "target": str(target.resolve()), "forms": sorted(forms)}
-    plan |= {"field": field, "columns": columns, "clock": clock, "replace": replace}
+    asked = about | {"forms": sorted(forms), "field": field, "columns": columns, "clock": clock}
+    asked |= {"replace": replace}
     work = target.with_name(target.name + WORK)
     with alone_in(work, target):
-        run = _Rewritten(source, target, work, RunFile(work / RECORD, plan), made, logged="mcap" in forms)
+        record = RunFile(work / RECORD, {"dataset": str(Path(dataset).resolve()), "target": str(target.resolve())})
         try:
-            if "moving" not in run.record.notes:
+            differs = _differing(record, asked, work)
+            if "moving" not in record.notes:
+                _require_free(target, in_place)
+                source = _opened(Path(dataset), field, clock)
+                run = _Rewritten(source, target, work, record, made, logged="mcap" in forms)
                 run.prepare(in_place=in_place, replace=replace)
                 run.write(episodes, columns, progress)
-            return run.finish()
+            kept = place(target, work, record)
         except BaseException:
-            if "done" not in run.record.notes:  # what is refused leaves nothing
-                shutil.rmtree(work, ignore_errors=True)
+            if "done" not in record.notes:  # what is refused leaves nothing
+                with suppress(OSError):
+                    clear(work)
             raise
+    if differs:
+        raise InputError(
+            f"an annotation of {dataset} was cut off while its files were moved: it is whole now, in {target}, but it "
+            f"is not the one that is asked for here ({differs}). To have that one, too, start it again, with "
+            "replace=True in place, or with another output="
+        )
+    return Annotated(target, **record.notes["summary"], kept=kept)
 
 
-def _opened(dataset: str | os.PathLike[str], field: str | None, clock: str | None) -> LeRobot:
-    path = Path(dataset)
+def _differing(record: RunFile, asked: dict[str, Any], work: Path) -> str:
+    """How what is asked for differs from what is on its way there: that is put in its place all the same, once written.
+
+    Raises InputError where only a part of it is written.
+    """
+    if "done" not in record.notes:
+        record.notes = {"asked": json.loads(json.dumps(asked))}
+    differs = differing(record.notes["asked"], asked)
+    if differs and "moving" not in record.notes:
+        raise InputError(f"{work} belongs to another run ({differs}): ask for the same, or remove {work} to begin anew")
+    return differs
+
+
+def _require_lerobot(path: Path) -> None:
     if not is_lerobot(path):
         kinds = {True: "there is no meta/info.json in it", False: "there is no such folder on this machine"}
         what = "it is a file" if path.is_file() else kinds[path.is_dir()]
         raise RecordingError(f"expected the folder of a LeRobot data set; came {path}: {what}")
+
+
+def _require_free(target: Path, in_place: bool) -> None:
+    if not in_place and os.path.lexists(target):
+        raise InputError(f"{target} is there already: take another output=, or move it away")
+
+
+def _opened(path: Path, field: str | None, clock: str | None) -> LeRobot:
     with guarded(str(path)):
         source = LeRobot(path, str(path), Request(field=field, clock=clock))
         source.column()
@@ -156,28 +193,35 @@ def _target(dataset: Path, output: str | os.PathLike[str] | None, in_place: bool
     target = whole.with_name(whole.name + "-annotated") if output is None else Path(output)
     if target.resolve().is_relative_to(whole):
         raise InputError(f"{target} lies in the data set that is read: take a folder outside, or in_place=True")
-    if target.exists():
-        raise InputError(f"{target} is there already: take another output=, or move it away")
     return target
 
 
 class _Rewritten:
-    """One annotation: what is read, the folder it becomes, the one it is made in, its record, and the columns."""
+    """One annotation: what is read, the folder it becomes, the one it is worked in, its record, and the columns."""
 
     def __init__(
         self, source: LeRobot, target: Path, work: Path, record: RunFile, made: TouchColumns, *, logged: bool
     ) -> None:
         self.source, self.target, self.work, self.record, self.made = source, target, work, record, made
-        self.logged = logged
+        self.folder, self.logged = work / MADE, logged
 
     def prepare(self, *, in_place: bool, replace: bool) -> None:
-        """Look at what is there, before anything is written. Raises InputError for what was changed meanwhile."""
+        """Look at what is there, before anything is written: answering takes hours.
+
+        Raises InputError for what was changed meanwhile, or cannot be put in its place; RecordingError for what leads
+        out of the data set.
+        """
         with guarded(self.source.address):
             self.names = names_in(self.source)
             self.dropped = _dropped(self.source, self.made, replace)
             if self.logged and not replace and (self.source.path / LOGS).exists():
                 raise InputError(f"{self.source.address} has a folder {LOGS!r} already: replace=True writes over it")
+            for _ in own_files(self.source.path, "meta" if in_place else ""):
+                pass  # each is checked
+            require_each_once(self.source, self.names)
             state = _state_of(self.source.path)
+        if in_place:
+            require_own_folders(self.target, [*self.names, "meta/info.json", *[f"{LOGS}/*.mcap"] * self.logged])
         self.in_place = in_place
         if self.record.notes.setdefault("source", state) != state:
             raise InputError(
@@ -189,23 +233,23 @@ class _Rewritten:
         """Write what is not written yet, and note what then has to be moved."""
         for number, name in enumerate(self.names):
             progress(f"answering {printable(Path(name).name)}", number, len(self.names))
-            if name not in self.record.notes.get("done", {}) or not (self.work / name).is_file():
+            if name not in self.record.notes.get("done", {}) or not (self.folder / name).is_file():
                 self._annotated(name, episodes, columns)
         progress("statistics", len(self.names), len(self.names))
         with guarded(self.source.address):
             wanted = wanted_statistics(self.source, self.source.column())
-            of_episodes = statistics_in(self.work, self.names, self.made, wanted)
-            written = write_metadata(self.source, self.work, self.made, of_episodes, self.dropped)
+            of_episodes = statistics_in(self.folder, self.names, self.made, wanted)
+            written = write_metadata(self.source, self.folder, self.made, of_episodes, self.dropped)
             if not self.in_place:
-                copy_others(self.source, self.work, [*self.names, *written])
+                copy_others(self.source, self.folder, [*self.names, *written])
         self.record.note("summary", _summary(self.record.notes["done"], len(of_episodes)))
-        logs = [f"{LOGS}/{path.name}" for path in sorted((self.work / LOGS).glob("*.mcap"))]
+        logs = [f"{LOGS}/{path.name}" for path in sorted((self.folder / LOGS).glob("*.mcap"))]
         self.record.note("moving", [*logs, *self.names, *written] if self.in_place else [])
 
     @contextmanager
     def _log(self, episode: int) -> Iterator[AnswerLog]:
         """The log of an episode, whole on the disk where the block ends without an error."""
-        with drafted(self.work / LOGS / f"episode_{episode:06d}.mcap") as draft, AnswerLog(draft) as log:
+        with drafted(self.folder / LOGS / f"episode_{episode:06d}.mcap") as draft, AnswerLog(draft) as log:
             yield log
 
     def _annotated(self, name: str, episodes: Episodes, columns: str | None) -> None:
@@ -214,7 +258,7 @@ class _Rewritten:
         readings, times, numbers = readings_of(episodes.sensor, frames[0]), *frames[1:]
         found = episodes.answered(readings, times, numbers, *[self._log] * self.logged)
         with guarded(self.source.address):
-            write_data(self.source, name, self.work / name, self.made, found, self.dropped)
+            write_data(self.source, name, self.folder / name, self.made, found, self.dropped)
         counted = {
             "frames": len(times),
             "answered": int((found.material >= 0).sum()),
@@ -224,40 +268,6 @@ class _Rewritten:
         }
         self.record.note("done", self.record.notes.get("done", {}) | {name: counted})
 
-    def finish(self) -> Annotated:
-        """Put what was written in its place."""
-        moving, summary = self.record.notes["moving"], self.record.notes["summary"]
-        kept = None
-        try:
-            if moving:
-                kept = self.target / self._kept()
-                for name in moving:  # info.json is the last
-                    (self.target / name).parent.mkdir(exist_ok=True)
-                    if (self.work / name).exists():
-                        (self.work / name).replace(self.target / name)
-                shutil.rmtree(self.work)
-            else:
-                self.work.rename(self.target)
-                (self.target / RECORD).unlink()
-        except OSError as error:
-            raise InputError(
-                f"{error.filename or self.target} cannot be put in its place: {error.strerror}. All is written in "
-                f"{self.work}: mend that, and start the same again"
-            ) from error
-        return Annotated(self.target, **summary, kept=kept)
-
-    def _kept(self) -> str:
-        """The name of the folder that keeps `meta/` as it was; it is copied once."""
-        if "kept" not in self.record.notes:
-            names = ["meta.before", *(f"meta.before-{number}" for number in range(2, 1000))]
-            name = next(name for name in names if not (self.target / name).exists())
-            draft = self.work / "meta.kept"
-            shutil.rmtree(draft, ignore_errors=True)
-            shutil.copytree(self.target / "meta", draft)
-            draft.replace(self.target / name)
-            self.record.note("kept", name)
-        return str(self.record.notes["kept"])
-
 
 def _frames(
     source: LeRobot, name: str, columns: str | None
@@ -266,8 +276,6 @@ def _frames(
     blocks = []
     for block in source.blocks_of(source.path / name):
         source.budget.give(block.readings.nbytes)
-        if block.episodes is None:
-            raise FieldError(f"{name} of {source.address} has no column 'episode_index'")
         blocks.append(block)
     if not blocks:
         raise RecordingError(f"{name} of {source.address} has no frames: remove it, or write it again")
@@ -280,7 +288,7 @@ def _frames(
 
 def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
     """The columns that give way. Raises InputError where there are some without replace, or of somebody else."""
-    ours = [name for name, about in source.features.items() if _is_ours(about)]
+    ours = [name for name, about in source.features.items() if is_written(about)]
     wanted = [name for name in ours if (made.language if name == EVENTS else made.numbers)]
     there = [name for name in made.features if name in source.features]
     if strangers := [name for name in there if name not in ours and name != EVENTS]:
@@ -297,11 +305,6 @@ def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
     if source.column() in found:
         raise InputError(f"{source.column()!r} are answers, and no readings: give another field=")
     return found
-
-
-def _is_ours(about: Any) -> bool:
-    info = about.get("info") if isinstance(about, dict) else None
-    return isinstance(info, dict) and info.get("written by") == WRITER
 
 
 def _state_of(folder: Path) -> str:

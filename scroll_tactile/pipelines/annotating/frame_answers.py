@@ -23,6 +23,7 @@ from scroll_tactile.results import Prediction
 __all__ = ["EVENT", "Episodes", "FrameAnswers", "Log", "in_words"]
 
 EVENT = "felt: "  # how the words of an event begin
+FARTHEST = 2  # times the sensor's rate, or this part of it: the rate of frames that are taken for its readings
 
 Cut = Literal["episodes", "contact"]
 
@@ -133,11 +134,11 @@ class Episodes:
 
     def _require_near(self, times: npt.NDArray[np.float64]) -> None:
         steps, rate = np.diff(times), self._learner.sensor.rate
-        step = float(np.median(steps)) if len(steps) else 0.0
-        if step * rate > _longest(rate) + 1:
+        if len(steps) and not 1 / FARTHEST <= round(float(np.median(steps)) * rate, 2) <= FARTHEST:
             raise InputError(
-                f"expected frames at about the sensor's {rate:g} readings a second; these come every {step:.4g} s, and "
-                "each would be a gap in time. Take a memory of a sensor that has their rate"
+                f"expected frames at about the sensor's {rate:g} readings a second, half as many to twice as many; "
+                f"these come every {np.median(steps):.4g} s, and most of what is felt would be made up between them, "
+                "or left out. Take a memory of a sensor that has their rate, or give another clock="
             )
 
     def _touches(self, times: npt.NDArray[np.float64]) -> set[int] | None:

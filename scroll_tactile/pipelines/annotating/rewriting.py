@@ -15,12 +15,22 @@ import numpy as np
 
 from scroll_tactile.errors import FieldError, InputError, RecordingError
 from scroll_tactile.pipelines.annotating.frame_answers import FrameAnswers
-from scroll_tactile.pipelines.annotating.touch_columns import EVENTS, TouchColumns, statistics_of, together
+from scroll_tactile.pipelines.annotating.touch_columns import EVENTS, TouchColumns, is_written, statistics_of, together
 from scroll_tactile.recordings.arrays.lerobot import LeRobot
 from scroll_tactile.recordings.arrays.rowgroups import codec_of, row_groups, schema_of
 from scroll_tactile.recordings.bounds import read_text, require_inside, stored_bytes
 
-__all__ = ["copy_others", "names_in", "statistics_in", "wanted_statistics", "write_data", "write_metadata"]
+__all__ = [
+    "copied",
+    "copy_others",
+    "names_in",
+    "own_files",
+    "require_each_once",
+    "statistics_in",
+    "wanted_statistics",
+    "write_data",
+    "write_metadata",
+]
 
 _LONGEST = 1 << 26  # bytes of stats.json
 _COUNTS = ("count",)  # statistics that are whole numbers, whatever they are of
@@ -30,14 +40,41 @@ _DRAFT = ".new"  # at the end of a file's name while it is written: no reader ta
 def names_in(source: LeRobot) -> list[str]:
     """The parquet files with frames, by their paths within the data set: those of its episodes, and what lies beside.
 
-    Raises RecordingError where one is missing, or the data set calls two by one name.
+    Raises RecordingError where one is missing, or called as if it lay elsewhere, or the data set calls two by one name.
     """
     listed = source.files()
     paths = sorted({*listed, *(source.path / "data").glob("**/*.parquet")})
     found = [os.path.normpath(path.relative_to(source.path)) for path in paths]
     if len(set(found)) < len(found) or len(set(listed)) < len(listed):
         raise RecordingError(f"{source.address} names the same file of frames twice: expected each once")
+    if climbing := [name for name in found if Path(name).parts[0] == os.pardir]:  # it would be written outside, too
+        raise RecordingError(f"{source.address} names data outside its folder: {climbing[0]!r:.100}")
     return found
+
+
+def require_each_once(source: LeRobot, names: Sequence[str]) -> None:
+    """Raises RecordingError for an episode in two places: two touches would be made of it, and one log of the two.
+
+    Raises FieldError where frames have no number of their episode.
+    """
+    found: set[int] = set()
+    for name in names:
+        last = None
+        with source.opened(source.path / name, ["episode_index"]) as file:
+            if "episode_index" not in file.schema_arrow.names:
+                raise FieldError(f"{name} of {source.address} has no column 'episode_index'")
+            if not source.types.is_integer(kind := file.schema_arrow.field("episode_index").type):
+                raise FieldError(f"column 'episode_index' of {name} holds {kind}; expected whole numbers")
+            for batch in file.iter_batches(columns=["episode_index"]):
+                numbers = batch.column(0).to_numpy(zero_copy_only=False).astype(np.int64)
+                for number in numbers[np.diff(numbers, prepend=numbers[:1] - 1) != 0].tolist():
+                    if number in found and number != last:
+                        raise RecordingError(
+                            f"episode {number} of {source.address} is in two places, the second in {name}: expected "
+                            "its frames in one file, one after the other"
+                        )
+                    found.add(number)
+                    last = number
 
 
 def write_data(
@@ -135,7 +172,8 @@ def write_metadata(
         written.append("meta/stats.json")
     info = _json(source, "info.json")
     features = _without(info["features"], [name for name in dropped if name != EVENTS])
-    info["features"] = features | columns.features
+    theirs = {EVENTS: features[EVENTS]} if EVENTS in features and not is_written(features[EVENTS]) else {}
+    info["features"] = features | columns.features | theirs  # what others say of their events stays
     _write_json(folder / "meta" / "info.json", info)
     return [*written, "meta/info.json"]
 
@@ -188,29 +226,42 @@ def _write_json(target: Path, content: Mapping[str, Any]) -> None:
 def copy_others(source: LeRobot, folder: Path, written: Sequence[str]) -> None:
     """Bring all files but these into the folder: videos as a second name of the same file where that can be.
 
-    Raises RecordingError for what is no file, or leads out of the data set.
+    Raises RecordingError as `own_files` does.
     """
-    for place, inside, files in os.walk(source.path):
-        for name in inside:
+    for own, path in own_files(source.path):
+        source.budget.work()
+        if own not in written and not (folder / own).exists():
+            copied(path, folder / own, linked=own.startswith(f"videos{os.sep}"))
+
+
+def own_files(root: Path, inside: str = "") -> Iterator[tuple[str, Path]]:
+    """The files of a data set, or of a folder in it: the path of each within the data set, and where its bytes lie.
+
+    Raises RecordingError for what is no file, or leads out of the data set; OSError for a folder that cannot be read.
+    """
+    for place, folders, files in os.walk(root / inside, onerror=_raise):
+        for name in folders:
             if (Path(place) / name).is_symlink():
                 raise RecordingError(f"{Path(place) / name} is a link to a folder: copy what it leads to in its place")
         for name in sorted(files):
             path = Path(place) / name
-            own = os.path.normpath(path.relative_to(source.path))
-            source.budget.work()
-            if own not in written and not (folder / own).exists():
-                require_inside(source.path, path)
-                stored_bytes(path)
-                with drafted(folder / own) as draft:
-                    _copy(path.resolve(), draft, linked=own.startswith(f"videos{os.sep}"))
+            require_inside(root, path)
+            stored_bytes(path)
+            yield os.path.normpath(path.relative_to(root)), path.resolve()
 
 
-def _copy(path: Path, draft: Path, *, linked: bool) -> None:
-    if linked:
-        with suppress(OSError):  # other devices, and file systems without
-            os.link(path, draft)
-            return
-    shutil.copyfile(path, draft)
+def _raise(error: OSError) -> None:
+    raise error
+
+
+def copied(path: Path, target: Path, *, linked: bool = False) -> None:
+    """Copy a file, durable; linked: as a second name of it where the file system allows that."""
+    with drafted(target) as draft:
+        if linked:
+            with suppress(OSError):  # other devices, and file systems without
+                os.link(path, draft)
+                return
+        shutil.copyfile(path, draft)
 
 
 @contextmanager

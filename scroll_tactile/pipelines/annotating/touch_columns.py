@@ -12,12 +12,12 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.pipelines.annotating.frame_answers import EVENT, FrameAnswers
 from scroll_tactile.quantities import Quantity
 
-__all__ = ["EVENTS", "FORMS", "PREFIX", "WRITER", "TouchColumns", "statistics_of", "together"]
+__all__ = ["EVENTS", "FORMS", "PREFIX", "TouchColumns", "is_written", "statistics_of", "together"]
 
 PREFIX = "observation.touch."
 EVENTS = "language_events"
 FORMS = ("numbers", "language", "mcap")
-WRITER = "scroll-tactile"  # the value under "written by" in a feature's info; only these may be replaced
+_WRITER = "scroll-tactile"  # the value under "written by" in a feature's info; only these may be replaced
 _ROLE, _STYLE = "tool", "interjection"  # of LeRobot's styles of events the one that no camera belongs to
 _FIELDS = ("role", "content", "style", "camera", "tool_calls")
 _SHARES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -37,7 +37,7 @@ class TouchColumns:
     ) -> None:
         if not forms or set(forms) - {*FORMS}:
             raise InputError(f"expected forms among {', '.join(FORMS)}; came {', '.join(map(repr, forms))!s:.80}")
-        numbers, made = "numbers" in forms, {"written by": WRITER, **about}
+        numbers, made = "numbers" in forms, {"written by": _WRITER, **about}
         self.names, self.language = tuple(names), "language" in forms
         self.quantities: dict[str, Quantity] = {}
         self.features: dict[str, dict[str, Any]] = {}
@@ -122,6 +122,12 @@ def _checked(kind: Any) -> Any:
             "without language leaves it alone"
         )
     return kind
+
+
+def is_written(about: Any) -> bool:
+    """Whether an annotation wrote a feature, by what meta/info.json says of it."""
+    info = about.get("info") if isinstance(about, dict) else None
+    return isinstance(info, dict) and info.get("written by") == _WRITER
 
 
 def statistics_of(values: npt.NDArray[Any], wanted: Sequence[str]) -> dict[str, list[Any]]:

@@ -137,8 +137,9 @@ class Watch:
         self.alarmed, top = sequence, int(logs.argmax())
         n, resting = self.channels, top >= SCORES * self.channels
         recent = [each for each in self.recent if (not each.material) == resting]
-        behind = [each.row > self.since[top] for each in recent]
         if resting:
-            self.change = diagnose_rest(recent, behind, self.cells[AT_REST].rows, n)
+            levels = float(logs[SCORES * n : (SCORES + 1) * n].max()) >= most / 2
+            self.change = diagnose_rest(recent, self.cells[AT_REST].rows, n, levels=levels)
         else:
+            behind = [each.row > self.since[top] for each in recent]
             self.change = diagnose(recent, behind, self.scatter, top, self.bound)

@@ -22,7 +22,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[1] / part) for part in ("",
 
 import api as public_names  # noqa: E402
 import pictures  # noqa: E402
-from sources import DECISIONS, EXAMPLES, PAGES, ROOT, about, linked, notebook, program, section  # noqa: E402
+from sources import DECISIONS, EXAMPLES, PAGES, ROOT, about, linked, notebook, program, section, sessions  # noqa: E402
 
 INCLUDE = re.compile(r"^<!-- include: (\S+)#(.+) -->$", re.MULTILINE)
 _texts: dict[str, str] = {}  # each page as Markdown, by its place
@@ -77,7 +77,7 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     place = page.file.src_uri
     text = INCLUDE.sub(lambda found: linked(section(ROOT / found[1], found[2]), found[1], place), markdown)
     _texts[place] = text
-    return text
+    return sessions(text)
 
 
 def on_post_build(config: MkDocsConfig) -> None:

@@ -11,10 +11,12 @@ from pathlib import Path
 
 from mkdocs.exceptions import PluginError
 
-__all__ = ["DECISIONS", "EXAMPLES", "PAGES", "ROOT", "about", "linked", "notebook", "program", "section"]
+__all__ = ["DECISIONS", "EXAMPLES", "PAGES", "ROOT", "about", "linked", "notebook", "program", "section", "sessions"]
 
 ROOT = Path(__file__).resolve().parents[1]
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
+SESSION = re.compile(r"^```(?:python|pycon)\n(>>> .*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK_ENDS = re.compile(r"^(\.\.\. +\S.*\n)(?!\.\.\.)", re.MULTILINE)
 FENCE = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
 PAGES = {  # of the repository → of the site
     "README.md": "index.md",
@@ -36,6 +38,14 @@ DECISIONS = sorted((ROOT / ".github/decisions").glob("*.md"))
 PAGES |= {f"examples/{path.name}": f"examples/{path.stem}.md" for path in EXAMPLES}
 PAGES |= {f".github/decisions/{path.name}": f"decisions/{path.name}" for path in DECISIONS}
 NO_TEXT = ("#", "```", "|", "<!--", "- ", "![", "python", "scroll-tactile ")  # how paragraphs begin that say nothing
+
+
+def sessions(text: str) -> str:
+    """A text whose sessions can be copied: known as such, a block ends with the empty line that Python waits for.
+
+    Where only a bracket goes on, the empty line does no harm.
+    """
+    return SESSION.sub(lambda found: "```pycon\n" + BLOCK_ENDS.sub(r"\1...\n", found[1]) + "```", text)
 
 
 def linked(text: str, source: str, place: str) -> str:

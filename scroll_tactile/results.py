@@ -106,7 +106,8 @@ class Adaptation:
     better with it, and all stays as it was. why: in a sentence. sequence: its row in the memory's journal, to retract
     it by; None where it was not kept. gains, offsets: of each channel, as the changed skin reads low + gain · (x − low)
     + offset, in the sensor's unit, where the one that learned would have read x; 1 and 0 where nothing is known.
-    left_out: channels that read nothing any more: all of their values are missing from now on. before, after: how far
+    left_out: channels that read nothing any more: all of their values are missing from now on, and guessed from the
+    other channels. before, after: how far
     the touches lie from what was learned of their materials, each judged with the others' correction: the mean squared
     deviation of a number that is known of a channel, about 1 for a skin that did not change.
     """

@@ -1,5 +1,7 @@
 """The site's own pages run, and show what is so."""
 
+import re
+from codeop import CommandCompiler
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,21 @@ def test_a_page_that_shows_what_is_not_so_fails(block, message, tmp_path, monkey
     page.write_text(f"# Page\n\n{block}\n")
     with pytest.raises(AssertionError, match=message):
         Page(page).run()
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *(DOCS / name for name in RUNNING)], ids=lambda path: path.name)
+def test_a_session_without_its_prompts_can_be_pasted_into_python(path, monkeypatch):
+    """A block, such as that of a for, ends there with an empty line and nothing else."""
+    monkeypatch.syspath_prepend(ROOT / ".site")
+    from sources import sessions
+
+    for session in re.findall(r"^```pycon\n(.*?)^```$", sessions(path.read_text(encoding="utf-8")), re.M | re.DOTALL):
+        typed: list[str] = []
+        for line in re.findall(r"^(?:>>> |\.\.\. ?)(.*)", session, re.MULTILINE):
+            typed.append(line)
+            if CommandCompiler()("\n".join(typed), symbol="single"):
+                typed = []
+        assert not typed, "\n".join(typed)
 
 
 @pytest.mark.parametrize("name", RUNNING)

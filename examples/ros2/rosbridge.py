@@ -2,8 +2,8 @@
 
 On the robot:     sudo apt install ros-humble-rosbridge-suite
                   ros2 launch rosbridge_server rosbridge_websocket_launch.xml
-Beside it, or on another machine, in a Python from 3.11 on:    pip install scroll-tactile roslibpy
-    python rosbridge.py MEMORY /rh/tactile sr_robot_msgs/BiotacAll 'tactiles[0].electrodes' [HOST]
+Beside it, or on another machine, in a Python from 3.11 on, in a clone:    pip install . roslibpy
+    python examples/ros2/rosbridge.py MEMORY /rh/tactile sr_robot_msgs/BiotacAll 'tactiles[0].electrodes' [HOST]
 
 Answers come on /scroll_tactile/answer, and what was touched last is learned as by the node:
     ros2 service call /scroll_tactile/learn diagnostic_msgs/srv/AddDiagnostics "{load_namespace: silk}"

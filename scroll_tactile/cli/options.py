@@ -86,7 +86,7 @@ Labels = Annotated[
     Path | None,
     typer.Option(
         help="A .csv of touches, with columns file, begin, end (in seconds) and material; what is under 'force [N] "
-        "0..10 step 0.01' (or 'force [N]', once declared) and 'slip [label]' is learned as values and labels."
+        "0..10 step 0.01' (or 'force [N]', once declared) and 'slip \\[label]' is learned as values and labels."
     ),
 ]
 LabelTopic = Annotated[
@@ -96,7 +96,7 @@ Annotate = Annotated[
     list[str] | None,
     typer.Option(
         help="A column of LeRobot data sets that is learned as a value or a label of each touch: 'force [N] 0..10 step "
-        "0.01' (or 'force [N]', once declared), 'slip [label]', and 'force [N] from observation.wrench[2]' where the "
+        "0.01' (or 'force [N]', once declared), 'slip \\[label]', and 'force [N] from observation.wrench[2]' where the "
         "column is called otherwise; several times. A value is the mean over the touch."
     ),
 ]

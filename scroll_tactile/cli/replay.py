@@ -291,7 +291,7 @@ def annotate(
     in_place: Annotated[
         bool, typer.Option("--in-place", help="Change the data set itself; meta.before keeps its meta/ as it was.")
     ] = False,
-    forms: Annotated[str, typer.Option("--as", help="numbers, language, or both with a comma between.")] = (
+    forms: Annotated[str, typer.Option("--as", help="numbers, language, mcap, with commas between.")] = (
         "numbers,language"
     ),
     replace: Annotated[
@@ -312,7 +312,8 @@ def annotate(
     """Write into a LeRobot data set what the memory answers at each frame, knowing no more than the frames before it.
 
     Columns observation.touch.material (a number; meta/info.json has the names), .probability, .known and .QUANTITY, and
-    events in language_events. All else stays as it is. Interrupt it, type it again, and it goes on.
+    events in language_events; with --as mcap a log of each episode in mcap/, for Foxglove and Rerun. All else stays as
+    it is. Interrupt it, type it again, and it goes on.
     """
     from scroll_tactile.pipelines.annotating.annotation_run import annotate as annotated
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["KINDS", "MOST_CHANNELS", "UNIT", "channel_numbers", "from_text", "to_text"]
+__all__ = ["KINDS", "MOST_CHANNELS", "UNIT", "channel_numbers", "from_text", "has_numbers", "to_text"]
 
 UNIT = 2.0**-10  # of a natural logarithm: 0.1 %
 FLOOR = 2.0**-10  # of the range: below it a level or a spread is none; a quarter of it for the noise
@@ -20,6 +21,11 @@ MOST_CHANNELS = 256  # beyond, a touch is not measured: the scatter of its numbe
 Numbers = npt.NDArray[np.int16]
 
 
+def has_numbers(sensor: Sensor) -> bool:
+    """Whether touches of a sensor are measured by channel: of a camera, and of more than 256 channels, none are."""
+    return not sensor.camera and sensor.channels <= MOST_CHANNELS
+
+
 def channel_numbers(stream: Stream) -> Numbers | None:
     """Level, spread and noise of each channel of a touch, then the level of all: (3 n + 1,), in `UNIT` of a logarithm.
 
@@ -27,10 +33,10 @@ def channel_numbers(stream: Stream) -> Numbers | None:
     deviation over time; log of the mean |second difference|, which is noise and no movement; log of the mean over all.
     A channel's gain moves the first three alike, an offset the first, noise the third.
 
-    None for a camera, for more than 256 channels and for fewer than three readings.
+    None for a sensor without (see `has_numbers`), and for fewer than three readings.
     """
     sensor = stream.sensor
-    if sensor.camera or sensor.channels > MOST_CHANNELS or len(stream) < 3:
+    if not has_numbers(sensor) or len(stream) < 3:
         return None
     low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
     shares = (stream.readings.astype(np.float64) - low) / (high - low)

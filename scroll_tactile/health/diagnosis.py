@@ -20,6 +20,7 @@ DEAD = -1.5  # of a logarithm: spread and noise of a channel that fell by so muc
 FEWEST = 3  # touches of each of two materials, from which one alone can be said to have changed
 LEAST = 0.1  # of what the greatest explains: less is a correlation that is not known so well
 MANY = 0.5  # of the channels
+FEWEST_CHANNELS = 3  # from which many of them can be told from one
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def diagnose(
     dead = _dead(away[own], n)
     names = [each.material for each, mine in zip(recent, own, strict=True) if mine]
     row, all_names = recent[int(own.argmax())].row, tuple(sorted(set(names)))
-    if 0 < len(dead) < MANY * n:
+    if dead and (len(dead) < MANY * n or n < FEWEST_CHANNELS):
         return SensorChange(row, dead, "dead", all_names)
     if (alone := _alone(names, sizes[own], found[0][2])) is not None:
         return SensorChange(row, (), "material", (alone,))
@@ -75,10 +76,10 @@ def diagnose(
 
 def _kind(found: Sequence[tuple[int, int, float]], n: int) -> ChangeKind:
     _, kind, size = found[0]
-    if len(found) > MANY * n:
+    if n >= FEWEST_CHANNELS and len(found) > MANY * n:
         alike = len({size > 0 for _, _, size in found}) == 1
         return "all gains" if alike else "gains"
-    if len(found) > 2:
+    if n >= FEWEST_CHANNELS and len(found) > 2:
         return "gains"
     if kind == KINDS - 1:
         return "noisier" if size > 0 else "slower"
@@ -88,9 +89,9 @@ def _kind(found: Sequence[tuple[int, int, float]], n: int) -> ChangeKind:
 def _dead(away: Floats, n: int) -> tuple[int, ...]:
     """The channels whose spread and noise fell so far below those of the others that they say nothing any more."""
     lively = away[:, n : 2 * n] + away[:, 2 * n : 3 * n]
-    return tuple(
-        np.flatnonzero(np.median(lively - np.median(lively, axis=1, keepdims=True), axis=0) < 2 * DEAD).tolist()
-    )
+    if n >= FEWEST_CHANNELS:
+        lively = lively - np.median(lively, axis=1, keepdims=True)
+    return tuple(np.flatnonzero(np.median(lively, axis=0) < 2 * DEAD).tolist())
 
 
 def _explained(away: Floats, scatter: Scatter, bound: float) -> list[tuple[int, int, float]]:
@@ -145,7 +146,7 @@ def diagnose_rest(recent: Sequence[Deviation], rows: Rows, channels: int, *, lev
         kind: ChangeKind = "noisier" if louder[np.abs(louder).argmax()] > 0 else "slower"
         return SensorChange(row, _far(louder), kind, ())
     which = _far(shift)
-    if len(which) <= MANY * n:
+    if len(which) <= MANY * n or n < FEWEST_CHANNELS:
         return SensorChange(row, which, "offset", ())
     gain = float(shift @ before / (before @ before))
     better = np.square(shift - gain * before).sum() < np.square(shift - shift.mean()).sum()

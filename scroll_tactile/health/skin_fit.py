@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scroll_tactile.health.channel_numbers import FLOOR, KINDS, UNIT, Numbers
 from scroll_tactile.signals.correction import GREATEST_GAIN, corrected
 
-__all__ = ["Fitted", "Reference", "fitted"]
+__all__ = ["Fitted", "Reference", "fitted", "guess_of_lost"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -33,6 +33,7 @@ OWN = 0.02  # of a logarithm: added, in squares, to the standard deviation of ea
 IDLE = 1.0  # times the floor of spreads: a channel below it says nothing of its gain
 CLIPPED, MOSTLY = 0.1, 0.4  # of the readings: more of them at an end of the range than before; that usually are there
 DEAD = -3.0  # of the logarithms of spread and noise, together: a channel that fell by so much reads nothing any more
+BLOCKS = 16  # of touches, one of which is left out: beyond, each is one of several
 STEP, ROUNDS, ENOUGH = 1e-3, 30, 1e-3  # of derivatives; of the search, and what is no progress
 
 
@@ -167,12 +168,12 @@ class _PosteriorFit:
         return self._joined(here) - self.means, found
 
     def mode(self, sigma: float, tau: float, start: Floats, leave: int | None = None) -> tuple[Floats, float]:
-        """The posterior mode (2 n,), log gains and offsets in spans, and the evidence; leave: a touch left out."""
+        """The posterior mode (2 n,), log gains and offsets in spans, and the evidence; leave: a block left out."""
         n, free = self.n, np.flatnonzero(np.tile(self.known, 2))
         prior = np.repeat([1 / sigma**2, 1 / tau**2], n)
         weights = self.weights.copy()
         if leave is not None:
-            weights[leave] = 0.0
+            weights[leave::BLOCKS] = 0.0
 
         def objective(at: Floats) -> float:
             return float(weights @ self.loss(at[:n], at[n:]) + (prior * at**2).sum()) / 2
@@ -215,10 +216,32 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
             if likely > evidence:
                 best, evidence, how = at, likely, (sigma, tau)
     before = fit.loss(none[:n], none[n:])
-    held = [fit.mode(*how, best, leave)[0] for leave in range(len(touches))]
-    after = np.array([fit.loss(at[:n], at[n:])[leave] for leave, at in enumerate(held)])
+    after = np.empty(len(touches))
+    for leave in range(min(len(touches), BLOCKS)):
+        held = fit.mode(*how, best, leave)[0]
+        after[leave::BLOCKS] = fit.loss(held[:n], held[n:])[leave::BLOCKS]
     limit = np.log(GREATEST_GAIN)
     gains = np.where(fit.known, np.exp(np.clip(best[:n], -limit, limit)), 1.0)
     offsets = np.where(fit.known, np.clip(best[n:] * reference.spans, -1.0, 1.0), 0.0)
     first, second = (float(each.mean()) / fit.dimension for each in (before, after))
     return Fitted(gains, offsets, fit.lost, first, second, float((before - after).sum()) / 2)
+
+
+def guess_of_lost(touches: Sequence[Floats], lost: npt.NDArray[np.bool_], step: float) -> npt.NDArray[np.float32]:
+    """The weights (m, n − m + 1) by which m lost channels are guessed from the others, the last of each a constant.
+
+    Least squares over all readings of earlier touches, (T, n) each, shares of the range in steps of `step`; what
+    rounding to them adds, step² / 12, is the ridge. Where there are no touches the weights are 0.
+    """
+    n, m = len(lost), int(np.count_nonzero(lost))
+    count, total, squares = 0, np.zeros(n), np.zeros((n, n))
+    for shares in touches:
+        count, total, squares = count + len(shares), total + shares.sum(axis=0), squares + shares.T @ shares
+    if not count or not m:
+        return np.zeros((m, n - m + 1), np.float32)
+    mean = total / count
+    covariance = squares / count - np.outer(mean, mean)
+    others = covariance[np.ix_(~lost, ~lost)] + np.diag(np.full(n - m, step**2 / 12))
+    weights = np.linalg.solve(others, covariance[np.ix_(~lost, lost)]).T
+    constants = mean[lost] - weights @ mean[~lost]
+    return np.concatenate([weights, constants[:, None]], axis=1).astype(np.float32)

@@ -31,7 +31,7 @@ from scroll_tactile.health.diagnosis import Deviation, SensorChange, diagnose, d
 __all__ = ["AT_REST", "MOST_ROWS", "RECENT", "Cell", "Place", "Watch"]
 
 MOST_ROWS = 256  # rows of a cell; a fuller cell drops its older half, or ranks would be learned
-RECENT = 128  # touches from which a change is told
+RECENT = 128  # touches, and rows at rest, from which a change is told
 
 Place = tuple[str, int, int]
 """The place of a cell: material, length and level."""
@@ -83,7 +83,8 @@ class Watch:
         self.cells: dict[Place, Cell] = {}
         self.least = np.zeros((SCORES + 2) * channels)
         self.since = np.zeros(len(self.least), np.int64)
-        self.recent: deque[Deviation] = deque(maxlen=RECENT)
+        self.touched: deque[Deviation] = deque(maxlen=RECENT)
+        self.rested: deque[Deviation] = deque(maxlen=RECENT)
         self.evidence = 0.0
         self.grew: list[tuple[int, float]] = []
         self.taken = 0
@@ -95,7 +96,7 @@ class Watch:
         twin = copy(self)
         twin.bets, twin.scatter = self.bets.copy(), self.scatter.copy()
         twin.least, twin.since = self.least.copy(), self.since.copy()
-        twin.cells, twin.recent = dict(self.cells), self.recent.copy()
+        twin.cells, twin.touched, twin.rested = dict(self.cells), self.touched.copy(), self.rested.copy()
         return twin
 
     def take(self, sequence: int, material: str, steps: int, numbers: Numbers) -> None:
@@ -123,7 +124,7 @@ class Watch:
             self.bets.take(ranks(scores, random), 0)
         else:
             self.bets.take(ranks(cell.scores, random), SCORES * n)
-        self.recent.append(Deviation(sequence, material, away, among))
+        (self.touched if material else self.rested).append(Deviation(sequence, material, away, among))
 
     def _judge(self, sequence: int) -> None:
         logs = self.bets.log
@@ -136,10 +137,11 @@ class Watch:
             return
         self.alarmed, top = sequence, int(logs.argmax())
         n, resting = self.channels, top >= SCORES * self.channels
-        recent = [each for each in self.recent if (not each.material) == resting]
+        recent = self.rested if resting else self.touched
         if resting:
             levels = float(logs[SCORES * n : (SCORES + 1) * n].max()) >= most / 2
             self.change = diagnose_rest(recent, self.cells[AT_REST].rows, n, levels=levels)
         else:
             behind = [each.row > self.since[top] for each in recent]
+            behind[-1] = True  # as it is, unless somebody else wrote what was kept
             self.change = diagnose(recent, behind, self.scatter, top, self.bound)

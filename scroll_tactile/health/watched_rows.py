@@ -50,7 +50,8 @@ class WatchedRows:
     memory had lost rows when it began.
 
     The copies lie apart by at most 64 rows, or by as many as have come since: one goes back by few rows where the last
-    is retracted, and n rows have some 2 log₂(n / 64) of them, of 35 kB (19 channels) or 300 kB (60) each.
+    is retracted, and n rows have some 2 log₂(n / 64) of them, of 35 kB (19 channels) or 300 kB (60) each, beside the
+    cells as they were: 0.7 MB each after 4000 rows of 19 channels.
     """
 
     def __init__(self, rules: WatchRules, watch: Watch, *, last: int, known: int, lost: int) -> None:

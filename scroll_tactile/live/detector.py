@@ -96,6 +96,7 @@ class ContactDetector:
     def interrupt(self) -> None:
         """Time begins anew: a contact is over, rest stays as it was learned."""
         self.contact = False
+        self._filled = 0  # a block that is being learned is of readings that follow each other
         self._anew()
 
     def feed(self, rows: npt.NDArray[np.float64]) -> tuple[int, Event | None]:

@@ -55,7 +55,8 @@ class Rest:
         self._log_run = math.log(max(2.0, sensor.rate * 3600 / false_contacts))
         self.channels = sensor.channels
         self.block = max(FEWEST, round(BLOCK * sensor.rate))
-        self.needed = -(-max(round(LEARNED * sensor.rate), 2 * sensor.channels) // self.block) * self.block
+        least = max(round(LEARNED * sensor.rate), 2 * sensor.channels, 2 * self.block)  # one block has no scatter
+        self.needed = -(-least // self.block) * self.block
         self.level: Whole = np.zeros(sensor.channels)
         self._levels: deque[tuple[Whole, int]] = deque(maxlen=FOLLOWED)
         self._scatter: npt.NDArray[np.int64] = np.zeros((sensor.channels, sensor.channels), np.int64)

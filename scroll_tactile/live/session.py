@@ -330,7 +330,7 @@ class LiveSession:
             self._leave(touch)
             return
         before = touch.prediction if touch.decided else None
-        prediction = touch.predict(stream)
+        prediction, rest = touch.predict(stream), self._rest_before(touch)
         revised = before if before is not None and _says(before) != _says(prediction) else None
         self.touch, self._thing = stream, (*touch.earlier, stream)[-MOST_EARLIER:]
         self.report.touches += 1
@@ -338,11 +338,17 @@ class LiveSession:
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
         outcome = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
-        rest = None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
         self._ended.append(LiveTouch(stream, prediction, *outcome, rest))
         self._settled = touch.settled
         if self._notes is not None:
             self._notes.take(self._ended[-1])
+
+    def _rest_before(self, touch: GrowingTouch) -> Stream | None:
+        """What was read at rest before a touch; None where that is too little, or nothing but missing values."""
+        try:
+            return None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
+        except StreamError:
+            return None
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""

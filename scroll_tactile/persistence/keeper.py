@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.errors import InputError
+from scroll_tactile.health.channel_numbers import MOST_CHANNELS, has_numbers
 from scroll_tactile.health.watched_rows import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
@@ -138,10 +139,17 @@ class MemoryKeeper(ABC):
         channel; touches are compared with earlier ones of the same material, of a similar length and level, so that no
         mixture of materials, lengths and forces is a change. See `health.betting`. The digest knows nothing of it.
 
-        Raises InputError for values that cannot be, and in a memory without a path; StoreError.
+        Raises InputError for values that cannot be, for a camera, for more than 256 channels, and in a memory without a
+        path; StoreError.
         """
         require_arguments({"bound": bound, "after": after}, {"until": until})
-        return health_of(self._ledger, self.sensor.channels, WatchRules(float(bound), after, until, source))
+        checked = None if source is None else require_source(source)
+        if not has_numbers(self.sensor):
+            raise InputError(
+                f"the health of a sensor is told from its channels, 1 to {MOST_CHANNELS}; sensor {self.sensor.name!r} "
+                + ("has pixels" if self.sensor.camera else f"has {self.sensor.channels}")
+            )
+        return health_of(self._ledger, self.sensor.channels, WatchRules(float(bound), after, until, checked))
 
     def adapt(
         self,
@@ -156,10 +164,11 @@ class MemoryKeeper(ABC):
         such as the one before `Health.since`; None: all.
 
         A gain and an offset of each channel are estimated from them, drawn to none (see `health.skin_fit`), and a
-        channel that reads nothing any more is left out. Where that explains touches better which it was not estimated
-        from, and most of them are then known, or more than before, later ones are read through it: `observe`,
-        `predict`, `estimate`, `compose`, `sense` and touches that begin in live sessions. What was learned stays as it
-        is, to the byte; `retract` takes the adaptation back.
+        channel that reads nothing any more is left out: whatever it reads, its values are missing, and the embedding
+        sees what the other channels say of it, as far as kept touches tell how they go together. Where that explains
+        touches better which it was not estimated from, and most of them are then known, or more than before, later ones
+        are read through it: `observe`, `predict`, `estimate`, `compose`, `sense` and touches that begin in live
+        sessions. What was learned stays as it is, to the byte; `retract` takes the adaptation back.
 
         A second one replaces the first: it is made from the readings as they came. It is of this unit: `merge` and
         `pack` leave it behind, a compaction, a backup and `reembed` keep it. An `exported` judge knows nothing of it.

@@ -218,10 +218,12 @@ class Ledger(OpenMemory):
 
         Returns its row in the journal. The model stays: what was learned is what it was.
         """
+        text = correction.to_text()
         with self.lock:
             store, memory = self.require_store("be adapted"), self.memory
+            Correction.from_text(text, memory.recipe.sensor)  # what replay would refuse must not come into the journal
             with self._mutation(_nothing):
-                head = store.append(ADAPT, "", b"", attributes={CORRECTION: correction.to_text()})
+                head = store.append(ADAPT, "", b"", attributes={CORRECTION: text})
                 apply_correction(memory, head)
                 memory.sequence = head.sequence
             self._checkpoint_if_due()

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.health.watched_rows import WatchedRows
+from scroll_tactile.health.watched_rows import WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.contents import ListedContents, StoredContents
@@ -33,8 +33,9 @@ Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any], Collection[str]]
 MOST_ADDED = 1024  # touches: a model is fitted again long before
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
 REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
-# A checkpoint writes all materials. With very many, it waits for one row for each so many of them.
-MATERIALS_PER_ROW = 16
+# A checkpoint writes all materials, so many of them in the time that one touch takes to learn: it waits until as long
+# was spent on touches. With 100 000 materials and a row for each 16, writing took twice as long as learning.
+MATERIALS_PER_ROW = 8
 
 
 class OpenMemory:
@@ -47,9 +48,9 @@ class OpenMemory:
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
     grows with each change of a description. added: if `follow` is set, the touches observed and retracted since the
     list was last cleared; None where these are too many, or something else has changed. followers: are called with the
-    same at each change. watched: the rows that health was last read from; None while they are read. lost: grows where
-    a change was cut short, whose rows may not be in the journal. saves: whether checkpoints are written; the journal
-    alone has every row, too.
+    same at each change. watched: the rows that health was last read from, by some rules; not there while they are read.
+    lost: grows where a change was cut short, whose rows may not be in the journal. saves: whether checkpoints are
+    written; the journal alone has every row, too.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class OpenMemory:
         self._whole = True
         self._undo: Callable[[], None] | None = None
         self._batching = False
-        self.watched: WatchedRows | None = None
+        self.watched: dict[WatchRules, WatchedRows] = {}
         self.lost = 0
 
     @property

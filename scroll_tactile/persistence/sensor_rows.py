@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
-from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text
-from scroll_tactile.health.skin_fit import Fitted, Reference, fitted
+from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
+from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
 from scroll_tactile.health.watch import Watch
 from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
-from scroll_tactile.matching.likelihood import LEVELS
+from scroll_tactile.matching.likelihood import LEVELS, MISSING
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 Floats = npt.NDArray[np.float64]
 
 PIECE = 64  # rows that are read while the memory is locked
+MOST_WATCHED = 4  # rules: of the page, of diagnostics, of a live session
 FEWEST, FEWEST_MATERIALS = 3, 2  # touches, and materials among them: one may have changed itself
 LIKELIER = math.log(100)  # that the touches have to be, each by the correction of the others, than without any
 FEWEST_SPREAD = 8  # touches of materials that were touched before, by which it is known how touches differ
@@ -55,8 +56,9 @@ def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
     """
     with ledger.lock:
         ledger.require_store("tell how its sensor is")
-        watched, ledger.watched = ledger.watched, None
-        if watched is None or watched.rules != rules or watched.lost != ledger.lost:
+        _ = ledger.memory  # which may have lost rows, and says so as it is read
+        watched = ledger.watched.pop(rules, None)
+        if watched is None or watched.lost != ledger.lost:
             watched = _stored(ledger, channels, rules) or WatchedRows(
                 rules, Watch(channels, rules.bound), last=rules.after, known=0, lost=ledger.lost
             )
@@ -65,12 +67,21 @@ def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
             for row in piece:
                 watched.take(row)
     except StoreError:  # of a damaged row: those before it need not be read again
-        ledger.watched = watched
+        _keep(ledger, watched)
         raise
-    ledger.watched = watched
     with ledger.lock:
         store = ledger.require_store("tell how its sensor is")
-        return watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
+        found = watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
+        _keep(ledger, watched)  # from here on another thread may take it further
+        return found
+
+
+def _keep(ledger: OpenMemory, watched: WatchedRows) -> None:
+    """Go on from these rows at the next question by the same rules; those by the last few rules are kept."""
+    with ledger.lock:
+        ledger.watched[watched.rules] = watched
+        while len(ledger.watched) > MOST_WATCHED:
+            del ledger.watched[next(iter(ledger.watched))]
 
 
 def _piece(ledger: OpenMemory, watched: WatchedRows) -> list[WatchedRow]:
@@ -119,7 +130,7 @@ def _stored(ledger: OpenMemory, channels: int, rules: WatchRules) -> WatchedRows
 
 def health_to_store(ledger: OpenMemory) -> Derived | None:
     """What was last read, to be kept beside the newest checkpoint; None where nothing was."""
-    store, watched = ledger.store, ledger.watched
+    store, watched = ledger.store, next(reversed(ledger.watched.values()), None)
     if store is None or watched is None or watched.lost != ledger.lost:
         return None
     _take_back(store, ledger.memory, watched)
@@ -132,7 +143,7 @@ def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor
     Raises InputError for what is no pairs of a material and readings, or of too few touches or materials; StreamError,
     SensorMismatchError, MaterialError.
     """
-    if sensor.camera or sensor.channels > MOST_CHANNELS:
+    if not has_numbers(sensor):
         raise InputError(
             f"a memory is adapted channel by channel, and sensor {sensor.name!r} has "
             + ("pixels" if sensor.camera else f"{sensor.channels}; at most {MOST_CHANNELS} can be told apart")
@@ -177,24 +188,35 @@ def adapt_to(
         ledger.require_write_mode()
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
-        ends = _at_ends(memory, sensor.channels)
-        reference = _reference(store, memory, sensor.channels, {touch.key for touch in touches}, until)
+        own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
+        kept = _kept_before(store, memory, own, until)
+        ends = _at_ends(kept, sensor.channels)
+        reference = _reference(store, memory, sensor.channels, own, until)
     _require_known(reference, sorted(set(touches.values())), store)
     low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
     shares = [(touch.readings - low) / (high - low) for touch in touches]
     found = fitted(reference, shares, list(touches.values()), ends)
     span = np.broadcast_to(high - low, (sensor.channels,))
+    earlier = [(of[:, (of != MISSING).all(axis=0)] / (LEVELS - 1)).T for of in kept]
     correction = Correction(
-        found.gains.astype(np.float32), (found.offsets * span).astype(np.float32), found.lost.astype(np.bool_)
+        found.gains.astype(np.float32),
+        (found.offsets * span).astype(np.float32),
+        found.lost.astype(np.bool_),
+        guess_of_lost(earlier, found.lost, 1 / (LEVELS - 1)),
     )
     why = _refusal(found) or _not_recognised(touches, correction, unknown_of)
     return _result(correction, found, why, None if why else ledger.adapt(correction))
 
 
-def _at_ends(memory: Memory, channels: int) -> Floats:
-    """The share of kept readings of each channel that lie at an end of the range, (n,); 1 where none are kept."""
-    kept = [] if memory.kept is None else memory.kept.touches()
-    shares = [((touch.levels == 0) | (touch.levels == LEVELS - 1)).mean(axis=1) for touch in kept]
+def _kept_before(store: Store, memory: Memory, own: set[bytes], until: int | None) -> list[npt.NDArray[np.uint8]]:
+    """The levels, (n, T), of kept touches that were observed up to a row, but for some by their keys."""
+    out = own if until is None else own | {head.key for head in store.heads(until)}
+    return [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
+
+
+def _at_ends(kept: Sequence[npt.NDArray[np.uint8]], channels: int) -> Floats:
+    """The share of kept readings, (n, T), of each channel at an end of the range, (n,); 1 where none are kept."""
+    shares = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]
     return np.asarray(np.mean(shares, axis=0) if shares else np.ones(channels), np.float64)
 
 

@@ -96,7 +96,9 @@ class Listener:
         silent = time.monotonic() - self.received
         count = self.node.count_publishers(self.topic)
         if not count:
-            topics = [name for name, _ in self.node.get_topic_names_and_types() if name != self.topic]  # heard here
+            own = f"{self.node.get_fully_qualified_name()}/"
+            heard = [name for name, _ in self.node.get_topic_names_and_types()]
+            topics = [name for name in heard if name != self.topic and not name.startswith(own)]  # those of others
             return f"no reading for {silent:.0f} s: nobody publishes {self.topic}{nearest(self.topic, topics)}"
         about = self.node.get_publishers_info_by_topic(self.topic)
         kinds = sorted({each.topic_type for each in about})
@@ -120,6 +122,7 @@ class Listener:
         if kind is None:
             return False
         self.kind = kind
+        self.received = time.monotonic()  # it is silent from now on
         if self._looking is not None:
             self.node.destroy_timer(self._looking)
             self._looking = None

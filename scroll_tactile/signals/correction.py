@@ -24,18 +24,21 @@ Floats = npt.NDArray[np.float32]
 class Correction:
     """The changed skin reads low + gain · (x − low) + offset where the one that learned would have read x.
 
-    gains: float32 (n,). offsets: float32 (n,), in the sensor's unit. lost: bool (n,), the channels that are left out:
-    all of their values are missing.
+    gains: float32 (n,). offsets: float32 (n,), in the sensor's unit. lost: bool (n,), the m channels that are left out:
+    their values are missing, and a guess by the others stands in their place. guess: float32 (m, n − m + 1); as shares
+    of the range, a lost channel is guessed as guess[:, :-1] · (the others) + guess[:, -1], within the range.
     """
 
     gains: Floats
     offsets: Floats
     lost: npt.NDArray[np.bool_]
+    guess: Floats
 
     @classmethod
     def none(cls, channels: int) -> Self:
         """That of a skin that did not change."""
-        return cls(np.ones(channels, np.float32), np.zeros(channels, np.float32), np.zeros(channels, np.bool_))
+        ones, zeros = np.ones(channels, np.float32), np.zeros(channels, np.float32)
+        return cls(ones, zeros, np.zeros(channels, np.bool_), np.zeros((0, channels + 1), np.float32))
 
     def applied(self, stream: Stream) -> Stream:
         """A stream as the skin that learned would have read it; one that was corrected before stays as it is."""
@@ -44,6 +47,7 @@ class Correction:
         low, high = (np.asarray(limit, np.float64) for limit in stream.sensor.limits)
         span = high - low
         shares = corrected((stream.readings - low) / span, self.gains, self.offsets / span)
+        shares[:, self.lost] = self._guessed(shares[:, ~self.lost])
         readings = (low + shares * span).astype(np.float32)
         np.clip(readings, *stream.sensor.limits, out=readings)  # rounding may pass an end
         mask = stream.mask
@@ -51,14 +55,26 @@ class Correction:
             mask = np.zeros(readings.shape, np.bool_) if mask is None else mask.copy()
             mask[:, self.lost] = True
             mask.setflags(write=False)
-            readings[:, self.lost] = np.broadcast_to(stream.sensor.limits[0], stream.sensor.shape)[self.lost]
         readings += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
         readings.setflags(write=False)
         return replace(stream, readings=readings, mask=mask, raw=stream)
 
+    def _guessed(self, others: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The lost channels, (T, m), by the others, (T, n − m). Added in one order: equal on every machine."""
+        weights = self.guess.astype(np.float64)
+        found = np.tile(weights[:, -1], (len(others), 1))
+        for share, weight in zip(others.T, weights.T[:-1], strict=True):
+            found += share[:, None] * weight
+        return np.clip(found, 0.0, 1.0)
+
     def to_text(self) -> str:
         """As an attribute of a journal row."""
-        parts = self.gains.astype("<f4"), self.offsets.astype("<f4"), self.lost.astype(np.uint8)
+        parts = (
+            self.gains.astype("<f4"),
+            self.offsets.astype("<f4"),
+            self.lost.astype(np.uint8),
+            self.guess.astype("<f4"),
+        )
         return binascii.b2a_base64(b"".join(part.tobytes() for part in parts), newline=False).decode()
 
     @classmethod
@@ -69,19 +85,21 @@ class Correction:
             raw = binascii.a2b_base64(text, strict_mode=True) if isinstance(text, str) else b""
         except ValueError:
             raw = b""
-        if sensor.camera or len(raw) != 9 * n:
+        lost = np.frombuffer(raw[8 * n : 9 * n], np.uint8)
+        m = int(np.count_nonzero(lost))
+        if sensor.camera or len(raw) != 9 * n + 4 * m * (n - m + 1):
             raise InputError(f"expected a gain and an offset for each of {n} channels; came {text!r:.60}")
         gains, offsets = (part.astype(np.float32) for part in np.frombuffer(raw[: 8 * n], "<f4").reshape(2, n))
-        lost = np.frombuffer(raw[8 * n :], np.uint8)
+        guess = np.frombuffer(raw[9 * n :], "<f4").astype(np.float32).reshape(m, n - m + 1)
         low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
-        sound = bool(((gains >= 1 / GREATEST_GAIN) & (gains <= GREATEST_GAIN)).all())
+        sound = bool(((gains >= 1 / GREATEST_GAIN) & (gains <= GREATEST_GAIN)).all()) and bool(np.isfinite(guess).all())
         sound = sound and bool((np.abs(offsets) <= high - low).all()) and bool((lost <= 1).all()) and not lost.all()
         if not sound:
             raise InputError(
-                f"expected gains from 1/{GREATEST_GAIN:g} to {GREATEST_GAIN:g}, offsets within the sensor's range, and "
-                f"not all channels left out; came {gains}, {offsets}, {lost}"
+                f"expected gains from 1/{GREATEST_GAIN:g} to {GREATEST_GAIN:g}, offsets within the sensor's range, "
+                f"finite weights, and not all channels left out; came {gains}, {offsets}, {guess}, {lost}"
             )
-        return cls(gains, offsets, lost.astype(np.bool_))
+        return cls(gains, offsets, lost.astype(np.bool_), guess)
 
 
 def corrected(

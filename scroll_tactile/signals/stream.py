@@ -81,7 +81,7 @@ class Stream:
         """The stream of the first `seconds`, or the whole stream if it is no longer; memory is shared.
 
         `clipped` stays an upper bound: which values were clipped is not kept. Missing values are interpolated anew,
-        from what had been observed by then.
+        from what had been observed by then; what a correction guesses of a lost channel stays.
 
         Raises InputError if seconds is not a number, StreamTooShortError if it asks for less than two readings (or one
         frame of a camera), NotFiniteError if all values until then are missing.
@@ -98,8 +98,9 @@ class Stream:
             return Stream(self.sensor, part, min(self.clipped, part.size), raw=raw)
         mask = self.mask[:count]
         _require_any(mask, self.sensor)
+        unread = mask if raw is None else mask & ~self.mask.all(axis=0)  # not the lost channels: these are guessed
         part = part.copy()
-        interpolate(part, mask, self.sensor)
+        interpolate(part, unread, self.sensor)
         part.setflags(write=False)
         return Stream(self.sensor, part, min(self.clipped, int(np.count_nonzero(~mask))), mask, raw)
 

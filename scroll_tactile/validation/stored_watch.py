@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import __version__
-from scroll_tactile.health.betting import STAKES
+from scroll_tactile.health.betting import SCORES, STAKES
 from scroll_tactile.health.channel_numbers import KINDS
 from scroll_tactile.health.diagnosis import Deviation, SensorChange
-from scroll_tactile.health.watch import MOST_ROWS, RECENT, Cell, Watch
+from scroll_tactile.health.watch import AT_REST, MOST_ROWS, RECENT, Cell, Watch
 from scroll_tactile.health.watched_rows import WatchedRows, WatchRules
 from scroll_tactile.results import ChangeKind
 from scroll_tactile.validation.expected import array, counts, expect, name, whole
@@ -29,14 +29,15 @@ from store import Checkpoint
 __all__ = ["NAME", "watch_to_arrays", "watched_from"]
 
 NAME = "health"
-MADE_BY = f"{__version__}, 1"  # the release, in which scores may differ, and the version of these arrays
+MADE_BY = f"{__version__}, 2"  # the release, in which scores may differ, and the version of these arrays
 LARGEST = 2**53  # of a row, and of a count
 
 
 def watch_to_arrays(watched: WatchedRows) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Arrays and attributes of a watch."""
     watch, change = watched.watch, watched.watch.change
-    names = sorted({material for material, _, _ in watch.cells} | {each.material for each in watch.recent})
+    recent = [*watch.touched, *watch.rested]
+    names = sorted({material for material, _, _ in watch.cells} | {each.material for each in recent})
     places, empty = {name: place for place, name in enumerate(names)}, np.empty((0, KINDS * watch.channels + 1))
     cells = [(places[name], *at, len(cell.rows)) for (name, *at), cell in watch.cells.items()]
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -47,12 +48,11 @@ def watch_to_arrays(watched: WatchedRows) -> tuple[dict[str, npt.NDArray[Any]], 
         "since": watch.since,
         "cells": np.array(cells, np.int64).reshape(-1, 4),
         "rows": np.concatenate([empty.astype(np.int16), *(cell.rows for cell in watch.cells.values())]),
-        "recent": np.array([(each.row, places[each.material], each.among) for each in watch.recent], np.int64),
-        "away": np.concatenate([empty, *(each.away[None] for each in watch.recent)]),
+        "recent": np.array([(each.row, places[each.material], each.among) for each in recent], np.int64).reshape(-1, 3),
+        "away": np.concatenate([empty, *(each.away[None] for each in recent)]),
         "grew": np.array([row for row, _ in watch.grew], np.int64),
         "evidence": np.array([evidence for _, evidence in watch.grew]),
     }
-    arrays["recent"] = arrays["recent"].reshape(-1, 3)
     attributes = {"made_by": MADE_BY, "rules": asdict(watched.rules), "names": names, "last": watched.last}
     attributes |= {"taken": watch.taken, "scattered": watch.scatter.count, "evidence": watch.evidence}
     return arrays, attributes | {"change": None if change is None else asdict(change)}
@@ -91,6 +91,9 @@ class _WatchReader(ArrayReader):
         watch.since = self.rows_of_journal("since", scores).copy()
         self._cells(watch, size)
         self._recent(watch, size)
+        touched, rested = np.split(watch.bets.log, [SCORES * channels])
+        for kept, logs in ((watch.touched, touched), (watch.rested, rested)):  # or a change could not be told
+            expect(bool(kept) or not logs.any(), "log", "0 where no row was bet on", logs)
         rows = self.rows_of_journal("grew", None)
         evidence = self.floats("evidence", (len(rows),), -LARGEST, LARGEST)
         watch.grew = list(zip(rows.tolist(), evidence.tolist(), strict=True))
@@ -113,18 +116,22 @@ class _WatchReader(ArrayReader):
         for which, length, level, count in cells.tolist():
             expect(0 <= which < len(self._names) and 0 < count <= MOST_ROWS, "cells", "names and counts", cells)
             place = self._names[which], length, level
+            expect(bool(place[0]) or place == AT_REST, "cells", f"{AT_REST} at rest", place)
             watch.cells[place] = Cell.of(place, rows[start : start + count].copy())
             start += count
         expect(start == len(rows) and len(watch.cells) == len(cells), "cells", f"{len(rows)} rows", start)
 
     def _recent(self, watch: Watch, size: int) -> None:
         recent = array(self.arrays, "recent", ("int64",), (None, 3))
-        expect(len(recent) <= RECENT, "recent", f"{RECENT} or fewer", len(recent))
+        expect(len(recent) <= 2 * RECENT, "recent", f"{2 * RECENT} or fewer", len(recent))
         away = self.floats("away", (len(recent), size), -LARGEST, LARGEST)
+        known = {material for material, _, _ in watch.cells}
         for (row, which, among), own in zip(recent.tolist(), away, strict=True):
             fits = 0 <= row <= self._last and 0 <= which < len(self._names) and 0 < among <= MOST_ROWS
+            fits = fits and self._names[which] in known
             expect(fits, "recent", "rows, names and counts", (row, which, among))
-            watch.recent.append(Deviation(row, self._names[which], own.copy(), among))
+            kept = watch.touched if self._names[which] else watch.rested
+            kept.append(Deviation(row, self._names[which], own.copy(), among))
 
     def _change(self, channels: int) -> SensorChange:
         change: Any = self._about.get("change")

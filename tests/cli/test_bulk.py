@@ -291,3 +291,9 @@ class TestList:
 
     def test_an_empty_memory_lists_nothing(self, memory: Path) -> None:
         assert run("memory", "list", memory).stdout == ""
+
+
+@pytest.mark.parametrize("command", ["learn", "evaluate", "fleet"])
+def test_help_shows_what_stands_in_square_brackets(command):
+    said = " ".join(run(command, "--help").output.replace("│", " ").split())
+    assert said.count("'slip [label]'") == 2  # of --labels and --annotate

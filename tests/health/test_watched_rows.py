@@ -48,7 +48,7 @@ def taken(rows: list[WatchedRow], into: WatchedRows) -> WatchedRows:
 def state(watched: WatchedRows) -> tuple[Any, ...]:
     watch = watched.watch
     arrays = watch.scatter.inverse, watch.bets.shares, watch.bets.log, watch.least, watch.since
-    recent = [each.row for each in watch.recent]
+    recent = [each.row for kept in (watch.touched, watch.rested) for each in kept]
     parts = watch.grew, watch.evidence, watch.taken, watch.alarmed, watch.change, recent
     return *parts, *(part.tobytes() for part in arrays)
 

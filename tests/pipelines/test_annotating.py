@@ -13,7 +13,7 @@ from live_touches import slide
 from robot_sets import FIELD, contents, robot_set, whole
 from touches import PAD, SMALL
 
-from scroll_tactile import Annotated, Quantity, TactileLearner, annotate
+from scroll_tactile import Annotated, AnswerLog, Quantity, TactileLearner, annotate
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.pipelines.annotating import annotation_run, rewriting
 from scroll_tactile.pipelines.annotating.touch_columns import EVENTS
@@ -223,6 +223,27 @@ def test_an_interrupted_call_is_resumed_by_the_same_one(learner, before, after, 
     assert not (tmp_path / "out.annotating").exists()
 
 
+def test_each_episode_has_a_log_of_a_live_sessions_states(learner, before, after, tmp_path):
+    done = annotate(learner, before, output=tmp_path / "out", field="pad", forms=["numbers", "language", "mcap"])
+    logs = sorted((done.output / "mcap").iterdir())
+    assert [log.name for log in logs] == [f"episode_{number:06d}.mcap" for number in range(3)]
+    for log, (_, readings) in zip(logs, touched(), strict=True):
+        session = learner.live(contact="manual")
+        session.begin()
+        with AnswerLog(tmp_path / f"own-{log.name}") as own:
+            for frame, reading in enumerate(readings):
+                time = float(np.float32(frame / 50))
+                state = session.push(reading, time)
+                own.note(state if frame + 1 < len(readings) else session.end(), time)
+        assert log.read_bytes() == (tmp_path / f"own-{log.name}").read_bytes()
+    assert contents(done.output) == contents(after.output) | {f"mcap/{log.name}": log.read_bytes() for log in logs}
+    with pytest.raises(InputError, match="has a folder 'mcap' already: replace=True"):
+        annotate(learner, done.output, field="pad", in_place=True, forms=["mcap"])
+    logs[1].unlink()
+    again = annotate(learner, done.output, field="pad", in_place=True, forms=["mcap"], replace=True)
+    assert len(list((again.output / "mcap").iterdir())) == 3 and again.frames == 150
+
+
 @pytest.mark.parametrize("cut", range(5))
 def test_in_place_the_data_set_is_whole_wherever_the_power_is_cut(learner, before, after, tmp_path, monkeypatch, cut):
     folder = robot_set(tmp_path / "set", touched(), files=(0, 0, 1))
@@ -304,7 +325,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(learner, before, tmp_pa
         ({"field": None}, FieldError, "expected a field to read"),
         ({"field": "nothing"}, FieldError, "nothing"),
         ({"columns": "0:1"}, ChannelCountError, "expected readings of sensor 'pad', 2 channels"),
-        ({"forms": ("sounds",)}, InputError, "expected forms 'numbers', 'language' or both"),
+        ({"forms": ("sounds",)}, InputError, "expected forms among numbers, language, mcap"),
         ({"cut": "none"}, InputError, "expected cut as 'episodes' or 'contact'"),
         ({"scene": ["x"]}, InputError, "x"),
         ({"output": before / "inside"}, InputError, "lies in the data set"),

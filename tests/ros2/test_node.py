@@ -166,6 +166,21 @@ def test_a_topic_that_never_comes_is_said_with_those_nearest(spinning, learner):
     spinning.until(lambda: f"nearest is {TOPIC!r}" in served.listener.absent())
 
 
+def test_no_topic_of_its_own_is_named_as_the_nearest(spinning, learner):
+    node = spinning.node("scroll_tactile")
+    served = TactileNode(node, learner, "/rh/tactile", "position", kind="sensor_msgs/msg/JointState")
+    spinning.until(lambda: "/scroll_tactile/known" in dict(node.get_topic_names_and_types()))
+    assert "/scroll_tactile/" not in served.listener.absent()
+
+
+def test_a_topic_that_comes_late_is_silent_from_then_on(spinning, learner):
+    served = TactileNode(spinning.node("scroll_tactile"), learner, "/finger/late", "position")
+    served.listener.received -= 100  # it waited that long
+    spinning.node("finger").create_publisher(JointState, "/finger/late", 10)
+    spinning.until(lambda: served.listener.subscription is not None)
+    assert "no reading for 0 s from the 1 publishers of /finger/late" in served.listener.absent()
+
+
 def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
     """A name is learned, ctrl-C ends it in order, a second node is refused, and the memory has it."""
     with TactileLearner.open(memory, mode="read") as source:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ import numpy.typing as npt
 from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.errors import FieldError, InputError, RecordingError, printable
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
 from scroll_tactile.pipelines.annotating.frame_answers import Cut, Episodes
 from scroll_tactile.pipelines.annotating.rewriting import (
     copy_others,
+    drafted,
     names_in,
     statistics_in,
     wanted_statistics,
@@ -37,6 +40,7 @@ from scroll_tactile.recordings.recording import only_columns
 __all__ = ["Annotated", "annotate"]
 
 RECORD = "annotation.json"
+LOGS = "mcap"  # the folder of the episodes' logs
 WORK = ".annotating"  # the suffix of the folder that is worked in, behind the name of the one that is made
 
 
@@ -86,6 +90,8 @@ def annotate(
       of its interval; without an estimate the middle and the ends of its range.
     - `language_events`: on the frame where a touch is decided, or ends undecided or revised, a row such as "felt: oak,
       0.97, decided", of role "tool" and style "interjection"; null on others.
+    - `mcap/episode_000000.mcap` and so on, where forms has "mcap": what `AnswerLog` writes of each episode, by its
+      frames' times, for Foxglove and Rerun.
 
     Features, statistics and those of each episode are added. All else is copied as it is, videos as second names of
     the same files where the disk allows that. Equal memories give equal columns. An interrupted call is resumed by the
@@ -93,16 +99,15 @@ def annotate(
 
     learner: the memory; it is settled, and stays as it is. dataset: its folder. output: a new one; without it
     `<dataset>-annotated`. in_place: change the data set itself, and keep a copy of `meta/` in `meta.before`. replace:
-    overwrite the answers of an earlier annotation; rows that others wrote in `language_events` stay. forms: "numbers",
-    "language", or
-    both.
-    field, columns, clock: as of `recordings.read`, field being a column of readings of the learner's sensor. cut:
-    "episodes" takes each as one touch; "contact" finds touches in them, which then begin with two seconds at rest.
-    risk, scene: as of `TactileLearner.live`. progress: called with (what is being done, files done, files in all).
+    overwrite the answers of an earlier annotation; rows that others wrote in `language_events` stay. forms: some of
+    "numbers", "language" and "mcap". field, columns, clock: as of `recordings.read`, field being a column of readings
+    of the learner's sensor. cut: "episodes" takes each as one touch; "contact" finds touches in them, which then begin
+    with two seconds at rest. risk, scene: as of `TactileLearner.live`. progress: called with (what is being done, files
+    done, files in all).
 
     Raises InputError for a memory that holds nothing, an output that is there, or cannot be written; RecordingError and
     FieldError for a data set that is not whole, or not v3; ChannelCountError for another sensor's; LockedError where
-    another call is at work there.
+    another call is at work there; MissingLibraryError for "mcap" without that package.
     """
     require_arguments({"path": dataset, "risk": risk}, {"progress": progress})
     if not learner.materials:
@@ -117,7 +122,7 @@ def annotate(
     plan |= {"field": field, "columns": columns, "clock": clock, "replace": replace}
     work = target.with_name(target.name + WORK)
     with alone_in(work, target):
-        run = _Rewritten(source, target, work, RunFile(work / RECORD, plan), made)
+        run = _Rewritten(source, target, work, RunFile(work / RECORD, plan), made, logged="mcap" in forms)
         try:
             if "moving" not in run.record.notes:
                 run.prepare(in_place=in_place, replace=replace)
@@ -159,14 +164,19 @@ def _target(dataset: Path, output: str | os.PathLike[str] | None, in_place: bool
 class _Rewritten:
     """One annotation: what is read, the folder it becomes, the one it is made in, its record, and the columns."""
 
-    def __init__(self, source: LeRobot, target: Path, work: Path, record: RunFile, made: TouchColumns) -> None:
+    def __init__(
+        self, source: LeRobot, target: Path, work: Path, record: RunFile, made: TouchColumns, *, logged: bool
+    ) -> None:
         self.source, self.target, self.work, self.record, self.made = source, target, work, record, made
+        self.logged = logged
 
     def prepare(self, *, in_place: bool, replace: bool) -> None:
         """Look at what is there, before anything is written. Raises InputError for what was changed meanwhile."""
         with guarded(self.source.address):
             self.names = names_in(self.source)
             self.dropped = _dropped(self.source, self.made, replace)
+            if self.logged and not replace and (self.source.path / LOGS).exists():
+                raise InputError(f"{self.source.address} has a folder {LOGS!r} already: replace=True writes over it")
             state = _state_of(self.source.path)
         self.in_place = in_place
         if self.record.notes.setdefault("source", state) != state:
@@ -189,13 +199,20 @@ class _Rewritten:
             if not self.in_place:
                 copy_others(self.source, self.work, [*self.names, *written])
         self.record.note("summary", _summary(self.record.notes["done"], len(of_episodes)))
-        self.record.note("moving", [*self.names, *written] if self.in_place else [])
+        logs = [f"{LOGS}/{path.name}" for path in sorted((self.work / LOGS).glob("*.mcap"))]
+        self.record.note("moving", [*logs, *self.names, *written] if self.in_place else [])
+
+    @contextmanager
+    def _log(self, episode: int) -> Iterator[AnswerLog]:
+        """The log of an episode, whole on the disk where the block ends without an error."""
+        with drafted(self.work / LOGS / f"episode_{episode:06d}.mcap") as draft, AnswerLog(draft) as log:
+            yield log
 
     def _annotated(self, name: str, episodes: Episodes, columns: str | None) -> None:
         with guarded(self.source.address):
             frames = _frames(self.source, name, columns)
         readings, times, numbers = readings_of(episodes.sensor, frames[0]), *frames[1:]
-        found = episodes.answered(readings, times, numbers)
+        found = episodes.answered(readings, times, numbers, *[self._log] * self.logged)
         with guarded(self.source.address):
             write_data(self.source, name, self.work / name, self.made, found, self.dropped)
         counted = {
@@ -215,6 +232,7 @@ class _Rewritten:
             if moving:
                 kept = self.target / self._kept()
                 for name in moving:  # info.json is the last
+                    (self.target / name).parent.mkdir(exist_ok=True)
                     if (self.work / name).exists():
                         (self.work / name).replace(self.target / name)
                 shutil.rmtree(self.work)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,11 +20,23 @@ from scroll_tactile.live.session import LiveSession
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.results import Prediction
 
-__all__ = ["EVENT", "Episodes", "FrameAnswers", "in_words"]
+__all__ = ["EVENT", "Episodes", "FrameAnswers", "Log", "in_words"]
 
 EVENT = "felt: "  # how the words of an event begin
 
 Cut = Literal["episodes", "contact"]
+
+
+class Log(Protocol):
+    """Something that takes what a session says at a time in seconds, such as an `AnswerLog`."""
+
+    def note(self, state: LiveState, time: float, /) -> None:
+        """Take the state after the reading of this time."""
+
+
+class _NoLog:
+    def note(self, state: LiveState, time: float, /) -> None:
+        pass
 
 
 @dataclass(eq=False)
@@ -92,13 +105,19 @@ class Episodes:
         return self._learner.live(contact="manual" if self._cut == "episodes" else "auto", **self._how)
 
     def answered(
-        self, readings: npt.NDArray[Any], times: npt.NDArray[np.float64], episodes: npt.NDArray[np.int64]
+        self,
+        readings: npt.NDArray[Any],
+        times: npt.NDArray[np.float64],
+        episodes: npt.NDArray[np.int64],
+        log_of: Callable[[int], AbstractContextManager[Log]] = lambda _: nullcontext(_NoLog()),
     ) -> FrameAnswers:
         """What was known at each frame of some episodes that follow each other.
 
-        readings: (T, …), as of the sensor. times: (T,), in seconds. episodes: (T,), which one each is of.
+        readings: (T, …), as of the sensor. times: (T,), in seconds. episodes: (T,), which one each is of. log_of: makes
+        a log of an episode, which is told the states at its frames.
 
-        Raises InputError for times that are no seconds, or too far from each other for this sensor.
+        Raises InputError for times that are no seconds, or too far from each other for this sensor, and what a log
+        raises.
         """
         found = FrameAnswers.nothing(len(readings), self.names, self.quantities)
         if not np.isfinite(times).all():
@@ -108,7 +127,8 @@ class Episodes:
             if end > begin:
                 self._require_near(times[begin:end])
                 part = times[begin:end]
-                _Episode(found, begin).run(self._session(), readings[begin:end], part, self._touches(part))
+                with log_of(int(episodes[begin])) as log:
+                    _Episode(found, begin, log).run(self._session(), readings[begin:end], part, self._touches(part))
         return found
 
     def _require_near(self, times: npt.NDArray[np.float64]) -> None:
@@ -137,8 +157,8 @@ def _longest(rate: float) -> int:
 class _Episode:
     """One episode, whose first frame is `begin` of all."""
 
-    def __init__(self, found: FrameAnswers, begin: int) -> None:
-        self._found, self._begin = found, begin
+    def __init__(self, found: FrameAnswers, begin: int, log: Log) -> None:
+        self._found, self._begin, self._log = found, begin, log
         self._noted = False  # whether the touch under way was decided on
 
     def run(
@@ -164,6 +184,7 @@ class _Episode:
                     state = session.end()
                     self._happened(frame, state)
                 self._found.note(self._begin + frame, state)
+                self._log.note(state, time)
 
     def _happened(self, frame: int, state: LiveState) -> None:
         """Note what a push decided, or ended."""

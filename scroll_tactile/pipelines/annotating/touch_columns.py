@@ -12,10 +12,11 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.pipelines.annotating.frame_answers import EVENT, FrameAnswers
 from scroll_tactile.quantities import Quantity
 
-__all__ = ["EVENTS", "PREFIX", "WRITER", "TouchColumns", "statistics_of", "together"]
+__all__ = ["EVENTS", "FORMS", "PREFIX", "WRITER", "TouchColumns", "statistics_of", "together"]
 
 PREFIX = "observation.touch."
 EVENTS = "language_events"
+FORMS = ("numbers", "language", "mcap")
 WRITER = "scroll-tactile"  # the value under "written by" in a feature's info; only these may be replaced
 _ROLE, _STYLE = "tool", "interjection"  # of LeRobot's styles of events the one that no camera belongs to
 _FIELDS = ("role", "content", "style", "camera", "tool_calls")
@@ -25,8 +26,8 @@ _SHARES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 class TouchColumns:
     """The columns that answers become, and the features that describe them.
 
-    names: the materials, in the order of their numbers. quantities: that were declared. forms: "numbers", "language"
-    or both. about: what is kept with each feature, such as the memory's digest.
+    names: the materials, in the order of their numbers. quantities: that were declared. forms: some of `FORMS`, of
+    which "mcap" makes no column. about: what is kept with each feature, such as the memory's digest.
 
     Raises InputError for other forms, and for a quantity that has the name of another column.
     """
@@ -34,8 +35,8 @@ class TouchColumns:
     def __init__(
         self, names: Sequence[str], quantities: Mapping[str, Quantity], forms: Sequence[str], about: Mapping[str, Any]
     ) -> None:
-        if not forms or set(forms) - {"numbers", "language"}:
-            raise InputError(f"expected forms 'numbers', 'language' or both; came {', '.join(map(repr, forms))!s:.80}")
+        if not forms or set(forms) - {*FORMS}:
+            raise InputError(f"expected forms among {', '.join(FORMS)}; came {', '.join(map(repr, forms))!s:.80}")
         numbers, made = "numbers" in forms, {"written by": WRITER, **about}
         self.names, self.language = tuple(names), "language" in forms
         self.quantities: dict[str, Quantity] = {}

@@ -15,6 +15,7 @@ from forging import checkpoint_of, put_checkpoint, put_row
 from touches import spoil
 
 from scroll_tactile import Adaptation, Kernels, Scene, Sensor, TactileLearner, errors, sensors
+from scroll_tactile.health import skin_fit
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text
 from scroll_tactile.pipelines.fleet import learn
 from scroll_tactile.report import memory_page
@@ -411,6 +412,37 @@ def test_the_touch_under_way_keeps_what_it_began_with(path: Path) -> None:
         assert first.prediction == before != second.prediction
         assert learner.observe(NAMES[3], second.stream).key == second.stream.key
         assert learner.observe(NAMES[3], raw).repeated
+
+
+def test_a_beginning_keeps_what_is_guessed_of_a_lost_channel(path: Path) -> None:
+    raw = broken(touch(NAMES[1], 60))
+    long = np.concatenate([raw, raw])  # longer than any touch that was learned: its beginning is judged
+    with TactileLearner.open(path) as learner:
+        learner.adapt(five(broken))
+        whole = learner.stream(raw)
+        part = whole.first(0.5)
+        assert part.readings[:, DEAD].tolist() == whole.readings[:25, DEAD].tolist() != [0.0] * 25
+        assert part == learner.stream(raw[:25])
+        assert learner.predict(long).novelty == learner.predict(learner.stream(long)).novelty
+        assert learner.predict(long).material == learner.predict(raw).material
+
+
+def test_touches_learned_through_the_first_are_no_reference_of_a_second(path: Path) -> None:
+    with TactileLearner.open(path) as learner:
+        learner.adapt(five())
+        done = learner.adapt(five(broken))
+        learner.retract(done)
+        for name, readings in five(broken):
+            learner.observe(name, readings)
+        assert learner.adapt(five(broken)).gains == done.gains
+
+
+def test_many_touches_take_a_time_that_grows_as_they_do(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes, mode = list[Any](), skin_fit._PosteriorFit.mode
+    monkeypatch.setattr(skin_fit._PosteriorFit, "mode", lambda *how: modes.append(how) or mode(*how))
+    with TactileLearner.open(path) as learner:
+        assert learner.adapt([pair for first in range(50, 58) for pair in five(other, first)]).kept
+    assert len(modes) == len(skin_fit.SIGMAS) * len(skin_fit.TAUS) + skin_fit.BLOCKS
 
 
 def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_path: Path) -> None:

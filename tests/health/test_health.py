@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
+from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors, sensors
 from scroll_tactile.health import betting
 from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text, to_text
@@ -256,6 +256,23 @@ def test_what_cannot_be_told_is_refused(tmp_path: Path) -> None:
                 learner.health(**wrong)
         with pytest.raises(errors.InputError, match="three readings"):
             learner.sense(touch(NAMES[0], 0).readings[:2])
+        with pytest.raises(errors.InputError, match="source"):
+            learner.health(source=5)  # type: ignore[arg-type]
+    wide = Sensor(name="wide", channels=300, rate=50.0, low=0.0, high=1.0, unit="V", duration=1.0)
+    for name, sensor, what in (("camera", sensors.GELSIGHT, "has pixels"), ("wide", wide, "has 300")):
+        made = TactileLearner.open(tmp_path / name, sensor=sensor, embedding=Kernels(dimension=64))
+        with made as learner, pytest.raises(errors.InputError, match=what):
+            learner.health()
+
+
+@pytest.mark.parametrize(("kind", "by"), [("noisier", (0, 0, 300)), ("slower", (0, 0, -300))])
+def test_of_a_single_channel_it_is_told_what_changed(kind: str, by: tuple[int, int, int]) -> None:
+    random, watch = np.random.default_rng(0), Watch(1, 0.01)
+    for sequence in range(1, 400):
+        numbers = random.normal(0, 20, 4)
+        numbers[:3] += by if sequence > 150 else (0, 0, 0)
+        watch.take(sequence, "silk", 100, numbers.astype(np.int16))
+    assert watch.change is not None and watch.change.kind == kind and watch.change.channels == (0,)
 
 
 @pytest.fixture(scope="module")

@@ -212,6 +212,64 @@ def test_rows_of_a_batch_that_was_lost_are_not_kept_over_restarts(
     assert fresh(memory).grew[-1] != lost.grew[-1]
 
 
+def test_health_after_a_failed_batch_counts_no_row_that_is_gone(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise StoreFullError("no space left")
+
+    with TactileLearner.open(memory) as learner:
+        before = learner.health().touches
+        with pytest.raises(StoreError), learner.batch():
+            learner.sense(SCENE.touch(NAMES[0], 80), NAMES[0])
+            assert learner.health().touches == before + 1
+            monkeypatch.setattr(LogWriter, "stage", full)
+            learner.sense(SCENE.touch(NAMES[0], 81), NAMES[0])
+        monkeypatch.undo()
+        assert learner.health().touches == before
+
+
+def test_rows_that_others_ask_about_are_not_read_again_and_nobody_takes_those_that_are_told_of(
+    memory: Path, counted: Counted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with TactileLearner.open(memory) as learner:
+        for _ in range(3):  # diagnostics and a live session, by rules of their own
+            learner.health()
+            learner.health(after=20)
+        assert counted.rows(learner.health)[1] == counted.rows(lambda: learner.health(after=20))[1] == 0
+        told = WatchedRows.health
+
+        def alone(watched: WatchedRows, *how: Any) -> Health:
+            assert watched not in learner._ledger.watched.values()  # or another thread takes it further meanwhile
+            return told(watched, *how)
+
+        monkeypatch.setattr(WatchedRows, "health", alone)
+        learner.health()
+
+
+@pytest.mark.parametrize("first", ["", "a"])
+def test_a_change_is_told_by_the_rows_that_show_it_however_many_of_the_other_kind_came_since(first: str) -> None:
+    """Touches near the bound, then many rests, which carry it over the bound; and the other way round."""
+    random, second = np.random.default_rng(0), "" if first else "a"
+    watched = WatchedRows(RULES, Watch(4, RULES.bound), last=0, known=0, lost=0)
+
+    def take(material: str, shift: float = 0.0) -> None:
+        assert watched.last < 2000
+        numbers = np.append(random.normal(0, 20, 12), -1024)
+        numbers[0] += shift
+        watched.take(WatchedRow(watched.last + 1, material, 100, numbers.astype(np.int16)))
+
+    for material in (first, second):
+        for _ in range(150):
+            take(material)
+    while watched.watch.evidence < np.log(100) - 1.5:
+        take(first, 300)
+    for _ in range(140):
+        take(second)
+    assert watched.watch.alarmed is None
+    while watched.watch.alarmed is None:
+        take(second, 300)
+    assert watched.watch.change is not None and 0 in watched.watch.change.channels
+
+
 def test_what_was_read_is_kept_over_restarts(memory: Path, counted: Counted) -> None:
     with TactileLearner.open(memory) as learner:
         found = learner.health()
@@ -266,6 +324,7 @@ def test_a_kept_watch_is_the_same_to_the_bit_and_an_alarm_is_kept() -> None:
         ("rows", np.zeros((3, 7), np.int16)),
         ("cells", np.array([[9, 1, 1, 1]])),
         ("recent", np.array([[1, 0, 0]])),
+        ("recent", np.zeros((0, 3), np.int64)),  # of whom a change is to be told
         ("grew", np.array([7], np.int64)),
         ("names", ["b", "a"]),
         ("taken", -1),

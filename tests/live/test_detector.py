@@ -8,6 +8,7 @@ from touches import PAD, SMALL
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.detector import ContactDetector
+from scroll_tactile.live.rest import Rest
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import quiet_noise, resting_level, shift_of, simulated_shift
 
@@ -195,3 +196,24 @@ def test_a_shift_of_anybody_s_touches(tmp_path):
     assert (np.diff(made.times) > 0.2).sum() == 1
     with pytest.raises(InputError, match="hold"):
         shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_slow_sensors_rest_has_two_blocks_to_be_judged_by():
+    rest, random = Rest(wide(3, rate=4.0), 1.0), np.random.default_rng(0)
+    still = random.normal(0, 0.01, (rest.needed, 3))
+    assert rest.needed >= 2 * rest.block
+    moved = still + (np.arange(len(still)) >= rest.block)[:, None]
+    assert rest.unrest(rest.whole(still)) < 1 < rest.unrest(rest.whole(moved))
+
+
+def test_a_block_that_is_learned_is_not_of_readings_before_and_after_a_gap():
+    rows = np.random.default_rng(0).normal(0, 0.01, (4000, 3))
+    _, whole = found(wide(3), rows)
+    late = ContactDetector(wide(3), 1.0)
+    late.feed(1 + rows[:7])
+    late.interrupt()
+    first = 0
+    while first < len(rows):
+        first += late.feed(rows[first:])[0]
+    assert not late.learning and late._rest.mean == whole._rest.mean

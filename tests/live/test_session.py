@@ -337,3 +337,14 @@ def test_a_decision_that_the_whole_touch_takes_back_is_called_revised():
             assert touch.prediction.material == rest_of_it
             assert (touch.revised and touch.revised.material) == revised
         assert (live.report.touches, live.report.revised) == (2, 1)
+
+
+def test_a_touch_counts_where_the_sensor_said_nothing_before_it():
+    sensor = PAD.model_copy(update={"non_finite": "missing"})
+    made = TactileLearner(sensor=sensor, embedding=EMBEDDINGS["kernels"])
+    random = np.random.default_rng(0)
+    live = made.live()
+    live.push(rest(200, random))
+    live.push(np.full((30, PAD.channels), np.nan))
+    touches = [*live.push(slide("a", 60, random)).touches, *live.push(rest(80, random)).touches]
+    assert len(touches) == 1 and touches[0].rest is None

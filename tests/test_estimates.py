@@ -107,6 +107,7 @@ def test_a_memory_that_has_too_little_gives_no_number():
     assert "two materials" in learner.estimate(touch)["force"].missing
     observe(learner, [("cork", 1)])
     assert learner.estimate(touch)["force"].value is not None
+    assert learner.predict(touch).known is None and learner.estimate(touch)["force"].inside
 
 
 @pytest.mark.parametrize(

@@ -129,22 +129,37 @@ def _alone(names: Sequence[str], sizes: Floats, size: float) -> str | None:
     return showing[0] if len(showing) == 1 and others >= FEWEST and len(own[showing[0]]) >= FEWEST else None
 
 
-def diagnose_rest(recent: Sequence[Deviation], behind: Sequence[bool], rows: Rows, channels: int) -> SensorChange:
-    """From readings at rest: whether levels moved by what they were (a gain) or all by the same (an offset)."""
-    n, own = channels, np.array(behind)
+def diagnose_rest(recent: Sequence[Deviation], rows: Rows, channels: int, *, levels: bool) -> SensorChange:
+    """From readings at rest: whether levels moved by what they were (a gain) or all by the same (an offset).
+
+    levels: whether a level showed the change; where none did, noise has.
+    """
+    n = channels
     away = np.array([each.away for each in recent])
-    levels = away[:, :n] + away[:, -1:]
-    own = _began(levels @ np.sign(np.median(levels[own], axis=0)), own)
-    row, moved = recent[int(own.argmax())].row, np.median(levels[own], axis=0)
+    level, noise = away[:, :n] + away[:, -1:], away[:, 2 * n : 3 * n]
+    own = _moved(level if levels else noise)
+    row, moved = recent[int(own.argmax())].row, np.median(level[own], axis=0)
     before = np.exp(np.median(rows[:, :n] + rows[:, -1:].astype(np.int32), axis=0) * UNIT)
     shift = before * np.expm1(moved)
-    far = np.abs(shift) > np.abs(shift).max() / 4
-    which = tuple(np.flatnonzero(far).tolist())
+    if not levels or np.abs(shift).max() <= FLOOR:
+        louder = np.median(noise[own], axis=0)
+        kind: ChangeKind = "noisier" if louder[np.abs(louder).argmax()] > 0 else "slower"
+        return SensorChange(row, _far(louder), kind, ())
+    which = _far(shift)
     if len(which) <= MANY * n or n < FEWEST_CHANNELS:
-        if np.abs(shift).max() > FLOOR:
-            return SensorChange(row, which, "offset", ())
-        noise = np.abs(np.median(away[own, 2 * n : 3 * n], axis=0))
-        return SensorChange(row, (int(noise.argmax()),), "noisier", ())
+        return SensorChange(row, which, "offset", ())
     gain = float(shift @ before / (before @ before))
     better = np.square(shift - gain * before).sum() < np.square(shift - shift.mean()).sum()
     return SensorChange(row, which, "all gains" if better else "all offsets", ())
+
+
+def _moved(sizes: Floats) -> npt.NDArray[np.bool_]:
+    """Which rows (k, n) lie behind the place where their mean changes from 0: the most likely, if normal."""
+    sums = np.cumsum(sizes[::-1], axis=0)[::-1]
+    likely = np.square(sums).sum(axis=1) / np.arange(len(sizes), 0, -1)
+    return np.asarray(np.arange(len(sizes)) >= likely.argmax())
+
+
+def _far(sizes: Floats) -> tuple[int, ...]:
+    """The channels that moved a quarter as far as the one that moved most, or farther."""
+    return tuple(np.flatnonzero(np.abs(sizes) > np.abs(sizes).max() / 4).tolist())

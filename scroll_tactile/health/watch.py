@@ -138,9 +138,10 @@ class Watch:
         self.alarmed, top = sequence, int(logs.argmax())
         n, resting = self.channels, top >= SCORES * self.channels
         recent = self.rested if resting else self.touched
-        behind = [each.row > self.since[top] for each in recent]
-        behind[-1] = True  # as it is, unless somebody else wrote what was kept
         if resting:
-            self.change = diagnose_rest(recent, behind, self.cells[AT_REST].rows, n)
+            levels = float(logs[SCORES * n : (SCORES + 1) * n].max()) >= most / 2
+            self.change = diagnose_rest(recent, self.cells[AT_REST].rows, n, levels=levels)
         else:
+            behind = [each.row > self.since[top] for each in recent]
+            behind[-1] = True  # as it is, unless somebody else wrote what was kept
             self.change = diagnose(recent, behind, self.scatter, top, self.bound)

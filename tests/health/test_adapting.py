@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 from forging import checkpoint_of, put_checkpoint, put_row
+from touches import spoil
 
 from scroll_tactile import Adaptation, Kernels, Scene, Sensor, TactileLearner, errors, sensors
 from scroll_tactile.health import skin_fit
@@ -90,6 +91,9 @@ def test_a_reading_at_an_end_of_the_range_stays_and_a_stream_is_corrected_once()
     part = read.first(0.04)
     assert (part.raw, part.missing) == (stream.first(0.04), 2)
     assert pickle.loads(pickle.dumps(read)).raw == stream
+    gaps = np.where(np.arange(4)[:, None] == 1, np.nan, stream.readings)
+    gappy = validate(gaps, PAD.model_copy(update={"non_finite": "missing"}))
+    assert skin.applied(gappy).missing == gappy.missing + 3  # of the channel that is left out, but for its gap
     text = skin.to_text()
     assert Correction.from_text(text, PAD).to_text() == text
     for wrong in (None, "=", text[:-4], Correction.none(9).to_text()):
@@ -98,6 +102,8 @@ def test_a_reading_at_an_end_of_the_range_stays_and_a_stream_is_corrected_once()
     none, nothing = Correction.none(8), np.zeros((8, 1), np.float32)
     for gains, offsets, out, how in (
         (0, 0, lost, guess),
+        (0.05, 0, lost, guess),
+        (17, 0, lost, guess),
         (np.nan, 0, lost, guess),
         (1, 2000, lost, guess),
         (1, 0, lost, guess + np.float32(np.inf)),
@@ -176,6 +182,21 @@ def test_it_holds_over_restart_compaction_backup_reembedding_and_snapshots(path:
         assert check_memory(tmp_path / f"copy-{keep}") == []
 
 
+def test_a_compaction_checkpoint_behind_it_has_it(path: Path) -> None:
+    with TactileLearner.open(path) as learner:
+        learner.adapt(five())
+        for i in range(2):
+            learner.observe(NAMES[0], other(touch(NAMES[0], 80 + i)))
+        learner.compact(keep=1)
+        kept, store = correction(learner), learner._ledger.store
+        assert store is not None and store.newest is not None
+        newest = store.newest
+        store.close()
+    spoil(path, newest)
+    with TactileLearner.open(path) as learner:
+        assert learner.memory.checkpoint != newest and correction(learner) == kept
+
+
 def test_reembedding_keeps_it_and_reads_what_was_learned_as_it_was_read(path: Path) -> None:
     with TactileLearner.open(path) as learner:
         learner.adapt(five())
@@ -252,6 +273,30 @@ def test_what_the_memory_does_not_know_even_so_is_refused_before_there_is_a_row(
         done = learner.adapt(five())
         assert (done.kept, done.sequence) == (False, None) and "5 of 5 touches are unknown even so" in done.why
         assert (learner.memory.sequence, learner.digest(), correction(learner)) == (rows, digest, None)
+
+
+def test_later_and_retracted_touches_are_no_part_of_what_it_is_compared_with(path: Path) -> None:
+    with TactileLearner.open(path) as learner:
+        first = learner.adapt(five(), until=49)
+        learner.retract(first)
+        learner.retract(50)
+        assert learner.adapt(five()).gains == first.gains
+
+
+def test_three_touches_that_are_known_as_it_is_are_enough(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with TactileLearner.open(path) as learner:
+        monkeypatch.setattr(TactileLearner, "_unknown", lambda learner, touches: 0)
+        assert learner.adapt([*five()[:2], (NAMES[0], other(touch(NAMES[0], 51)))]).kept
+
+
+def test_answers_by_an_axis_are_read_through_it(path: Path) -> None:
+    with TactileLearner.open(path) as learner:
+        for i, name in [(i, name) for i in range(20, 23) for name in NAMES[:2]]:
+            learner.observe(name, touch(name, i), labels={"ground": f"on {name}"})
+        raw = other(touch(NAMES[0], 60))
+        before = learner.predict(raw, of="ground")
+        learner.adapt(five())
+        assert learner.predict(raw, of="ground") == learner.predict(learner.stream(raw), of="ground") != before
 
 
 def test_no_more_than_some_are_kept_to_come_back_to(path: Path) -> None:
@@ -430,6 +475,8 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
     with TactileLearner.open(path, mode="read") as learner, pytest.raises(ReadOnlyError):
         learner.adapt(pairs)
     with TactileLearner.open(path, mode="read") as learner, pytest.raises(ReadOnlyError):
+        learner.adapt(five(lambda stream: stream.readings))  # though it would be left as it is
+    with TactileLearner.open(path, mode="read") as learner, pytest.raises(ReadOnlyError):
         learner.retract(done)
     with pytest.raises(errors.InputError, match="without a path"):
         TactileLearner(sensor=PAD).adapt(pairs)
@@ -503,6 +550,7 @@ def test_the_command_and_the_page(path: Path, tmp_path: Path) -> None:
     told = run("memory", "adapt", path, tmp_path / "new", "--label-by", "folder", "--json")
     assert json.loads(told.output)["sequence"] == 52
     assert run("memory", "retract", path, 52).exit_code == run("memory", "retract", path, 51).exit_code == 0
+    assert "behind `until`" in refused("memory", "adapt", path, tmp_path / "new", "--label-by", "folder", "--until", 0)
     for name in NAMES:
         np.save(tmp_path / "new" / name / "touch.npy", touch(name, 50).readings)
     told = run("memory", "adapt", path, tmp_path / "new", "--label-by", "folder")

@@ -123,6 +123,49 @@ def test_all_zeros_are_told_at_rest() -> None:
         assert (watch.change.kind, watch.change.since) == (kind, pytest.approx(101, abs=12))
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("kind", "channels", "noise", "gain"),
+    [
+        ("noisier", (CHANNEL,), np.where(np.arange(8) == CHANNEL, 2.0, 1.0), 1.0),
+        ("slower", (CHANNEL,), np.where(np.arange(8) == CHANNEL, 0.4, 1.0), 1.0),
+        ("noisier", tuple(range(8)), 2.0, 1.0),
+        ("all gains", tuple(range(8)), 1.0, 0.5),
+    ],
+)
+def test_at_rest_noise_is_told_from_levels_and_dated(
+    kind: str, channels: tuple[int, ...], noise: Any, gain: float, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+
+    def rest(noise: Any, gain: float) -> Stream:
+        readings = gain * np.linspace(80, 200, 8) + random.normal(0, 6, (25, 8)) * noise
+        return validate(readings.astype(np.float32), PAD)
+
+    change = watched([("", rest(*how)) for how in [(1.0, 1.0)] * 100 + [(noise, gain)] * 60]).change
+    assert change is not None
+    assert (change.kind, change.channels, change.since) == (kind, channels, pytest.approx(101, abs=2))
+
+
+def test_a_channel_that_changed_in_two_ways_is_called_by_the_greater() -> None:
+    weaker = on_channel(lambda values: 0.8 * values + 60)
+    change = watched([*sound(30), *[(name, touch(name, i, weaker)) for i in range(30, 50) for name in NAMES]]).change
+    assert change is not None
+    assert (change.kind, change.channels) == ("gain", (CHANNEL,))
+
+
+def test_touches_between_rest_are_told_by_touches_and_dated_to_the_first_that_changed() -> None:
+    random = np.random.default_rng(0)
+    changed = [(name, touch(name, i, on_channel(lambda values: values + 60))) for i in range(30, 50) for name in NAMES]
+    mixed = list[tuple[str, Stream]]()
+    for own in [*sound(30), *changed]:
+        mixed += own, ("", validate((100 + random.normal(0, 6, (25, 8))).astype(np.float32), PAD))
+    change = watched(mixed).change
+    assert change is not None
+    assert (change.kind, change.channels, change.materials) == ("offset", (CHANNEL,), tuple(sorted(NAMES)))
+    assert change.since == 2 * 150 + 1
+
+
 def test_a_sensor_dead_from_the_first_day_and_few_touches_are_sound() -> None:
     dead = on_channel(lambda values: 0 * values)
     assert watched((name, touch(name, i, dead)) for i in range(40) for name in NAMES).alarmed is None
@@ -137,6 +180,9 @@ def test_numbers_are_read_back_and_none_of_another_sensor() -> None:
     assert found is not None
     assert found.tobytes() == numbers.tobytes()
     assert from_text(to_text(numbers), 9) is from_text("=", 8) is from_text(None, 8) is None
+    assert from_text(to_text(numbers), 7) is None
+    readings = touch(NAMES[0], 0).readings
+    assert channel_numbers(validate(readings[:2], PAD)) is None is not channel_numbers(validate(readings[:3], PAD))
 
 
 @pytest.fixture(scope="module")
@@ -279,7 +325,7 @@ def test_what_is_said_of_each_kind_names_what_changed() -> None:
             assert "<oak> feels otherwise" in text and "memory relabel" in advice(found)
         else:
             assert text.startswith("since observation 7, 1970-01-01 00:00 UTC channels 1, 2: ")
-            assert "--after 12" in advice(found)
+            assert "--after 12" in advice(found) and "--until 6" in advice(found)
     assert "nothing can be told yet" in in_words(Health(None, None, (), "", 1.0, 0.01, 1, None, (), ()))
 
 

@@ -48,7 +48,8 @@ def taken(rows: list[WatchedRow], into: WatchedRows) -> WatchedRows:
 def state(watched: WatchedRows) -> tuple[Any, ...]:
     watch = watched.watch
     arrays = watch.scatter.inverse, watch.bets.shares, watch.bets.log, watch.least, watch.since
-    parts = watch.grew, watch.evidence, watch.taken, watch.alarmed, watch.change
+    recent = [each.row for kept in (watch.touched, watch.rested) for each in kept]
+    parts = watch.grew, watch.evidence, watch.taken, watch.alarmed, watch.change, recent
     return *parts, *(part.tobytes() for part in arrays)
 
 
@@ -67,6 +68,15 @@ def test_rows_taken_back_leave_the_state_of_a_fresh_reading(seed: int, steps: li
         rows = [each if each.sequence != gone else WatchedRow(gone) for each in rows]
         watched.take_back(gone)
         assert state(taken(rows, watched)) == state(taken(rows, empty()))
+
+
+def test_the_row_of_the_alarm_or_of_a_copy_taken_back_leaves_the_state_of_a_fresh_reading() -> None:
+    watched = taken(CHANGED, empty())
+    for gone in (watched.watch.alarmed, *(earlier.last for earlier in watched._earlier if earlier.last)):
+        assert gone is not None
+        rows, again = [each if each.sequence != gone else WatchedRow(gone) for each in CHANGED], taken(CHANGED, empty())
+        again.take_back(gone)
+        assert state(taken(rows, again)) == state(taken(rows, empty()))
 
 
 def test_few_copies_are_kept_and_few_rows_read_again() -> None:
@@ -181,6 +191,25 @@ def test_rows_of_a_batch_that_was_lost_are_not_there(memory: Path, monkeypatch: 
             learner.sense(SCENE.touch(NAMES[1], 90 + i), NAMES[1])
         found = learner.health()
     assert fresh(memory) == found
+
+
+def test_rows_of_a_batch_that_was_lost_are_not_kept_over_restarts(
+    memory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise StoreFullError("no space left")
+
+    with TactileLearner.open(memory) as learner:
+        with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
+            for i in range(4):
+                learner.sense(SCENE.touch(NAMES[0], 80 + i), NAMES[0])
+            lost = learner.health()
+            monkeypatch.setattr(LogWriter, "stage", full)
+            learner.sense(SCENE.touch(NAMES[0], 84), NAMES[0])
+        monkeypatch.undo()
+        for i in range(4):
+            learner.sense(SCENE.touch(NAMES[1], 90 + i), NAMES[1])
+    assert fresh(memory).grew[-1] != lost.grew[-1]
 
 
 def test_health_after_a_failed_batch_counts_no_row_that_is_gone(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,11 @@ from touches import PAD, SMALL
 
 from scroll_tactile import AnswerLog, Quantity, TactileLearner
 from scroll_tactile.errors import InputError
+from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.pipelines.annotating import answer_log
 from scroll_tactile.recordings import read
+from scroll_tactile.results import Prediction
+from scroll_tactile.signals.stream import validate
 
 START = 1_760_000_000.0
 
@@ -98,6 +101,17 @@ def test_estimates_and_what_is_unknown_fit_the_schema(tmp_path):
         "low": expected.low,
         "high": expected.high,
     }
+
+
+def test_a_touch_behind_another_begins_and_what_cannot_be_told_is_neither(tmp_path):
+    rows, prediction = np.full((10, 2), 0.5), Prediction("a", 0.9, (("a", 0.9),), 1.0, None, 0.2)
+    ended = LiveTouch(validate(rows, PAD), prediction, False, 0.0, "gap")
+    with AnswerLog(tmp_path / "a.mcap") as log:
+        log.note(LiveState(True, 0.2, prediction), 0.2)
+        log.note(LiveState(True, 0.1, None, False, True, (ended,)), 1.1)
+    found = messages(tmp_path / "a.mcap")
+    assert [content["seconds"] for topic, _, content in found if topic == "/touch/contact"] == [0.2, 0.1]
+    assert [content["known"] for topic, _, content in found if topic == "/touch/answer"] == [-1, -1]
 
 
 KILLED = """

@@ -52,6 +52,14 @@ def test_lost_readings_are_the_line_between_their_neighbours():
         assert np.allclose(rows, count(len(rows))) and report.lost == kept[-1] + 1 - len(kept)
 
 
+def test_a_line_begins_at_its_time_and_at_what_the_callers_buffer_held():
+    clock, buffer, parts = Clock(RATE, LiveReport()), np.empty((1, 1)), []
+    for value, stamp in ((0, 0.0), (3, 0.02), (9, 0.08)):
+        buffer[:] = value
+        parts += [(part.time, part.rows.ravel().tolist()) for part in clock.places(buffer, clock.checked(stamp, 1))]
+    assert parts == [(0.0, [0]), (0.02, [3]), (pytest.approx(0.04), [5, 7]), (0.08, [9])]
+
+
 def test_readings_that_come_twice_or_late_are_left_out():
     order = [0, 1, 2, 2, 3, 5, 4, 6, 7, 8]
     rows, _, report = placed(order, np.array(order) / RATE)

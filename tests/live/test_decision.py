@@ -115,6 +115,8 @@ def test_a_rule_says_known_where_it_is_sure_and_new_where_it_is_strange():
     assert [rule.decided(known[p], 10) for p in known] == [False, True, True]  # of a whole touch 1 − risk is enough
     assert [rule.decided(new[n], 5) for n in new] == [False, True]
     assert not rule.decided(known[0.97], 4)
+    early = DecisionRule((5, 10), 0.05, sure=0.9, together=0.9, least_new=6.0)
+    assert [early.decided(known[0.94], columns) for columns in (5, 10)] == [True, True]  # what was decided stays so
     assert [rule.decided(known[0.97], columns, several=True) for columns in (4, 5, 10)] == [False, False, True]
 
 
@@ -173,6 +175,10 @@ def test_the_least_probability_keeps_the_risk_of_calibrated_answers():
         wrong.append(np.mean(~right[taken, reached.argmax(axis=1)[taken]]))
     assert np.mean(wrong) <= 0.05
     assert np.mean(wrong) >= 0.01  # it is no more careful than it has to be
+
+
+def test_answers_that_were_right_by_luck_are_decided_no_earlier():
+    assert least_sure(np.full((200, 1), 0.9), np.full((200, 1), True), 0.02) > 0.9  # one in ten should be wrong
 
 
 def test_several_touches_say_more_than_one_in_any_order(learner):

@@ -24,7 +24,9 @@ def rest(gain: float = 1.0) -> Stream:
     return validate((level + RANDOM.normal(0, 6, (25, 6))).astype(np.float32), PAD)
 
 
-def ended(stream: Stream, material: str | None, *, known: bool = True, decided: bool = True, **how: Any) -> LiveTouch:
+def ended(
+    stream: Stream, material: str | None, *, known: bool | None = True, decided: bool = True, **how: Any
+) -> LiveTouch:
     return LiveTouch(stream, Prediction(material, 0.99, (), 0.0, known, 1.0), decided, 0.0, "released", **how)
 
 
@@ -62,6 +64,7 @@ def test_known_touches_and_rest_are_noted_and_a_change_is_told_once(memory: Path
         assert takes(ended(two, NAMES[0])) == 1  # what was learned is not noted, too
         assert takes(ended(SCENE.touch(NAMES[1], 92), NAMES[1], known=False)) == 1
         assert takes(ended(SCENE.touch(NAMES[1], 93), NAMES[1], decided=False)) == 0
+        assert takes(ended(SCENE.touch(NAMES[1], 94), NAMES[1], known=None)) == 0
         assert takes(None) == 0
         for i in range(40):
             takes(ended(SCENE.touch(NAMES[i % 3], 100 + i), NAMES[i % 3], rest=rest()))

@@ -137,3 +137,9 @@ def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
     assert set(conformal.p_values(gap)) == {"m0", "m1", "m2", "m3"}
     ragged = Conformal.of([*touches[:-1], KeptTouch("m3", b"s", touch(3, 400, 15))])
     assert ragged.p_values(touch(3, 401))["m3"].share > 0.05
+
+
+def test_places_are_of_the_list_that_is_asked_for():
+    conformal = Conformal.of(kept(of_each=1))
+    for candidates, expected in ((["m0", "m1"], [[0, 1], [0, 1]]), (["a", "m1", "m3"], [[1, 3], [1, 2]])):
+        assert [places.tolist() for places in conformal.places(candidates)] == expected

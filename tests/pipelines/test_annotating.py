@@ -181,14 +181,15 @@ def test_contacts_are_found_in_episodes_that_begin_at_rest(learner, tmp_path):
     assert done.answered < len(readings) / 2
 
 
-def test_a_gap_makes_two_touches_and_what_is_not_finite_is_left_out(learner, tmp_path):
+@pytest.mark.parametrize("jump", [3, -0.8])
+def test_a_gap_makes_two_touches_and_what_is_not_finite_is_left_out(learner, tmp_path, jump):
     random = np.random.default_rng(4)
     readings = np.concatenate([slide("a", 40, random), slide("b", 40, random)])
     readings[60] = np.nan
     folder = robot_set(tmp_path / "set", [("one", readings)])
     path = folder / "data/chunk-000/file-000.parquet"
     table = pq.read_table(path)
-    times = (np.arange(80) / 50 + np.where(np.arange(80) >= 40, 3, 0)).astype(np.float32)
+    times = (np.arange(80) / 50 + np.where(np.arange(80) >= 40, jump, 0)).astype(np.float32)
     pq.write_table(table.set_column(table.schema.names.index("timestamp"), "timestamp", pa.array(times)), path)
     done = annotate(learner, folder, field="pad")
     material = whole(done.output)[NUMBERS[0]].to_pylist()
@@ -213,11 +214,12 @@ def test_an_interrupted_call_is_resumed_by_the_same_one(learner, before, after, 
     other = live_touches.learner("own")
     with pytest.raises(InputError, match="belongs to another run"):
         annotate(other, before, output=folder, field="pad")
-    monkeypatch.setattr(annotation_run, "write_data", rewriting.write_data)
     done, calls = [], []
+    monkeypatch.setattr(annotation_run, "write_data", lambda *how: done.append(how[1]) or rewriting.write_data(*how))
     result = annotate(learner, before, output=folder, field="pad", progress=lambda *how: calls.append(how))
     assert result == Annotated(folder, *list(vars(after).values())[1:])
-    assert contents(folder) == contents(after.output) and calls[-1] == ("statistics", 2, 2) and not done
+    assert contents(folder) == contents(after.output) and calls[-1] == ("statistics", 2, 2)
+    assert len(done) == 1 and done != written
     assert not (tmp_path / "out.annotating").exists()
 
 
@@ -258,7 +260,7 @@ def test_in_place_the_data_set_is_whole_wherever_the_power_is_cut(learner, befor
     monkeypatch.setattr(type(folder), "replace", cut_off)
     with pytest.raises(KeyboardInterrupt):
         annotate(learner, folder, field="pad", in_place=True)
-    assert len(moved) == cut + 1
+    assert len(moved) == cut + 1 and "info.json" not in [path.name for path in moved[:-1]]
     monkeypatch.setattr(type(folder), "replace", replace)
     done = annotate(learner, folder, field="pad", in_place=True)
     now = contents(folder)
@@ -268,11 +270,14 @@ def test_in_place_the_data_set_is_whole_wherever_the_power_is_cut(learner, befor
     assert now == contents(after.output)
 
 
-def test_answers_that_are_there_give_way_only_where_asked(learner, after, tmp_path):
+def test_answers_that_are_there_give_way_only_where_asked(learner, before, after, tmp_path):
     with pytest.raises(InputError, match=r"has 'observation.touch.known' already: replace=True"):
         annotate(learner, after.output, output=tmp_path / "again", field="pad")
     again = annotate(learner, after.output, output=tmp_path / "again", field="pad", replace=True)
     assert whole(again.output).equals(whole(after.output))
+    bold = annotate(learner, before, output=tmp_path / "bold", field="pad", risk=0.3)  # with events on other frames
+    again = annotate(learner, bold.output, output=tmp_path / "anew", field="pad", replace=True)
+    assert whole(again.output).equals(whole(after.output)) and not whole(bold.output).equals(whole(after.output))
     words = annotate(learner, after.output, output=tmp_path / "words", field="pad", replace=True, forms=["language"])
     assert whole(words.output).select(NUMBERS).equals(whole(after.output).select(NUMBERS))
     with pytest.raises(InputError, match="are answers, and no readings"):

@@ -180,6 +180,7 @@ class TestCommand:
         assert "expected a field to read" in refused(*how, memory)
         assert "2 channels" in refused(*how, memory, "--field", "pad", "--columns", "0")
         assert "expected forms" in refused(*how, memory, "--field", "pad", "--as", "words")
+        assert "'zinc'" in refused(*how, memory, "--field", "pad", "--scene", "a, zinc")
         assert run(*how, memory, "--field", "pad", "--in-place").exit_code == 0
         again = refused(*how, memory, "--field", "pad", "--in-place")
         assert "--replace answers anew" in again and "--as without numbers" in again

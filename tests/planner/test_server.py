@@ -87,6 +87,7 @@ def test_what_cannot_be_is_a_tools_error_that_says_what_to_do(folder):
     files = [("what_is_felt", {"file": name}) for name in ("../outside.npy", "link.npy", "day", "/dev/zero", "a\0b")]
     calls = [
         ("what_is_felt", {}),
+        ("what_is_felt", {"readings": [[0.5, 0.5]] * 9, "file": "day/t.npy"}),
         ("what_is_felt", {"readings": [[0.1, 0.2, 0.3]] * 5}),
         ("what_is_felt", {"readings": [[0.1, 0.2], [0.1]]}),
         ("what_is_felt", {"readings": [[0.5, 0.5]] * 4, "scene": ["nothing"]}),
@@ -96,7 +97,7 @@ def test_what_cannot_be_is_a_tools_error_that_says_what_to_do(folder):
         *files,
     ]
     _, answers = talk(folder, "--files", folder / "files", calls=calls)
-    told = ["one of them", "(T, 2)", "Were values lost", "nothing", "readings", "most", "observe"] + [
+    told = ["one of them", "one of them", "(T, 2)", "Were values lost", "nothing", "readings", "most", "observe"] + [
         "in the served folder"
     ] * 5
     for (name, arguments), answer, words in zip(calls, answers, told, strict=True):
@@ -127,6 +128,9 @@ def test_only_with_learn_it_observes_and_retracts(folder, tmp_path):
     assert "retracted" in again and "--files" in file
     with TactileLearner.open(tmp_path / "memory", mode="read") as learner:
         assert learner.digest() == before and learner.materials == {}
+    with TactileLearner.open(tmp_path / "other", sensor=PAD, embedding=SMALL) as learner:
+        server._Tools(learner, folder / "files").observe("b", file="day/t.npy")
+        assert [each.source for each in learner.observations()] == ["day/t.npy"]
 
 
 def test_a_call_is_bounded(folder, monkeypatch):
@@ -134,6 +138,9 @@ def test_a_call_is_bounded(folder, monkeypatch):
     monkeypatch.setattr(server, "LARGEST_FILE", 10)
     with TactileLearner.open(folder / "memory", mode="read") as learner:
         tools = server._Tools(learner, folder / "files")
+        monkeypatch.setattr(server, "FEW", 10)
+        again = tools.what_to_touch_again()
+        assert len(again) == 3 and tools.what_to_touch_again(2) == again[:2]
         with pytest.raises(InputError, match="at most 10 numbers"):
             tools.what_is_felt([[0.0, 1.0]] * 6)
         with pytest.raises(InputError, match="expected a file"):

@@ -104,6 +104,17 @@ def test_a_touch_without_a_label_that_moves_the_samples_is_settled_too(monkeypat
     assert answers(ours, of="slip") == answers(theirs, of="slip")
 
 
+def test_a_touch_with_one_label_and_then_another_counts_once_for_each():
+    ours, theirs = TactileLearner(**SETTINGS), by_labels()
+    felt(ours)
+    for label in "ns":
+        ours.observe("a", stream((30, 60)), labels={"slip": label}, again=True)
+        theirs.observe(label, stream((30, 60)))
+    for learner in (ours, theirs):
+        learner.settle()
+    assert answers(ours, of="slip") == answers(theirs)
+
+
 def test_a_live_session_answers_by_an_axis():
     learner = TactileLearner(**SETTINGS)
     felt(learner)

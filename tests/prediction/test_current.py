@@ -277,6 +277,16 @@ def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monk
     assert bits(learner) == expected((*FEWER, *(("a", 90 + i) for i in range(5))))
 
 
+def test_a_small_memory_is_opened_as_it_is_fitted(tmp_path):
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
+        for touch in OBSERVED[:9]:
+            learner.observe(touch[0], stream(*touch))
+        learner.predict(stream(*PROBES[0]))
+        learner.observe("a", stream("a", 90))  # one more: the model that answers is the one before
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as again:
+        assert bits(again) == expected((*OBSERVED[:9], ("a", 90)))
+
+
 def test_a_fit_that_failed_beside_is_made_again(monkeypatch):
     learner = asked_once()
     with monkeypatch.context() as broken:

@@ -151,3 +151,4 @@ def test_a_touch_that_was_observed_twice_has_the_mean_of_its_values():
     one, other = Annotation((("force", 1000),)), Annotation((("force", 2500),), (("slip", "north"),))
     assert value_of(((one, 2), (other, 1)), FORCE) == 1.5
     assert value_of(((Annotation((), (("slip", "north"),)), 1),), FORCE) is None
+    assert value_of(((Annotation((("force", 0),)), 1),), FORCE) == 0.0

@@ -13,6 +13,7 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.pipelines.learning import learn_sources
 from scroll_tactile.pipelines.sources import SourceOptions
 from scroll_tactile.recordings import read, resampled
+from scroll_tactile.recordings.headings import Heading
 
 EPISODE = np.repeat([0, 1, 2], 10)
 WRENCH = RNG.uniform(0, 5, (30, 3)).astype(np.float32)
@@ -96,6 +97,12 @@ def test_a_touch_with_two_labels_is_refused_and_the_others_are_learned(data):
 def test_a_column_that_cannot_annotate_is_refused(data, tmp_path, heading, error, match):
     with pytest.raises(error, match=match):
         read(data, field="tip", annotate=[heading])
+
+
+def test_a_heading_is_read_from_its_end_and_a_range_makes_a_unit_of_any_word():
+    placed = Heading.parsed("force from left [N] 0..9 step 1 from wrench[2]")
+    assert (placed.name, placed.column, placed.quantity.high) == ("force from left", "wrench[2]", 9.0)
+    assert Heading.parsed("grip [label] 0..9 step 1").quantity.unit == "label"
 
 
 def test_other_recordings_have_no_such_columns_and_none_is_resampled(data, tmp_path):

@@ -178,6 +178,33 @@ def test_a_touch_is_learned_once_and_forgotten(tmp_path):
             made.begin()
 
 
+def test_what_was_learned_last_is_taken_back_first_and_once(tmp_path):
+    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as own:
+        made, _, _ = bridge(source=own)
+        for start, name in ((1000.0, "felt"), (2000.0, "cork"), (3000.0, "silk")):
+            run(made, ROWS + 0.001 * start / 1000, start=start)
+            made.learn(name)
+        made.retract(str(made.learned.sequence))
+        assert made.undo().startswith("cork: ") and made.undo().startswith("felt: ")
+        with pytest.raises(errors.InputError, match="there is none"):
+            made.undo()
+        assert set(own.materials) == {*"abc"}
+
+
+def test_paused_a_touch_can_be_learned_and_resumed_it_answers_as_it_was_adjusted(tmp_path):
+    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as own:
+        made, answers, _ = bridge(source=own)
+        run(made, ROWS[: PLACES[0][1] - 5])
+        made.pause()
+        assert answers[-1]["event"] == "paused" and not answers[-1]["contact"]
+        made.adjust(risk=0.05, scene=["b", "c"])
+        made.resume()
+        assert made.learn("felt").startswith("felt: ")
+        answers.clear()
+        run(made, start=2000.0)
+        assert {name for answer in answers for name, _ in answer.get("ranking", ())} == {"b", "c"}
+
+
 def test_touches_that_somebody_else_begins_and_ends():
     made, answers, _ = bridge(contact="manual")
     rows = ROWS[slice(*PLACES[1])]

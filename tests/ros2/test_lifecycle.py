@@ -10,7 +10,9 @@ import pytest
 from robot import TOPIC, command, ended_by_ctrl_c, publishing
 
 from scroll_tactile import TactileLearner, errors
-from scroll_tactile.ros2.fingers import Finger, fingers_of
+from scroll_tactile.recordings import PRESETS
+from scroll_tactile.ros2.fingers import Finger, fingers_of, new_sensor
+from scroll_tactile.ros2.parameters import DYNAMIC, refused, texts
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
@@ -205,6 +207,16 @@ def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeyp
         if name == "hand":
             assert remote.call("index/materials").success and "felt" in remote.call("index/materials").message
         ended_by_ctrl_c(process)
+
+
+def test_a_memory_that_is_there_has_its_sensor_and_parameters_are_what_they_can_be(memory, tmp_path):
+    assert new_sensor(memory, "", "biotac") is None  # a preset may give topic and field alone
+    assert new_sensor(tmp_path / "none", "", "biotac") == PRESETS["biotac"].sensor
+    with pytest.raises(errors.InputError, match="say which sensor"):
+        new_sensor(tmp_path / "none", "", "")
+    assert texts([" a", "", "  ", "b "]) == ["a", "b"] and texts(" ") == []
+    risk = next(each for each in DYNAMIC if each.name == "risk")
+    assert [bool(refused(risk, value)) for value in (0.0, 0.05, 1.0, True, "x")] == [True, False, True, True, True]
 
 
 def test_fingers_by_topics_fields_and_names():

@@ -57,6 +57,17 @@ def test_a_reader_may_do_nothing_that_writes(tmp_path):
                 call()
 
 
+def test_a_reader_whose_folder_becomes_another_stores_reads_that_one(tmp_path):
+    for name, rows in (("one", 1), ("other", 3)):
+        with Store.open(tmp_path / name, identity={"for": name}) as made:
+            for _ in range(rows):
+                made.append("a", name, b"")
+    with Store.open(tmp_path / "one", mode="read") as reader:
+        (tmp_path / "one").rename(tmp_path / "gone")
+        (tmp_path / "other").rename(tmp_path / "one")
+        assert [head.label for head in reader.heads()] == ["other"] * 3
+
+
 def test_closing_is_final_and_may_be_repeated(tmp_path):
     opened = Store.open(tmp_path, identity={})
     opened.append("a", "b", b"")

@@ -87,8 +87,11 @@ def test_a_memory_shows_what_it_keeps_and_says(folder, tmp_path, started):
             assert [value for _, (value,) in counts] == list(range(1, learner.materials[name] + 1))
         grew = scalars(found, "/hand/health/evidence", "observation")
         assert [(at, value) for at, (value,) in grew] == [(at, pytest.approx(value)) for at, value in health.grew]
+        assert {value for _, (value,) in scalars(found, "/hand/health/alarm", "observation")} == {2.0}
         last = max(row.times["observed"] for row in found["/hand/touch"])
         assert datetime.fromtimestamp(last, UTC).year == datetime.now(UTC).year
+        unknown = [touch for touch in facts.held_out if touch.answer == touch.material and not touch.known]
+        assert sum("called unknown" in text for text in texts(found, "/hand/events")) == len(unknown)
     assert "17 touches of 3 materials" in found["/hand/about"][-1].values["TextDocument:text"][0]
 
 
@@ -153,12 +156,15 @@ def test_a_known_sensors_bag_shows_contacts_without_a_memory(tmp_path, started):
     assert not any("probability" in path for path in found)
 
 
-def test_one_touch_without_rest_is_taken_whole(folder, tmp_path, started):
+def test_one_touch_without_rest_is_taken_whole(folder, tmp_path, started, monkeypatch):
     np.save(tmp_path / "t.npy", slide("a", 50, np.random.default_rng(7)))
     assert started(tmp_path / "t.npy", "--memory", folder / "memory", out=tmp_path / "t.rrd")[0] == 0
     found = rows(tmp_path / "t.rrd")
     assert len(tensors(found, "/touch")) == 1 and "no contact" in texts(found, "/events")[0]
     assert np.hstack(tensors(found, "/readings")).shape == (2, 50)
+    monkeypatch.setattr("scroll_tactile.viewer.recording_log.LONGEST", 0.5)  # it takes one second
+    assert started(tmp_path / "t.npy", "--memory", folder / "memory", out=tmp_path / "t.rrd")[0] == 0
+    assert not tensors(rows(tmp_path / "t.rrd"), "/touch")
 
 
 def test_missing_values_are_left_out_and_named(folder, tmp_path, started):
@@ -195,6 +201,11 @@ def test_readings_of_another_sensor_are_left_alone_before_they_are_read(folder, 
     with pytest.raises(SystemExit) as end:
         importer.main([str(tmp_path / "damaged.npy"), "--memory", str(folder / "memory")])
     assert end.value.code == 1 and "damaged.npy" in capsys.readouterr().err
+    (tmp_path / "damaged.bag").write_bytes(b"anything")
+    for more, code in (([], importer.INCOMPATIBLE), (["--memory", str(folder / "memory")], 1)):
+        with pytest.raises(SystemExit) as end:
+            importer.main([str(tmp_path / "damaged.bag"), *more])
+        assert end.value.code == code and "damaged.bag" in capsys.readouterr().err
 
 
 def test_a_damaged_memory_is_an_error_that_says_so(folder, tmp_path, started):

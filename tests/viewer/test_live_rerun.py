@@ -150,3 +150,14 @@ def test_a_cameras_frames_are_pictures(tmp_path):
         log.close()
     (row,) = [row for row in rows(tmp_path / "c.rrd")["/readings"] if "Image:buffer" in row.values]
     assert set(np.array(row.values["Image:buffer"][0]).tolist()) == {7}
+
+
+def test_a_touch_that_begins_as_another_ends_is_decided_anew(tmp_path):
+    prediction = Prediction("a", 0.9, (("a", 0.9),), 1.0, True, 0.2)
+    ended = LiveTouch(validate(np.full((10, 2), 0.5), PAD), prediction, True, 0.0, "gap")
+    with stream_to(str(tmp_path / "two.rrd")) as stream:
+        log = TouchLog(stream, PAD)
+        log.show(LiveState(True, 0.2, prediction, True), 0.2)
+        log.show(LiveState(True, 0.2, prediction, True, True, (ended,)), 3.0)
+        log.close()
+    assert sum(text.startswith("decided") for text in texts(rows(tmp_path / "two.rrd"), "/events")) == 2

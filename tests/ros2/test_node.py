@@ -166,6 +166,31 @@ def test_a_topic_that_never_comes_is_said_with_those_nearest(spinning, learner):
     spinning.until(lambda: f"nearest is {TOPIC!r}" in served.listener.absent())
 
 
+def test_fingers_of_a_node_have_one_risk_and_scene_until_the_last_is_closed(spinning, learner):
+    node = spinning.node("hand")
+    kind = "sensor_msgs/msg/JointState"
+
+    def finger(name, **how):
+        return TactileNode(node, learner, TOPIC, "position", kind=kind, finger=name, active=False, **how)
+
+    with pytest.raises(errors.InputError, match="never observed"):
+        finger("thumb", scene=["zinc"])
+    assert not node.has_parameter("scene")
+    fingers = [finger("thumb", risk=0.02, scene=["a", "b"]), finger("index"), finger("ring", risk=0.02, scene=["b, a"])]
+    with pytest.raises(errors.InputError, match=r"risk as 0.02 already.*came risk=0.05: leave it out"):
+        finger("little", risk=0.05)
+    with pytest.raises(errors.InputError, match=r"came scene=\['c'\]"):
+        finger("little", scene=["c"])
+    for each in fingers:
+        assert each.bridge._how["risk"] == 0.02 and sorted(each.bridge._how["scene"]) == ["a", "b"]
+        assert node.get_parameter("risk").value == 0.02
+        each.close()
+    assert not any(map(node.has_parameter, ("risk", "scene", "health_after")))
+    again = finger("thumb", risk=0.1)
+    assert again.bridge._how["risk"] == 0.1
+    again.close()
+
+
 def test_no_topic_of_its_own_is_named_as_the_nearest(spinning, learner):
     node = spinning.node("scroll_tactile")
     served = TactileNode(node, learner, "/rh/tactile", "position", kind="sensor_msgs/msg/JointState")

@@ -28,6 +28,7 @@ __all__ = ["Answer", "Bridge", "BridgeReport"]
 
 RESTLESS = "the sensor is not at rest, or something touches it: nothing is found until it is left alone for two seconds"
 _FILE = re.compile(r"\w[\w.-]{0,99}", re.ASCII)  # a name that leads to no other folder
+_NUMBER = re.compile(r"[0-9]{1,19}")  # of a row: no journal has more, and int() refuses thousands of digits
 
 
 @dataclass
@@ -89,7 +90,8 @@ class Bridge:
         self.stamp = 0.0
         self._touch: Stream | None = None  # the last of the session before this one
         self.paused = False
-        self._learned: list[Receipt] = []  # by this bridge, and not taken back
+        self._learned: list[Receipt] = []  # by this bridge; the last may be taken back, see `learned`
+        self._met: dict[str, int] = {}  # by the sessions before this one
         self._answer, self._warn = answer, warn
         self._notes = HealthNotes(learner, None, warn, materials=of is None) if watch else None
         self._by: dict[str, Any] = {} if of is None else {"of": of}
@@ -144,7 +146,9 @@ class Bridge:
 
     def resume(self) -> None:
         """Take readings again, after `pause`; rest is learned anew. Raises what `learner.live` raises."""
-        self.session, self.paused = self.learner.live(**self._how), False
+        session = self.learner.live(**self._how)
+        self._met = self._counts()
+        self.session, self.paused, self._restless = session, False, False
 
     @property
     def touch(self) -> Stream | None:
@@ -175,30 +179,36 @@ class Bridge:
 
         Raises InputError where nothing is left to be taken back, and what `learner.retract` raises.
         """
-        if not self._learned:
+        receipt = self.learned
+        if receipt is None:
             raise InputError(
                 "expected a touch that was learned since the node began, and was not taken back; there is none"
             )
-        receipt = self._learned[-1]
         self.learner.retract(receipt)
-        self._learned.pop()
         left = self.learner.materials.get(receipt.material, 0)
         return f"{receipt.material}: observation {receipt.sequence} was taken back; {left} are left"
 
     def retract(self, observation: str) -> str:
         """Take back an observation, by its number; durable when this returns. Says what was done.
 
-        Raises InputError for what is no number, and what `learner.retract` raises.
+        Raises InputError for what is no number, and for that of an adaptation, and what `learner.retract` raises.
         """
-        if not observation.isascii() or not observation.isdigit():
+        if not _NUMBER.fullmatch(observation):
             raise InputError(f"expected the number of an observation, as learn gave it; came {observation!r:.60}")
-        self.learner.retract(int(observation))
-        self._learned = [each for each in self._learned if each.sequence != int(observation)]
-        return f"observation {int(observation)} was taken back"
+        number = int(observation)
+        if number in self.learner.memory.corrections:
+            raise InputError(
+                f"expected the number of an observation; {number} is that of an adaptation to a changed skin, which "
+                f"`scroll-tactile memory retract MEMORY {number}` takes back once the node has ended"
+            )
+        self.learner.retract(number)
+        return f"observation {number} was taken back"
 
     @property
     def learned(self) -> Receipt | None:
-        """What this bridge learned last, and was not taken back."""
+        """What this bridge learned last, and nobody took back."""
+        while self._learned and self.learner.memory.is_gone(self._learned[-1].sequence):
+            self._learned.pop()
         return self._learned[-1] if self._learned else None
 
     def save(self, name: str) -> str:
@@ -238,12 +248,14 @@ class Bridge:
         return f"{material}: {count} observation{'s' * (count != 1)} forgotten"
 
     def begin(self) -> str:
-        """A touch begins. Raises InputError in a session that finds contacts itself."""
+        """A touch begins. Raises InputError in a session that finds contacts itself, and while paused."""
+        self._require_running()
         self._publish(self.session.begin())
         return "a touch begins with the next reading"
 
     def end(self) -> str:
-        """The touch is over. Raises InputError in a session that finds contacts itself."""
+        """The touch is over. Raises InputError in a session that finds contacts itself, and while paused."""
+        self._require_running()
         touching = self.state.contact
         state = self.session.end()
         self._publish(state)
@@ -253,9 +265,14 @@ class Bridge:
         return f"touched for {touch.stream.seconds:g} s: {touch.prediction.material or 'nothing was ever observed'}"
 
     def again(self) -> str:
-        """The next touch is of the same thing as the last. Raises InputError before any touch."""
+        """The next touch is of the same thing as the last. Raises InputError before any touch, and while paused."""
+        self._require_running()
         self.session.again()
         return "the next touch is of the same thing as the last: what they say adds up"
+
+    def _require_running(self) -> None:
+        if self.paused:
+            raise InputError("no readings are taken, and the touch under way has ended: activate the node first")
 
     def _ended_touch(self, what: str) -> Stream:
         if self.touch is None:
@@ -263,8 +280,15 @@ class Bridge:
         return self.touch
 
     def status(self) -> dict[str, int | bool]:
-        """What the bridge and its session met, by name."""
-        return {**asdict(self.report), **asdict(self.session.report)}
+        """What the bridge and its sessions met, by name; of states that of the last session."""
+        return {**asdict(self.report), **self._counts()}
+
+    def _counts(self) -> dict[str, int | bool]:
+        """What this session met, and those before it."""
+        report = asdict(self.session.report)
+        return {
+            name: value if isinstance(value, bool) else value + self._met.get(name, 0) for name, value in report.items()
+        }
 
     def close(self) -> None:
         """End the touch under way, if any; the learner stays open."""

@@ -12,7 +12,7 @@ from scroll_tactile.ros2.answer_fields import Answer
 from scroll_tactile.ros2.bridge import Bridge
 from scroll_tactile.ros2.interfaces import Quality, interface
 from scroll_tactile.ros2.listening import Listener
-from scroll_tactile.ros2.parameters import DYNAMIC, declare, refused, texts
+from scroll_tactile.ros2.parameters import DYNAMIC, names_in, refused, release, share
 from scroll_tactile.ros2.publishing import AnswerTopics, Diagnostics
 from store import StoreError
 
@@ -56,10 +56,13 @@ class TactileNode:
     A wrong name, a full disk or a missing touch reaches whoever called, which a topic of names could not report.
 
     Parameters, all dynamic: `risk` and `scene`, from the next touch on, and `health_after`: set it to the observation
-    that `/diagnostics` names once a sensor was mended, and only later touches count.
+    that `/diagnostics` names once a sensor was mended, and only later touches count. They are the node's, for all its
+    fingers: risk and scene are their defaults, 0.05 and all materials where left out, and the last `close` undeclares
+    them.
 
-    Raises MissingLibraryError where a package of ROS is missing, InputError for a type that is none, and what `Bridge`
-    raises. A field that the first message does not have raises FieldError from the node's executor.
+    Raises MissingLibraryError where a package of ROS is missing, InputError for a type that is none, and for a risk or
+    scene that is not that of the fingers before, and what `Bridge` raises. A field that the first message does not have
+    raises FieldError from the node's executor.
     """
 
     def __init__(
@@ -70,7 +73,7 @@ class TactileNode:
         field: str,
         *,
         kind: str | None = None,
-        risk: float = 0.05,
+        risk: float | None = None,
         contact: Literal["auto", "manual"] = "auto",
         of: str | None = None,
         scene: Sequence[str] | None = None,
@@ -87,9 +90,14 @@ class TactileNode:
         if self._own and not active:
             self.listener.stop()
         self._log, self._answered = node.get_logger(), answered
-        declare(node, DYNAMIC, {"risk": risk, "scene": list(scene or ()) or ""})
-        how: dict[str, Any] = {"contact": contact, "of": of, "watch": watch, **self._wanted({})}
-        self.bridge = Bridge(learner, field, **how, answer=self._publish, warn=self._warn)
+        given = {"risk": None if risk is None else float(risk), "scene": list(scene or ()) or None}
+        share(node, {name: value for name, value in given.items() if value is not None})
+        try:
+            how: dict[str, Any] = {"contact": contact, "of": of, "watch": watch, **self._wanted({})}
+            self.bridge = Bridge(learner, field, **how, answer=self._publish, warn=self._warn)
+        except BaseException:
+            release(node)
+            raise
         self._answers = AnswerTopics(node, finger, learner.sensor.name)
         self._diagnostics = Diagnostics(node, self.bridge, finger)
         self._services = self._offered()
@@ -132,6 +140,7 @@ class TactileNode:
             self.node.destroy_service(service)
         for publisher in [*self._answers.publishers, self._diagnostics.publisher]:
             self.node.destroy_publisher(publisher)
+        release(self.node)
 
     def _offered(self) -> list[Any]:
         """The services."""
@@ -178,8 +187,7 @@ class TactileNode:
     def _wanted(self, changed: Mapping[str, Any]) -> dict[str, Any]:
         """Risk and scene by the parameters, of which some change."""
         risk, scene = (changed.get(name, self.node.get_parameter(name).value) for name in ("risk", "scene"))
-        names = [name.strip() for text in texts(scene) for name in text.split(",") if name.strip()]
-        return {"risk": float(risk), "scene": names or None}
+        return {"risk": float(risk), "scene": names_in(scene) or None}
 
     def _checked(self, parameters: Sequence[Any]) -> Any:
         """Whether parameters can have these values; ROS sets them where nobody else says no."""

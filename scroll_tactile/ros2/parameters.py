@@ -5,11 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from scroll_tactile.errors import InputError
+from scroll_tactile.recordings.paths import nearest
 from scroll_tactile.ros2.interfaces import DURABILITIES, RELIABILITIES, interface
 
-__all__ = ["DYNAMIC", "STATIC", "Parameter", "declare", "refused", "texts"]
+__all__ = [
+    "DYNAMIC",
+    "STATIC",
+    "Parameter",
+    "declare",
+    "names_in",
+    "refused",
+    "release",
+    "require_known",
+    "share",
+    "texts",
+]
 
 
 @dataclass(frozen=True)
@@ -75,6 +88,61 @@ def declare(node: Any, parameters: Iterable[Parameter], values: Mapping[str, Any
             raise InputError(why)
 
 
+@dataclass
+class _Shared:
+    """What parts of one node have in common. own: the names that they declared. values: what the first was given."""
+
+    own: list[str]
+    values: dict[str, Any]
+    parts: int = 0
+
+
+_SHARED: WeakKeyDictionary[Any, _Shared] = WeakKeyDictionary()
+
+
+def share(node: Any, values: Mapping[str, Any]) -> None:
+    """Declare the dynamic ones for one more part of a node. values: what it is given, by name; `release` ends it.
+
+    Raises InputError where the node has another value already, for all its parts, and what `declare` raises.
+    """
+    shared = _SHARED.get(node)
+    if shared is None:
+        own = [each.name for each in DYNAMIC if not node.has_parameter(each.name)]
+        # What ROS is given wins over both, so that the parts' own words are compared, not what became of them.
+        said = {each.name: values.get(each.name, each.default) for each in DYNAMIC}
+        said |= {name: node.get_parameter(name).value for name in said if name not in own}
+        shared = _Shared(own, said)
+    for name, value in values.items():
+        there = shared.values[name]
+        same = sorted(names_in(there)) == sorted(names_in(value)) if name == "scene" else there == value
+        if not same:
+            raise InputError(
+                f"the node has parameter {name} as {there!r} already, for all that is on it; came {name}={value!r}: "
+                "leave it out, or set the parameter"
+            )
+    declare(node, DYNAMIC, shared.values)
+    shared.parts += 1
+    _SHARED[node] = shared
+
+
+def release(node: Any) -> None:
+    """Undeclare, with the last part of a node, what its parts declared."""
+    shared = _SHARED[node]
+    shared.parts -= 1
+    if not shared.parts:
+        del _SHARED[node]
+        for name in shared.own:
+            node.undeclare_parameter(name)
+
+
+def require_known(names: Iterable[str]) -> None:
+    """Raise InputError for a name that is no parameter's."""
+    known = [each.name for each in (*STATIC, *DYNAMIC)]
+    for name in names:
+        if name not in known:
+            raise InputError(f"there is no parameter {name!r}{nearest(name, known)}")
+
+
 def refused(each: Parameter, value: object) -> str:
     """Why a value cannot be; "" where it can."""
     if each.choices and value not in each.choices:
@@ -99,6 +167,11 @@ def texts(value: object) -> list[str]:
     if not isinstance(found, list | tuple) or not all(isinstance(text, str) for text in found):
         raise InputError(f"expected a text or a list of texts; came {value!r:.60}")
     return [text.strip() for text in found if text.strip()]
+
+
+def names_in(value: object) -> list[str]:
+    """The names in a parameter that is a list of them or a text with commas. Raises InputError for anything else."""
+    return [name.strip() for text in texts(value) for name in text.split(",") if name.strip()]
 
 
 def _descriptor(each: Parameter) -> Any:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.ros2.fingers import Finger, fingers_of, new_sensor
 from scroll_tactile.ros2.interfaces import Quality, interface, require_rclpy
 from scroll_tactile.ros2.listening import Listener
-from scroll_tactile.ros2.parameters import DYNAMIC, STATIC, declare, refused, texts
+from scroll_tactile.ros2.parameters import DYNAMIC, STATIC, declare, refused, require_known, texts
 from store import StoreError
 
 if TYPE_CHECKING:
@@ -30,12 +32,13 @@ class _Served:
     """What the node does in each of its states.
 
     own: a learner that is open already, and stays so; None: the parameter memory says where it is. values: defaults of
-    parameters. error: why the last transition failed. met: what was met, when it was cleaned up.
+    parameters. managed: whether the node has a lifecycle. opening: of the memory, from its beginning until it is let
+    go; None before and after. error: why the last transition failed. met: what was met, when it was cleaned up.
     """
 
-    def __init__(self, node: Any, own: TactileLearner | None, values: Mapping[str, Any]) -> None:
-        self.node, self._own = node, own
-        self.learner: TactileLearner | None = None
+    def __init__(self, node: Any, own: TactileLearner | None, values: Mapping[str, Any], managed: bool) -> None:
+        self.node, self._own, self.managed = node, own, managed
+        self.opening: Future[TactileLearner] | None = None
         self.fingers: list[TactileNode] = []
         self.met: dict[str, int | bool] = {}
         self.error: Exception | None = None
@@ -67,33 +70,51 @@ class _Served:
                 self._listeners[topic] = Listener(self.node, topic, kind, quality)
         return fingers
 
-    def open(self) -> None:
-        """Open the memory, and do what takes seconds the first time; in any thread."""
+    def open(self) -> Future[TactileLearner]:
+        """Have a thread open the memory, and do what takes seconds the first time, unless one does or did."""
+        if self.opening is None:
+            names = ("memory", "sensor", "preset", "mode", "risk", "of", "health_after")
+            pool = ThreadPoolExecutor(1)
+            self.opening = pool.submit(self._opened, {name: self.value(name) for name in names})
+            pool.shutdown(wait=False)
+        return self.opening
+
+    def _opened(self, values: Mapping[str, Any]) -> TactileLearner:
         from scroll_tactile.learner import TactileLearner
 
         learner = self._own
         if learner is None:
-            path = Path(self.value("memory"))
-            sensor = new_sensor(path, self.value("sensor"), self.value("preset"))
-            learner = TactileLearner.open(path, sensor=sensor, mode=self.value("mode"))
-        self.learner = learner
-        learner.live(risk=self.value("risk"), contact="manual", of=self.value("of") or None).close()
-        if learner.path is not None and not learner.sensor.camera:
-            learner.health()
+            path = Path(values["memory"])
+            sensor = new_sensor(path, values["sensor"], values["preset"])
+            learner = TactileLearner.open(path, sensor=sensor, mode=values["mode"])
+        try:
+            learner.live(risk=values["risk"], contact="manual", of=values["of"] or None).close()
+            if learner.path is not None and has_numbers(learner.sensor):
+                self._warm_health(learner, values["health_after"])
+        except BaseException:
+            if learner is not self._own:
+                learner.close()
+            raise
+        return learner
+
+    def _warm_health(self, learner: TactileLearner, after: int) -> None:
+        """Read the rows that /diagnostics will ask about; a damaged one is no reason not to answer."""
+        try:
+            learner.health(after=after)
+        except (ScrollTactileError, StoreError) as error:
+            self.node.get_logger().warning(f"the health of the sensor cannot be told: {error}")
 
     def configure(self) -> None:
-        """Open the memory, if it is not open yet, and offer topics and services. Raises what hinders it."""
+        """Open the memory, or wait until it is open, and offer topics and services. Raises what hinders it."""
         from scroll_tactile.ros2.node import TactileNode
 
         fingers = self.listen()
-        if self.learner is None:
-            self.open()
-        assert self.learner is not None
+        learner = self.open().result()
         how = {name: self.value(name) for name in ("contact", "watch")}
         for each in fingers:
             more: dict[str, Any] = {"listener": self._listeners[each.topic], "finger": each.name, "active": False}
             of = self.value("of") or None
-            self.fingers.append(TactileNode(self.node, self.learner, each.topic, each.field, of=of, **how, **more))
+            self.fingers.append(TactileNode(self.node, learner, each.topic, each.field, of=of, **how, **more))
 
     def activate(self) -> None:
         """Take readings. Raises what the first of them raises."""
@@ -117,37 +138,49 @@ class _Served:
                 self.met[name] = bool(before or count) if isinstance(count, bool) else before + count
             finger.close()
         self.fingers, self._listeners = [], {}
-        learner, self.learner = self.learner, None
-        if learner is not None:
+        opening, self.opening = self.opening, None
+        if opening is not None and opening.exception() is None:  # waits for it
+            learner = opening.result()
             self.met["materials"] = len(learner.materials)
             if learner is not self._own:
                 learner.close()
 
-    def tried(self, *steps: Callable[[], None]) -> bool:
-        """Take steps of a transition; whether they could be taken. What hinders them is logged, and is `error` then."""
-        self.error = None
-        try:
-            for step in steps:
-                step()
-        except _EXPECTED as error:
-            self.error = error
-            self.node.get_logger().error(str(error))
+    def tried(self, step: Callable[[], None], otherwise: Callable[[], None] | None = None) -> bool:
+        """Take a step of a transition; whether it could be taken. What hinders it is logged, and is `error` then.
+
+        otherwise: what is done then.
+        """
+        self.error = self._hindered(step)
+        if self.error is not None and otherwise is not None:
+            self._hindered(otherwise)
         return self.error is None
+
+    def _hindered(self, step: Callable[[], None]) -> Exception | None:
+        """What hinders a step. Any exception: rclpy would drop it without a word."""
+        try:
+            step()
+        except Exception as error:
+            said = str(error) if isinstance(error, _EXPECTED) else traceback.format_exc()
+            self.node.get_logger().error(said)
+            return error
+        return None
 
     def _checked(self, parameters: Sequence[Any]) -> Any:
         result = interface("rcl_interfaces/msg/SetParametersResult")
         for parameter in parameters:
             known = next((each for each in (*STATIC, *DYNAMIC) if each.name == parameter.name), None)
             why = "" if known is None else refused(known, parameter.value)
-            if known in STATIC and self.learner is not None and not why:
-                node = self.node.get_fully_qualified_name()
-                why = (
-                    f"parameter {parameter.name} is read when the node is configured: ros2 lifecycle set {node} "
-                    "deactivate and cleanup first, and configure and activate after it"
-                )
+            if known in STATIC and self.opening is not None and not why:
+                why = f"parameter {parameter.name} is read when the node {self._how_to_change(parameter)}"
             if why:
                 return result(successful=False, reason=why)
         return result(successful=True)
+
+    def _how_to_change(self, parameter: Any) -> str:
+        if not self.managed:
+            return f"starts: end it, and start it with --ros-args -p {parameter.name}:=VALUE"
+        node = self.node.get_fully_qualified_name()
+        return f"is configured: ros2 lifecycle set {node} deactivate and cleanup first, then configure and activate"
 
 
 def _node(rclpy: Any, context: Any) -> tuple[Any, bool]:
@@ -162,16 +195,10 @@ def _node(rclpy: Any, context: Any) -> tuple[Any, bool]:
         served: _Served
 
         def on_configure(self, state: Any) -> Any:
-            done = self.served.tried(self.served.configure)
-            if not done:
-                self.served.clean_up()
-            return results[done]
+            return results[self.served.tried(self.served.configure, self.served.clean_up)]
 
         def on_activate(self, state: Any) -> Any:
-            done = self.served.tried(self.served.activate)
-            if not done:
-                self.served.deactivate()
-            return results[done]
+            return results[self.served.tried(self.served.activate, self.served.deactivate)]
 
         def on_deactivate(self, state: Any) -> Any:
             return results[self.served.tried(self.served.deactivate)]
@@ -201,14 +228,16 @@ def serve(
 
     The node has a lifecycle (https://design.ros2.org/articles/node_lifecycle.html): configure opens the memory and
     offers services, activate takes readings, deactivate ends a touch under way, cleanup closes the memory. It brings
-    itself up to active, unless `autostart` is False, and hears the topics before the memory is open: what comes
-    meanwhile waits. Where rclpy has no lifecycle it is a plain node, which is active until it ends.
+    itself up to active, unless `autostart` is False or a manager configures it while the memory opens, and hears the
+    topics before the memory is open: what comes meanwhile waits. Where rclpy has no lifecycle it is a plain node, which
+    is active until it ends.
 
     A callback under way is finished first; a second ctrl-C interrupts it.
 
     Raises what `TactileNode` and `TactileLearner.open` raise, FieldError for a field that the first message does not
-    have, and InputError for parameters that cannot be, and for arguments that ROS refuses.
+    have, and InputError for parameters that there are not or that cannot be, and for arguments that ROS refuses.
     """
+    require_known(parameters)
     rclpy = require_rclpy()
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
@@ -225,7 +254,7 @@ def serve(
             raise InputError(f"ROS refuses to start with {' '.join(arguments) or 'no arguments'}: {error}") from error
         served: _Served | None = None
         try:
-            served = node.served = _Served(node, own, {name: _listed(value) for name, value in values.items()})
+            served = node.served = _Served(node, own, {name: _listed(value) for name, value in values.items()}, managed)
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(node)
 
@@ -235,7 +264,7 @@ def serve(
                 return not ended.is_set() and bool(context.ok())
 
             if served.value("autostart") or not managed:
-                _start(served, managed, running)
+                _start(served, running)
             while running():
                 pass
         except ExternalShutdownException:
@@ -247,22 +276,27 @@ def serve(
         return {} if served is None else served.met
 
 
-def _start(served: _Served, managed: bool, running: Callable[[], bool]) -> None:
+def _start(served: _Served, running: Callable[[], bool]) -> None:
     """Bring the node up to active, and hear its topics while the memory is opened. Raises what hinders it."""
     served.listen()
-    with ThreadPoolExecutor(1) as pool:
-        opening = pool.submit(served.open)
-        while not opening.done() and running():
-            pass
-        opening.result()
-    if managed:
-        node = served.node
-        for transition in (node.trigger_configure, node.trigger_activate):
-            transition()
-            if served.error is not None:
-                raise served.error
+    opening, node = served.open(), served.node
+    while not opening.done():
+        if not running():
+            return
+    opening.result()
+    if served.fingers or served.opening is not opening:
+        node.get_logger().info(
+            "somebody else configured the node while the memory opened: to activate it is left to them"
+        )
+    elif served.managed:
+        for name in ("configure", "activate"):
+            done = getattr(node, f"trigger_{name}")()
+            if done != type(done).SUCCESS:
+                raise served.error or ScrollTactileError(
+                    f"ROS did not {name} the node, and gave no reason: see its log"
+                )
     else:
-        served.node.get_logger().warning("rclpy has no lifecycle here: a plain node, active until it ends")
+        node.get_logger().warning("rclpy has no lifecycle here: a plain node, active until it ends")
         served.configure()
         served.activate()
 

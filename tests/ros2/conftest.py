@@ -35,6 +35,7 @@ def learner(memory, tmp_path_factory):
 def spinning(alone):
     """A context; gives nodes in it, and spins all until something is there."""
     rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
     from diagnostic_msgs.srv import AddDiagnostics
     from rclpy.executors import SingleThreadedExecutor
     from std_srvs.srv import Trigger
@@ -54,6 +55,14 @@ def spinning(alone):
             while not there():
                 assert time.monotonic() < end, "it never came"
                 executor.spin_once(timeout_sec=0.05)
+
+        def silent_after(self, publisher, seconds=300):
+            """Wait until a process has published all it had and the node says that nothing comes any more."""
+            heard, monitor = [], self.node("monitor")
+            monitor.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
+            self.until(lambda: publisher.poll() is not None, seconds)
+            heard.clear()  # what is said from here on is said after the last message
+            self.until(lambda: any(array.status[0].level == DiagnosticStatus.STALE for array in heard), seconds)
 
         def ask(self, node, kind, name, **request):
             client = node.create_client(kind, name)

@@ -15,6 +15,8 @@ from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner, errors
 from scroll_tactile.ros2 import Bridge
+from scroll_tactile.ros2.bridge import RESTLESS
+from scroll_tactile.signals.correction import Correction
 from store import StoreFullError
 
 ROWS, PLACES = shift("ab")
@@ -278,3 +280,84 @@ def test_answers_are_by_an_axis_of_labels_where_one_is_named():
     assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["north", "south"]
     with pytest.raises(errors.AnnotationError, match="expected an axis that touches have labels on"):
         bridge(source=source, of="way")
+
+
+@pytest.fixture
+def own(tmp_path):
+    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as learner:
+        yield learner
+
+
+def learned(made, names):
+    """Learn a touch under each name; their numbers."""
+    numbers = []
+    for i, name in enumerate(names):
+        run(made, shift("b", seed=i)[0], start=1000.0 + 100 * i)
+        made.learn(name)
+        numbers.append(made.learned.sequence)
+    return numbers
+
+
+@pytest.mark.parametrize("text", ["", "-1", "1.0", " 7", "٣", "1" * 20, "1" * 5000], ids=lambda text: text[:20])
+def test_what_is_no_number_of_an_observation_is_refused(own, text):
+    made, *_ = bridge(source=own)
+    with pytest.raises(errors.InputError, match="expected the number of an observation"):
+        made.retract(text)
+    with pytest.raises(errors.ObservationError):
+        made.retract("9" * 19)
+
+
+def test_undo_passes_over_what_somebody_took_back_already(own):
+    made, *_ = bridge(source=own)
+    wool, lace, silk, _ = learned(made, ["wool", "lace", "silk", "felt"])
+    made.forget("felt")
+    assert made.learned.sequence == silk
+    made.retract(str(silk))
+    own.retract(lace)
+    assert made.undo().startswith(f"wool: observation {wool} was taken back")
+    assert made.learned is None and own.materials == {"a": 6, "b": 6, "c": 6}
+    with pytest.raises(errors.InputError, match="there is none"):
+        made.undo()
+
+
+def test_an_adaptation_is_not_taken_back_as_an_observation(own):
+    row = own._ledger.adapt(Correction.none(PAD.channels))
+    made, *_ = bridge(source=own)
+    with pytest.raises(errors.InputError, match=r"an adaptation to a changed skin.*scroll-tactile memory retract"):
+        made.retract(str(row))
+    assert own.memory.correction is not None
+
+
+def test_what_was_met_adds_up_over_pauses():
+    made, *_ = bridge()
+    run(made)
+    made.pause()
+    once = made.status()
+    assert once["touches"] == 2
+    made.resume()
+    assert made.status() == once | {"learning": True}
+    run(made, start=2000.0)
+    made.pause()
+    both = made.status()
+    assert both["touches"] == 4 and both["readings"] == both["messages"] == 2 * len(ROWS)
+    assert both["learning"] is False
+
+
+def test_a_session_that_begins_anew_says_nothing_of_the_rest_before():
+    made, _, warnings = bridge()
+    run(made, np.concatenate([slide("b", 50, np.random.default_rng(9)), ROWS[:70]]))
+    assert warnings == [RESTLESS]
+    made.pause()
+    made.resume()
+    run(made, ROWS[:10], start=2000.0)
+    assert warnings == [RESTLESS]
+
+
+def test_a_paused_bridge_says_how_touches_can_begin_again():
+    made, *_ = bridge(contact="manual")
+    made.pause()
+    for call in (made.begin, made.end, made.again):
+        with pytest.raises(errors.InputError, match=r"no readings are taken.*activate"):
+            call()
+    made.resume()
+    assert made.begin()

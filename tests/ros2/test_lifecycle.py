@@ -3,6 +3,7 @@
 import json
 import signal
 import subprocess
+import threading
 from pathlib import Path
 
 import launching
@@ -13,10 +14,11 @@ from scroll_tactile import TactileLearner, errors
 from scroll_tactile.recordings import PRESETS
 from scroll_tactile.ros2.fingers import Finger, fingers_of, new_sensor
 from scroll_tactile.ros2.parameters import DYNAMIC, refused, texts
+from scroll_tactile.ros2.serving import _node, _Served, _start, serve
+from store import DamageError
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters  # noqa: E402
@@ -61,14 +63,6 @@ class Remote:
         message = rclpy.Parameter(name, value=value).to_parameter_msg()
         [result] = self.ask(SetParameters, "set_parameters", parameters=[message]).results
         return "" if result.successful else result.reason or "no reason"
-
-    def silent_after(self, publisher, seconds=300):
-        """Wait until a process has published all it had and the node says that nothing comes any more."""
-        heard = []
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
-        self.nodes.until(lambda: publisher.poll() is not None, seconds)
-        heard.clear()  # what is said from here on is said after the last message
-        self.nodes.until(lambda: any(array.status[0].level == DiagnosticStatus.STALE for array in heard), seconds)
 
     def ended(self):
         return [answer for answer in self.answers if answer["event"] == "ended"]
@@ -131,7 +125,7 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
     remote = Remote(spinning)
     remote.listen()
     with publishing(500, 250) as publisher, node_command(own) as process:
-        remote.silent_after(publisher)
+        spinning.silent_after(publisher)
         reply = remote.call("learn", "felt")
         assert reply.success and "learned as observation" in reply.message
         remote.answers.clear()
@@ -160,7 +154,7 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
 
 def test_every_reading_since_the_topic_was_heard_is_counted(spinning, own):
     with publishing(500, 250) as publisher, node_command(own) as process:
-        Remote(spinning).silent_after(publisher)
+        spinning.silent_after(publisher)
         output = ended_by_ctrl_c(process)
     assert "messages: 500" in output and "dropped" not in output
 
@@ -170,11 +164,103 @@ def test_a_client_without_lifecycle_makes_a_plain_node(spinning, own):
     with command("-c", PLAIN, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         remote = Remote(spinning, "/plain")
         assert json.loads(remote.call("materials").message) == {"a": 6, "b": 6, "c": 6}
-        assert "read when the node is configured" in remote.set("topic", "/other")
+        assert "read when the node starts: end it" in remote.set("topic", "/other")
         assert f"{remote.name}/get_state" not in dict(remote.node.get_service_names_and_types())
         process.send_signal(signal.SIGINT)
         _, logged = process.communicate(timeout=60)
     assert process.returncode == 0 and "no lifecycle here" in logged
+
+
+def served_by(node, memory, **values):
+    named = {"memory": str(memory), "topic": TOPIC, "field": "position", "type": "sensor_msgs/msg/JointState"}
+    return _Served(node, None, named | values, managed=True)
+
+
+@pytest.fixture
+def opening(own, monkeypatch):
+    """Has memories open only when the event is set; what was opened."""
+    go, paths, before = threading.Event(), [], TactileLearner.open
+
+    def slow(path, **how):
+        paths.append(path)
+        assert go.wait(60)
+        return before(path, **how)
+
+    monkeypatch.setattr(TactileLearner, "open", slow)
+    yield go, paths
+    monkeypatch.undo()
+    TactileLearner.open(own).close()  # it was let go
+
+
+def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(spinning, own, opening):
+    node, (go, paths) = spinning.node("scroll_tactile"), opening
+    served = served_by(node, own)
+
+    def running():
+        """What else the node is asked meanwhile."""
+        if not go.is_set():
+            [refused] = node.set_parameters([rclpy.Parameter("memory", value="other")])
+            assert not refused.successful and "deactivate and cleanup first" in refused.reason
+            go.set()
+            assert served.tried(served.configure), served.error
+        return True
+
+    _start(served, running)
+    assert paths == [own] and len(served.fingers) == 1 and not served.fingers[0].active
+    served.clean_up()
+
+
+def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(spinning, own, opening):
+    served = served_by(spinning.node("scroll_tactile"), own)
+    _start(served, lambda: False)
+    opening[0].set()
+    served.clean_up()
+    assert served.met["materials"] == 3 and not served.fingers
+
+
+def test_whatever_hinders_a_transition_ends_the_start(spinning, own, monkeypatch):
+    """rclpy makes a result of an exception, without a word."""
+    from rclpy.lifecycle import TransitionCallbackReturn
+
+    context, logged = spinning.node("operator").context, []
+
+    def fail(self):
+        raise ZeroDivisionError("of all things")
+
+    for step in ("configure", "activate"):
+        node, _ = _node(rclpy, context)
+        node.served = served_by(node, own)
+        monkeypatch.setattr(node.get_logger(), "error", logged.append)
+        with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
+            patched.setattr(_Served, step, fail)
+            _start(node.served, lambda: True)
+        assert "of all things" in logged[-1] and "Traceback" in logged[-1]
+        node.served.clean_up()
+    node, _ = _node(rclpy, context)
+    node.served = served_by(node, own)
+    monkeypatch.setattr(node, "trigger_activate", lambda: TransitionCallbackReturn.ERROR)
+    with pytest.raises(errors.ScrollTactileError, match="did not activate the node"):
+        _start(node.served, lambda: True)
+    node.served.clean_up()
+
+
+def test_a_damaged_row_is_no_reason_not_to_start(spinning, own, monkeypatch):
+    asked = []
+
+    def health(self, *, after=0):
+        asked.append(after)
+        raise DamageError("row 7 is damaged", path=self.path)
+
+    monkeypatch.setattr(TactileLearner, "health", health)
+    served = served_by(spinning.node("scroll_tactile"), own, health_after=5)
+    served.configure()
+    assert len(served.fingers) == 1 and set(asked) == {5}
+    served.clean_up()
+
+
+def test_a_parameter_that_there_is_not_is_named_with_the_nearest(own):
+    with pytest.raises(errors.InputError, match="no parameter 'rsk'; nearest is 'risk'"):
+        serve(own, TOPIC, "position", rsk=0.01)
 
 
 @pytest.mark.parametrize("name", ["finger", "hand"])

@@ -155,6 +155,51 @@ def test_messages_wait_for_who_takes_them_and_the_oldest_make_room(spinning, mon
     assert taken[0] == (3, 4.0, 3) and [lost for *_, lost in taken[1:]] == [0] * 5
 
 
+def test_all_fingers_of_a_topic_get_what_waited_and_nothing_waits_once_they_left(spinning, monkeypatch):
+    from scroll_tactile.ros2 import Listener, listening
+
+    monkeypatch.setattr(listening, "WAITING", 3)
+    listener, taken = Listener(spinning.node("hand"), TOPIC, "sensor_msgs/msg/JointState"), {"thumb": [], "index": []}
+    takers = [lambda *message, name=name: taken[name].append(message) for name in taken]
+    for i in (1, 2, 3, 5, 6):  # 4 was lost on its way, 1 and 2 had to make room
+        listener.receive(i, {"source_timestamp": i * 10**9, "publication_sequence_number": i})
+    for taker in takers:
+        listener.give(taker)
+    listener.receive(7, {"source_timestamp": 7 * 10**9, "publication_sequence_number": 7})
+    assert taken["thumb"] == taken["index"] == [(3, 3.0, 2), (5, 5.0, 1), (6, 6.0, 0), (7, 7.0, 0)]
+    for taker in takers:
+        listener.leave(taker)
+    listener.receive(8, {"source_timestamp": 8 * 10**9})
+    listener.give(takers[0])
+    assert taken["thumb"][-1][0] == 7
+    listener.leave(takers[0])
+    listener.stop()
+    listener.start()  # it is heard anew, and what comes waits again
+    listener.receive(9, {"source_timestamp": 9 * 10**9})
+    listener.give(takers[0])
+    assert taken["thumb"][-1][0] == 9
+
+
+def test_a_topic_that_comes_late_in_a_type_that_cannot_be_read_is_looked_for_on_and_said_once(spinning, monkeypatch):
+    from sensor_msgs.msg import JointState
+
+    from scroll_tactile.ros2 import Listener, listening
+
+    monkeypatch.setattr(listening, "LOOKED", 0.02)
+    node, kinds, warned, looks = spinning.node("hand"), [], [], []
+    monkeypatch.setattr(node, "get_topic_names_and_types", lambda: looks.append(1) or [(TOPIC, kinds)])
+    monkeypatch.setattr(node.get_logger(), "warning", warned.append)
+    listener = Listener(node, TOPIC)
+    for kinds[:] in (["std_msgs/msg/String", "sensor_msgs/msg/JointState"], ["sr_robot_msgs/msg/BiotacAll"]):
+        looks.clear()
+        spinning.until(lambda: len(looks) > 3)
+        assert listener.subscription is None
+    assert len(warned) == 2 and "say which" in warned[0] and "sr-robot-msgs" in warned[1]
+    kinds[:] = ["sensor_msgs/msg/JointState"]
+    spinning.until(lambda: listener.subscription is not None)
+    assert listener.kind == "sensor_msgs/msg/JointState" and listener.subscription.msg_type is JointState
+
+
 def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
     pytest.importorskip("rclpy")
     from rclpy.qos import qos_profile_sensor_data
@@ -167,7 +212,7 @@ def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
         Listener(node, TOPIC, quality=Quality(reliability="perfect"))
     listener = Listener(node, TOPIC, "sensor_msgs/msg/JointState", Quality(reliability="reliable", depth=7))
     spinning.node("driver").create_publisher(JointState, TOPIC, qos_profile_sensor_data)
-    spinning.until(lambda: "qos asks for reliability reliable, and they promise less" in listener.absent())
+    spinning.until(lambda: "qos asks for reliability reliable, and less is promised" in listener.absent())
 
 
 def test_answers_fill_the_message_package_of_the_examples(monkeypatch):

@@ -166,6 +166,31 @@ def test_a_topic_that_never_comes_is_said_with_those_nearest(spinning, learner):
     spinning.until(lambda: f"nearest is {TOPIC!r}" in served.listener.absent())
 
 
+def test_fingers_of_a_node_have_one_risk_and_scene_until_the_last_is_closed(spinning, learner):
+    node = spinning.node("hand")
+    kind = "sensor_msgs/msg/JointState"
+
+    def finger(name, **how):
+        return TactileNode(node, learner, TOPIC, "position", kind=kind, finger=name, active=False, **how)
+
+    with pytest.raises(errors.InputError, match="never observed"):
+        finger("thumb", scene=["zinc"])
+    assert not node.has_parameter("scene")
+    fingers = [finger("thumb", risk=0.02, scene=["a", "b"]), finger("index"), finger("ring", risk=0.02, scene=["b, a"])]
+    with pytest.raises(errors.InputError, match=r"risk as 0.02 already.*came risk=0.05: leave it out"):
+        finger("little", risk=0.05)
+    with pytest.raises(errors.InputError, match=r"came scene=\['c'\]"):
+        finger("little", scene=["c"])
+    for each in fingers:
+        assert each.bridge._how["risk"] == 0.02 and sorted(each.bridge._how["scene"]) == ["a", "b"]
+        assert node.get_parameter("risk").value == 0.02
+        each.close()
+    assert not any(map(node.has_parameter, ("risk", "scene", "health_after")))
+    again = finger("thumb", risk=0.1)
+    assert again.bridge._how["risk"] == 0.1
+    again.close()
+
+
 def test_no_topic_of_its_own_is_named_as_the_nearest(spinning, learner):
     node = spinning.node("scroll_tactile")
     served = TactileNode(node, learner, "/rh/tactile", "position", kind="sensor_msgs/msg/JointState")
@@ -178,7 +203,7 @@ def test_a_topic_that_comes_late_is_silent_from_then_on(spinning, learner):
     served.listener.received -= 100  # it waited that long
     spinning.node("finger").create_publisher(JointState, "/finger/late", 10)
     spinning.until(lambda: served.listener.subscription is not None)
-    assert "no reading for 0 s from the 1 publishers of /finger/late" in served.listener.absent()
+    assert "no reading for 0 s from the publisher of /finger/late" in served.listener.absent()
 
 
 def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
@@ -194,8 +219,9 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
         client = arm.create_client(AddDiagnostics, "/left/scroll_tactile/learn")
         spinning.until(client.service_is_ready, 60)
         assert f"is being written by process {process.pid}" in refused(*words)
-        with publishing(500, 250):
-            spinning.until(lambda: sum(answer["event"] == "ended" for answer in ended) == 2, 60)
+        with publishing(500, 250) as publisher:
+            spinning.silent_after(publisher)
+        assert sum(answer["event"] == "ended" for answer in ended) == 2
         assert spinning.call(arm, "/left/scroll_tactile/learn", "felt").success
         output = ended_by_ctrl_c(process)
     assert "4 materials" in output and "readings: 500" in output

@@ -92,6 +92,27 @@ def test_a_memory_shows_what_it_keeps_and_says(folder, tmp_path, started):
     assert "17 touches of 3 materials" in found["/hand/about"][-1].values["TextDocument:text"][0]
 
 
+def test_names_of_a_memory_are_plain_text_to_the_viewer(tmp_path, started):
+    sensor = PAD.model_copy(update={"name": "x ![p](http://127.0.0.1/leak.png)"})
+    with TactileLearner.open(tmp_path / "memory", sensor=sensor, embedding=SMALL) as learner:
+        learner.observe("a", slide("a", 50, np.random.default_rng(1)))
+    assert started(tmp_path / "memory", out=tmp_path / "m.rrd")[0] == 0
+    (kind,) = {row.values["TextDocument:media_type"][0] for row in rows(tmp_path / "m.rrd")["/about"]}
+    assert kind == "text/plain"
+
+
+def test_a_touch_that_is_of_two_materials_counts_with_each(tmp_path, started):
+    touch = slide("a", 50, np.random.default_rng(1))
+    with TactileLearner.open(tmp_path / "memory", sensor=PAD, embedding=SMALL) as learner:
+        for name in "aab":
+            learner.observe(name, touch, again=True)
+    assert started(tmp_path / "memory", out=tmp_path / "m.rrd")[0] == 0
+    found = rows(tmp_path / "m.rrd")
+    assert scalars(found, "/count/a", "observation") == [(1, [1.0]), (2, [2.0])]
+    assert scalars(found, "/count/b", "observation") == [(3, [1.0])]
+    assert {row.times["observation"] for row in found["/touches/a"]} <= {1, 2}
+
+
 def test_a_recording_shows_the_answers_of_a_live_session(folder, tmp_path, started):
     assert started(folder / "shift.npy", SCROLL_TACTILE_MEMORY=str(folder / "memory"), out=tmp_path / "r.rrd")[0] == 0
     found = rows(tmp_path / "r.rrd")

@@ -218,6 +218,31 @@ def test_readings_of_another_sensor_are_left_alone_before_they_are_read(folder, 
     assert end.value.code == 1 and "damaged.npy" in capsys.readouterr().err
 
 
+def test_files_of_others_are_left_alone_where_the_environment_names_a_memory(folder, tmp_path, started):
+    (tmp_path / "names.csv").write_text("name,age\nbob,3\n")
+    (tmp_path / "letter.csv").write_text("dear sir,\nhello you\nx,y,z,w\n")
+    np.save(tmp_path / "objects.npy", np.array([{}, 1], object), allow_pickle=True)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "metadata.yaml").write_text("hello: 1\n")
+    memory = str(folder / "memory")
+    for name in ("names.csv", "letter.csv", "objects.npy", "site"):
+        code, size, _ = started(tmp_path / name, "--application-id", name, SCROLL_TACTILE_MEMORY=memory)
+        assert (code, size) == (importer.INCOMPATIBLE, 0), name
+    assert started(tmp_path / "letter.csv", "--memory", memory)[0] == 1
+
+
+def test_an_option_that_there_is_not_is_an_error_by_hand(folder, started):
+    code, size, error = started(folder / "shift.npy", "--memroy", folder / "memory")
+    assert (code, size) == (2, 0) and "came --memroy" in error
+
+
+def test_a_recording_that_lies_in_a_memorys_folder_is_shown_by_itself(folder, tmp_path, started):
+    shutil.copytree(folder / "memory", tmp_path / "memory")
+    np.save(tmp_path / "memory" / "mine.npy", slide("a", 50, np.random.default_rng(7)))
+    code, size, error = started(tmp_path / "memory" / "mine.npy", "--memory", folder / "memory")
+    assert (code, error) == (0, "") and size > 0
+
+
 def test_a_damaged_memory_is_an_error_that_says_so(folder, tmp_path, started):
     shutil.copytree(folder / "memory", tmp_path / "memory")
     log = next((tmp_path / "memory").glob("log-*"))

@@ -108,9 +108,9 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
     fitted in parts, in any order, is the same as one that was fitted at once, if it was given a sensor: without one the
     range is that of the first part, and the rest is read within it.
 
-    Raises InputError for labels that do not fit the touches, or are of another kind than those before, ValueError for missing or fractional labels and for tables
-    of another width, TypeError for sparse ones, StreamError for touches that do not fit the sensor,
-    NotFittedError for predictions before anything was fitted.
+    Raises InputError for labels that do not fit the touches, or are of another kind than those before, ValueError for
+    missing or fractional labels and for tables of another width, TypeError for sparse ones, StreamError for touches
+    that do not fit the sensor, NotFittedError for predictions before anything was fitted.
     """
 
     def fit(self, X: Touches, y: Labels) -> Self:

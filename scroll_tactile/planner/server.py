@@ -10,19 +10,17 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from scroll_tactile import __version__
-from scroll_tactile.errors import InputError, ObservationError, ScrollTactileError
+from scroll_tactile.errors import ObservationError, ScrollTactileError
 from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
-from scroll_tactile.planner.served import Served
+from scroll_tactile.planner.served import Columns, File, Place, Readings, Served, Topic
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.signals.stream import Stream
 from store import StoreError
 
 __all__ = ["serve"]
 
-MOST_VALUES = 2**20  # numbers in the readings of one call: a minute of 100 channels at 170 Hz
 RANKED = 10  # materials of an answer
 FEW = 6  # touches: with fewer, each more of a material makes its answers clearly better
 LISTED = 200  # materials, of which all is told at once
@@ -31,13 +29,6 @@ INSTRUCTIONS = (
     "known is false it never felt this, and material is only the nearest; where known is null it cannot tell yet."
 )
 
-Readings = Annotated[
-    list[list[float]] | None, Field(description="Rows of one touch in time, each with the sensor's channels.")
-]
-File = Annotated[str | None, Field(description="In place of readings: a recording in the served folder, by its path.")]
-Topic = Annotated[str | None, Field(description="Of a file with several topics: the one to read.")]
-Place = Annotated[str | None, Field(description="Of a file with several fields: the one to read.")]
-Columns = Annotated[str | None, Field(description="Of a file with more channels: those to take, such as 0:2.")]
 Material = Annotated[str, Field(max_length=1000)]
 
 
@@ -93,7 +84,7 @@ class _Tools:
         scene: list[Material] | None = None,
     ) -> dict[str, Any]:
         """Say of which material a touch is. scene: the materials that can be there; without it all that are known."""
-        touch = self._touch(readings, file, topic, field, columns)
+        touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
         answer = self.learner.predict(touch, scene=scene)
         found: dict[str, Any] = {**answer.as_json(), "seconds": answer.seconds, "unlike": answer.unusual}
         found["ranking"] = {name: round(chance, 6) for name, chance in answer.ranking[:RANKED]}
@@ -141,23 +132,15 @@ class _Tools:
         columns: Columns = None,
     ) -> dict[str, Any]:
         """Learn that a touch is of this material, durably. Of what it had already nothing is learned twice."""
-        receipt = self.learner.observe(material, self._touch(readings, file, topic, field, columns), source=file)
+        touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
+        receipt = self.learner.observe(material, touch, source=file)
         return {"observation": receipt.sequence, "material": receipt.material, "repeated": receipt.repeated}
 
     def retract(self, observation: int) -> dict[str, Any]:
         """Take an observation out of the memory again, by the number that observe gave; as if it had never been."""
         if all(row.sequence != observation for row in self.learner.observations()):  # adaptations have numbers, too
-            raise ObservationError(f"expected the number that observe gave; came {observation}, which no observation has")
+            raise ObservationError(
+                f"expected the number that observe gave; came {observation}, which no observation has"
+            )
         self.learner.retract(observation)
         return {"retracted": observation}
-
-    def _touch(self, readings: list[list[float]] | None, file: str | None, *where: str | None) -> Stream:
-        """The touch, of the memory's sensor. where: topic, field and columns of a file. Raises InputError and what
-        `Served.touch` and `stream` raise."""
-        if (readings is None) == (file is None) or (file is None and any(where)):
-            raise InputError("expected readings or a file, one of them; topic, field and columns are of a file")
-        if readings is not None:
-            if sum(map(len, readings)) > MOST_VALUES:
-                raise InputError(f"expected at most {MOST_VALUES} numbers in a touch; cut it, or name a file")
-            return self.learner.stream(readings)
-        return self.learner.stream(self.served.touch(str(file), self.learner.sensor, *where))

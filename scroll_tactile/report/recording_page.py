@@ -100,7 +100,11 @@ def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Record
             raise
     first = contents.entries[0]
     chosen = chosen | {"topic": first.topic, "field": first.field}
-    return read(path, **chosen), chosen, f" It is the first of {len(contents.entries)} below; --topic and --field choose another."
+    return (
+        read(path, **chosen),
+        chosen,
+        f" It is the first of {len(contents.entries)} below; --topic and --field choose another.",
+    )
 
 
 def _shape(recording: Recording) -> str:

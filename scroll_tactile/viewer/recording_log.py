@@ -80,8 +80,9 @@ def log_recording(
     """Play a recording to a learner, as a live session, and write what it meets to a stream of Rerun.
 
     Its touches are its episodes, or the contacts that are found after two seconds at rest. Where there are neither, one
-    of at most a minute is one touch from end to end, and of a longer one there are the readings. learner: of the readings' sensor; an empty one finds contacts.
-    risk: as for `TactileLearner.live`.
+    of at most a minute is one touch from end to end, and of a longer one there are the readings.
+
+    learner: of the readings' sensor; an empty one finds contacts. risk: as for `TactileLearner.live`.
     """
     log = TouchLog(stream, learner.sensor, prefix)
     play = _Play(log, learner, recording, risk)

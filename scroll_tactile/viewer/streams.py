@@ -85,7 +85,9 @@ def _finish(stream: Any, target: str) -> None:
     except (RuntimeError, ValueError) as error:
         rerun().unregister_shutdown()  # which would wait without end for what cannot be sent
         what = "its disk may be full" if target.endswith(".rrd") else "the viewer went away, or stands still"
-        raise InputError(f"expected {target} to take all that was to be shown; {what} ({error}): start it again") from None
+        raise InputError(
+            f"expected {target} to take all that was to be shown; {what} ({error}): start it again"
+        ) from None
 
 
 def _require_viewer(address: str) -> None:

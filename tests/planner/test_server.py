@@ -177,7 +177,7 @@ def test_it_answers_from_the_memory_as_it_is_by_now_and_retracts_observations_al
 
 
 def test_a_call_is_bounded(folder, monkeypatch):
-    monkeypatch.setattr(server, "MOST_VALUES", 10)
+    monkeypatch.setattr(served, "MOST_VALUES", 10)
     monkeypatch.setattr(served, "LARGEST", 10)
     with TactileLearner.open(folder / "memory", mode="read") as learner:
         tools = server._Tools(learner, served.Served(folder / "files"))

@@ -108,9 +108,9 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
     fitted in parts, in any order, is the same as one that was fitted at once, if it was given a sensor: without one the
     range is that of the first part, and the rest is read within it.
 
-    Raises InputError for labels that do not fit the touches, ValueError for missing or fractional labels and for tables
-    of another width, TypeError for sparse ones, StreamError for touches that do not fit the sensor,
-    NotFittedError for predictions before anything was fitted.
+    Raises InputError for labels that do not fit the touches, or are of another kind than those before, ValueError for
+    missing or fractional labels and for tables of another width, TypeError for sparse ones, StreamError for touches
+    that do not fit the sensor, NotFittedError for predictions before anything was fitted.
     """
 
     def fit(self, X: Touches, y: Labels) -> Self:
@@ -130,12 +130,13 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
             )
         if learner is None:
             learner = self._empty_learner(touches)
+        before = getattr(self, "classes_", labels[:0])
+        classes_ = _joined(before, labels)
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):
             learner.observe(str(label), stream, again=True)  # a row that comes twice weighs twice
-        before, self.learner_ = getattr(self, "classes_", labels[:0]), learner
+        self.learner_, self.classes_ = learner, classes_
         self.n_features_in_ = getattr(self, "n_features_in_", learner.sensor.channels)
-        self.classes_ = np.unique(np.concatenate([before, labels]))
         return self
 
     def predict(self, X: Touches) -> npt.NDArray[Any]:
@@ -215,6 +216,17 @@ def _labels(y: Labels) -> npt.NDArray[Any]:
         raise InputError("expected a label for each touch; came NaN among y")
     check_classification_targets(labels)
     return labels
+
+
+def _joined(before: npt.NDArray[Any], labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """All labels, sorted. Raises InputError where they are called otherwise together than alone, as 1 is beside 1.0."""
+    together = np.unique(np.concatenate([before, labels]))
+    if not {*map(str, before), *map(str, labels)} == {*map(str, together)}:
+        raise InputError(
+            f"expected labels of the kind that came first, {before.dtype}; came {labels.dtype}: convert them with "
+            "y.astype(classifier.classes_.dtype)"
+        )
+    return together
 
 
 def _sensor_of(touches: Sequence[npt.NDArray[Any]]) -> Sensor:

@@ -198,3 +198,13 @@ class TestRegressor:
             fitted.predict(X[:1])
         with pytest.raises(NotFittedError):
             TactileRegressor().predict(X)
+
+
+def test_a_part_with_labels_of_another_kind_is_refused_before_it_is_observed():
+    X, classifier = touches(2)[0], make()
+    classifier.partial_fit(X[:4], [0, 0, 1, 1])
+    with pytest.raises(InputError, match="came first, int64; came float64"):
+        classifier.partial_fit(X[4:], [1.0, 1.0])
+    assert classifier.learner_.materials == {"0": 2, "1": 2}
+    assert classifier.predict_proba(X[:1]).shape == (1, 2)
+    assert classifier.partial_fit(X[4:5], [7]).classes_.tolist() == [0, 1, 7]

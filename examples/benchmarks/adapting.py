@@ -142,6 +142,15 @@ def _sets(data: Path | None, seed: int, only: str | None) -> Iterator[Touches]:
     return (touches for touches in read_sets(data, seed) if only is None or touches.name.startswith(only))
 
 
+def _whole_lines(cache: Path) -> list[Any]:
+    """What was measured before; the last line is taken off where a run was killed as it wrote it."""
+    written = cache.read_bytes()
+    whole = written[: written.rfind(b"\n") + 1]
+    if whole != written:
+        cache.write_bytes(whole)
+    return [text.loads(line) for line in whole.splitlines()]
+
+
 def run_adapting(
     data: Path | None,
     *,
@@ -155,7 +164,7 @@ def run_adapting(
     """A record for each set and case. cache: a file of what was measured already, one line a unit."""
     done: dict[tuple[Any, ...], Record] = {}
     if cache is not None and cache.is_file():
-        done = {tuple(key): value for key, value in map(text.loads, cache.read_text("utf-8").splitlines())}
+        done = {tuple(key): value for key, value in _whole_lines(cache)}
     records = []
     with one_thread(), TemporaryDirectory() as folder:
         for touches in _sets(data, seed, only):

@@ -37,21 +37,32 @@ def checkouts(before: Path | None) -> dict[str, Path]:
 
 
 def write_touches(
-    folder: Path, sensor: Sensor, touches: Iterable[tuple[str, npt.NDArray[np.float32]]], readings: int
+    folder: Path,
+    sensor: Sensor,
+    touches: Iterable[tuple[str, npt.NDArray[np.float32]]],
+    readings: int,
+    **made: int,
 ) -> Path:
     """Touches, of so many readings each, into a folder from which a worker reads them one by one.
 
-    What an earlier run wrote there is taken as it is: it is described last.
+    What an earlier run wrote there is taken as it is: it is described last. made: by what they differ from others of
+    this sensor, such as the seed. Raises InputError where an earlier run made others.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    described = {"sensor": sensor.model_dump(exclude_defaults=True), "readings": readings, "made": made}
     if (folder / "touches.json").exists():
+        before = json.loads((folder / "touches.json").read_text())
+        if before != json.loads(json.dumps(described)):
+            raise InputError(
+                f"expected touches in {folder} made with {made}; came those of another run, {before.get('made')}: go "
+                "on with its options, or give another folder"
+            )
         return folder
     with (folder / "readings").open("wb") as values, (folder / "materials").open("wb") as names:
         for name, touch in touches:
             assert touch.shape == (readings, sensor.channels)
             values.write(np.ascontiguousarray(touch, np.float32).tobytes())
             names.write(name.encode().ljust(NAME_BYTES, b"\0"))
-    described = {"sensor": sensor.model_dump(exclude_defaults=True), "readings": readings}
     (folder / "touches.json").write_text(json.dumps(described))
     return folder
 

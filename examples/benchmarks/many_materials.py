@@ -40,12 +40,14 @@ def run_many(bench: Bench, sides: Sides, materials: int) -> None:
     asked = min(200, materials)
     bench.note(f"{memory}: making the touches")
     made = skin_touches(bench.seed, materials, sizes.each)
-    touches = write_touches(bench.folder / f"skin-{materials}", SKIN, made, SKIN.readings)
+    how = {"seed": bench.seed, "each": sizes.each}
+    touches = write_touches(bench.folder / f"skin-{materials}", SKIN, made, SKIN.readings, **how)
     few = write_touches(
         bench.folder / f"few-{materials}",
         SKIN,
         [(name, skin_touch(bench.seed, int(name[1:]), i)) for i in range(sizes.each) for name in scene],
         SKIN.readings,
+        **how,
     )
     paths = {name: bench.folder / f"{name}-{materials}" for name in sides}
     alone = {name: bench.folder / f"{name}-alone-{materials}" for name in sides}

@@ -131,7 +131,9 @@ def report(
 
         cut = None if labels is None else read_intervals(labels)
         whose = None if sensor is None else read_sensor(sensor)
-        html = recording_page(source, sensor=whose, intervals=cut, **chosen)
+        words = {"sensor": sensor, "labels": None if labels is None else str(labels)}
+        came_by = {name: word for name, word in words.items() if word is not None}
+        html = recording_page(source, sensor=whose, intervals=cut, given=came_by, **chosen)
     save(html, page)
     say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")
 

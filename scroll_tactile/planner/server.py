@@ -10,20 +10,17 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from scroll_tactile import __version__
-from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.errors import ObservationError, ScrollTactileError
 from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
-from scroll_tactile.recordings import read
+from scroll_tactile.planner.served import Columns, File, Place, Readings, Served, Topic
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.signals.stream import Stream
 from store import StoreError
 
 __all__ = ["serve"]
 
-MOST_VALUES = 2**20  # numbers in the readings of one call: a minute of 100 channels at 170 Hz
-LARGEST_FILE = 2**28  # bytes
 RANKED = 10  # materials of an answer
 FEW = 6  # touches: with fewer, each more of a material makes its answers clearly better
 LISTED = 200  # materials, of which all is told at once
@@ -32,10 +29,6 @@ INSTRUCTIONS = (
     "known is false it never felt this, and material is only the nearest; where known is null it cannot tell yet."
 )
 
-Readings = Annotated[
-    list[list[float]] | None, Field(description="Rows of one touch in time, each with the sensor's channels.")
-]
-File = Annotated[str | None, Field(description="In place of readings: a recording in the served folder.")]
 Material = Annotated[str, Field(max_length=1000)]
 
 
@@ -48,25 +41,24 @@ def serve(learner: TactileLearner, *, learn: bool = False, files: Path | None = 
     with optional("mcp", "mcp", "serving a memory to planners"):
         from mcp.server import MCPServer
         from mcp.server.mcpserver.exceptions import ToolError
-    if files is not None and not files.is_dir():
-        raise InputError(f"expected a folder of recordings as files={str(files)!r}; there is none")
-    tools = _Tools(learner, files)
+    tools = _Tools(learner, Served(files))
     server = MCPServer("scroll-tactile", instructions=INSTRUCTIONS, version=__version__, log_level="WARNING")
     offered: list[Callable[..., Any]] = [tools.what_is_felt, tools.what_is_known, tools.what_to_touch_again]
     for tool in [*offered, tools.observe, tools.retract] if learn else offered:
-        server.add_tool(_explained(tool, ToolError))
+        server.add_tool(_explained(tools, tool, ToolError))
     server.run("stdio")
 
 
-def _explained(tool: Any, as_error: type[Exception]) -> Callable[..., Any]:
-    """The tool, whose errors come with what was expected; others would come without a word."""
+def _explained(tools: _Tools, tool: Any, as_error: type[Exception]) -> Callable[..., Any]:
+    """The tool, asked of the memory as it is by now; its errors say what was expected, others would say nothing."""
 
     @functools.wraps(tool)
     def explained(*values: Any, **named: Any) -> Any:
         try:
+            tools.learner.refresh()  # a client keeps its server for days, and others may learn meanwhile
             return tool(*values, **named)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
-            raise as_error(str(error) or type(error).__name__) from error
+            raise as_error(tools.told(str(error)) or type(error).__name__) from error
 
     return explained
 
@@ -74,24 +66,35 @@ def _explained(tool: Any, as_error: type[Exception]) -> Callable[..., Any]:
 class _Tools:
     """What a planner can ask; names, docstrings and types are what it reads."""
 
-    def __init__(self, learner: TactileLearner, files: Path | None) -> None:
-        self._learner, self._files = learner, None if files is None else files.resolve()
+    def __init__(self, learner: TactileLearner, served: Served) -> None:
+        self.learner, self.served = learner, served
+
+    def told(self, text: str) -> str:
+        """An error's text without the paths of this machine."""
+        path = self.learner.path
+        return self.served.told(text if path is None else text.replace(str(path), "the memory"))
 
     def what_is_felt(
-        self, readings: Readings = None, file: File = None, scene: list[Material] | None = None
+        self,
+        readings: Readings = None,
+        file: File = None,
+        topic: Topic = None,
+        field: Place = None,
+        columns: Columns = None,
+        scene: list[Material] | None = None,
     ) -> dict[str, Any]:
         """Say of which material a touch is. scene: the materials that can be there; without it all that are known."""
-        touch = self._touch(readings, file)
-        answer = self._learner.predict(touch, scene=scene)
+        touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
+        answer = self.learner.predict(touch, scene=scene)
         found: dict[str, Any] = {**answer.as_json(), "seconds": answer.seconds, "unlike": answer.unusual}
         found["ranking"] = {name: round(chance, 6) for name, chance in answer.ranking[:RANKED]}
-        if self._learner.quantities:
-            found["quantities"] = {name: own.as_json() for name, own in self._learner.estimate(touch).items()}
+        if self.learner.quantities:
+            found["quantities"] = {name: own.as_json() for name, own in self.learner.estimate(touch).items()}
         return found
 
     def what_is_known(self, material: Material | None = None) -> dict[str, Any]:
         """Say what the memory knows: its sensor, materials with their touches, what they are made of; or of one."""
-        learner = self._learner
+        learner = self.learner
         counts, described = learner.materials, learner.descriptions
         if material is not None:
             return {"touches": counts.get(material, 0), "description": described.get(material)}
@@ -109,7 +112,7 @@ class _Tools:
 
     def what_to_touch_again(self, most: Annotated[int, Field(ge=1, le=LISTED)] = 10) -> list[dict[str, Any]]:
         """Say which materials are worth touching again, and why: mixed up with others, or hardly touched."""
-        facts = MemoryFacts(self._learner, risk=0.05)
+        facts = MemoryFacts(self.learner, risk=0.05)
         why: dict[str, list[str]] = {}
         for one in facts.mistakes:
             said = f"{one.count} of {one.tested} of its touches, held out, were taken for {one.answer}"
@@ -119,33 +122,25 @@ class _Tools:
                 why.setdefault(name, []).append(f"touched {count} times only")
         return [{"material": name, "touches": facts.counts[name], "why": each} for name, each in why.items()][:most]
 
-    def observe(self, material: Material, readings: Readings = None, file: File = None) -> dict[str, Any]:
+    def observe(
+        self,
+        material: Material,
+        readings: Readings = None,
+        file: File = None,
+        topic: Topic = None,
+        field: Place = None,
+        columns: Columns = None,
+    ) -> dict[str, Any]:
         """Learn that a touch is of this material, durably. Of what it had already nothing is learned twice."""
-        receipt = self._learner.observe(material, self._touch(readings, file), source=file)
+        touch = self.learner.stream(self.served.touch(self.learner.sensor, readings, file, topic, field, columns))
+        receipt = self.learner.observe(material, touch, source=file)
         return {"observation": receipt.sequence, "material": receipt.material, "repeated": receipt.repeated}
 
     def retract(self, observation: int) -> dict[str, Any]:
         """Take an observation out of the memory again, by the number that observe gave; as if it had never been."""
-        self._learner.retract(observation)
-        return {"retracted": observation}
-
-    def _touch(self, readings: list[list[float]] | None, file: str | None) -> Stream:
-        """The touch, of the memory's sensor. Raises InputError and what `read` and `stream` raise."""
-        if (readings is None) == (file is None):
-            raise InputError("expected readings or a file, one of them")
-        if readings is not None:
-            if sum(map(len, readings)) > MOST_VALUES:
-                raise InputError(f"expected at most {MOST_VALUES} numbers in a touch; cut it, or name a file")
-            return self._learner.stream(readings)
-        return self._learner.stream(read(self._place(str(file))).stream(self._learner.sensor))
-
-    def _place(self, file: str) -> Path:
-        """A file in the served folder, wherever its links lead. Raises InputError for any other."""
-        if self._files is None:
-            raise InputError("no folder of recordings is served: start with --files FOLDER, or give readings")
-        place = self._files if "\0" in file else (self._files / file).resolve()
-        if not place.is_relative_to(self._files) or not place.is_file() or place.stat().st_size > LARGEST_FILE:
-            raise InputError(
-                f"expected a file in the served folder, of at most {LARGEST_FILE >> 20} MB; came {file!r:.80}"
+        if all(row.sequence != observation for row in self.learner.observations()):  # adaptations have numbers, too
+            raise ObservationError(
+                f"expected the number that observe gave; came {observation}, which no observation has"
             )
-        return place
+        self.learner.retract(observation)
+        return {"retracted": observation}

@@ -205,9 +205,9 @@ def _against_truth(head: RegressionHead, heads: Heads, risk: float, unit: str, o
         for name in sorted(set(heads.materials))
         if (mine := np.array(heads.materials) == name).any()
     ]
-    width = "unbounded: there are too few touches" if np.isinf(half) else f"{2 * half:.3g} {shown(unit)} wide"
+    width = "unbounded: there are too few touches" if np.isinf(half) else f"{2 * half:.3g} {unit} wide"
     caption = (
-        f"{len(off)} sampled touches, {of}: off by {off.mean():.3g} {shown(unit)} on average. Intervals that "
+        f"{len(off)} sampled touches, {of}: off by {off.mean():.3g} {unit} on average. Intervals that "
         f"are to hold {1 - risk:.0%} are {width}."
     )
     said = heads.targets - head.residuals

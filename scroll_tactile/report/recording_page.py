@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from os import PathLike, fspath
@@ -41,6 +41,7 @@ def recording_page(
     *,
     sensor: Sensor | None = None,
     intervals: Sequence[Interval] | None = None,
+    given: Mapping[str, str] | None = None,
     **chosen: Any,
 ) -> str:
     """One HTML page that shows what a recording holds; it needs no network and no script.
@@ -48,6 +49,7 @@ def recording_page(
     sensor: whose readings they are, which gives channels their range; unless given that of the preset, or of the one
     that the messages' type is of. chosen: topic, field, preset and the others of `read`; where a file has several
     fields and none is named, the first is shown. intervals: of touches in it; unless given its episodes, or contacts.
+    given: for the line that learns it, the name or file of the "sensor", and the file of the intervals, "labels".
 
     Raises what `describe` and `read` raise, ChannelCountError for a sensor of other channels, and InputError for both a
     sensor and a preset.
@@ -55,12 +57,12 @@ def recording_page(
     if sensor is not None and chosen.get("preset") is not None:
         raise InputError("give sensor= or preset=: both say whose readings they are")
     contents = describe(path)
-    recording, why = _read(contents, fspath(path), chosen)
+    recording, chosen, why = _read(contents, fspath(path), chosen)
     whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
     seen = _Seen.of(recording, whose.sensor)
     cut = cut_of(recording, intervals, whose.sensor or (None if seen is None else seen.sensor(recording)))
     spans = [(touch.begin, touch.end) for touch in cut.touches]
-    words = learning(recording, fspath(path), whose, cut, chosen)
+    words = learning(recording, fspath(path), whose, cut, chosen, given or {})
     sections = [
         ("signal", "Signal", side_by_side(_signal(recording, spans), f"<div>{_touches(recording, cut)}{words}</div>")),
         ("channels", "Channels", _channels(seen, whose)),
@@ -89,16 +91,20 @@ def _signal(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
     return figure(trace(recording, spans), words)
 
 
-def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, str]:
-    """The recording, of the requested field or of the first there is; and a sentence on that choice."""
+def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, dict[str, Any], str]:
+    """The recording, of the requested field or of the first there is; how it was read; and a sentence on that."""
     try:
-        return read(path, **chosen), ""
+        return read(path, **chosen), chosen, ""
     except FieldError:
         if any(chosen.get(name) for name in ("topic", "field", "preset")) or not contents.entries:
             raise
     first = contents.entries[0]
-    found = read(path, **chosen | {"topic": first.topic, "field": first.field})
-    return found, f" It is the first of {len(contents.entries)} below; --topic and --field choose another."
+    chosen = chosen | {"topic": first.topic, "field": first.field}
+    return (
+        read(path, **chosen),
+        chosen,
+        f" It is the first of {len(contents.entries)} below; --topic and --field choose another.",
+    )
 
 
 def _shape(recording: Recording) -> str:

@@ -53,8 +53,9 @@ def health_cards(found: Health | None) -> list[Card]:
         return []
     if found.since is None:
         return [("good", "Its sensor is", "the one that learned", f"{found.touches} touches and rest readings fit it.")]
-    what = found.kind if found.kind == "material" else f"another since observation {found.since}"
-    return [("bad" if found.kind == "dead" else "look", "Its sensor is", what, shown(in_words(found)))]
+    own = "the one that learned: a material changed"
+    what = own if found.kind == "material" else f"another since observation {found.since}"
+    return [("bad" if found.kind == "dead" else "look", "Its sensor is", what, in_words(found))]
 
 
 def health_section(found: Health) -> str:
@@ -66,7 +67,7 @@ def health_section(found: Health) -> str:
         f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
         f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on."
     )
-    told = note(f"{shown(in_words(found))}. {shown(advice(found))}") if found.since is not None else ""
+    told = note(f"{in_words(found)}. {advice(found)}") if found.since is not None else ""
     return told + figure(evidence(found.grew, alarm), caption)
 
 

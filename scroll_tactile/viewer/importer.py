@@ -29,13 +29,19 @@ CURRENT, BEGINNING = "CURRENT", b'{"format"'  # a file that every memory's folde
 DEEPEST = 8  # folders between a memory and a file in it; an array's chunks are six deep
 BAGS = (".bag", ".db3", ".mcap")
 FILES = (*BAGS, ".npy", ".csv", ".h5", ".hdf5", ".hdf", ".zarr.zip")
-FOLDERS = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # of ROS 2 bags, LeRobot, Zarr
+METADATA, BAG = "metadata.yaml", b"rosbag2_bagfile_information"  # of a bag of ROS 2, and what that begins with
+FOLDERS = ("meta/info.json", ".zgroup", "zarr.json")  # of LeRobot, Zarr
+OWN = (CURRENT, "lock", "holder.json", "checkpoints", "derived")  # what a store has in its folder, see FORMAT.md
 Kind = str
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Write what a path holds to the standard output, and exit: 0; 66 for what is not ours; 1 after an error."""
-    chosen = _parser().parse_known_args(arguments)[0]
+    """Write what a path holds to the standard output, and exit: 0; 66 for what is not ours; 1 after an error, and 2 for
+    an option that there is not."""
+    parser = _parser()
+    chosen, others = parser.parse_known_args(arguments)  # Rerun may come to give more options than today
+    if others and not (chosen.application_id or chosen.recording_id):
+        parser.error(f"expected the options that --help lists; came {' '.join(others)}")
     memory = chosen.memory or os.environ.get(MEMORY) or None
     named = bool(memory or chosen.topic or chosen.field or chosen.preset)
     kind, chosen.path = _kind(chosen.path, chosen.application_id or "", named)
@@ -79,15 +85,18 @@ def _kind(path: Path, application: str, named: bool) -> tuple[Kind, Path]:
         kind = _folder(folder)
         if (kind in ("memory", "bag") or (kind and named)) and _stem(folder) == application != _stem(path):
             return "inside", folder
-        if kind == "memory":
+        if kind == "memory" and _is_own(path.absolute().relative_to(folder).parts[0]):
             return ("memory", folder) if path.name == CURRENT else ("inside", folder)
     name = path.name.lower()
     return "bag" if name.endswith(BAGS) else "readings" if name.endswith(FILES) else "", path
 
 
 def _folder(path: Path) -> Kind:
-    found = next((name for name in FOLDERS if (path / name).is_file()), None)
-    return "memory" if _is_memory(path) else "" if found is None else "bag" if found == FOLDERS[0] else "readings"
+    if _begins(path / CURRENT, BEGINNING):  # databases have a file of this name, too
+        return "memory"
+    if _begins(path / METADATA, BAG):
+        return "bag"
+    return "readings" if any((path / name).is_file() for name in FOLDERS) else ""
 
 
 def _stem(path: Path) -> str:
@@ -95,22 +104,26 @@ def _stem(path: Path) -> str:
     return path.stem.replace(".", "_")
 
 
-def _is_memory(folder: Path) -> bool:
-    """Whether a folder is a memory's; databases have a file of this name, too."""
-    place = folder / CURRENT
+def _is_own(name: str) -> bool:
+    """Whether this is the name of what a store keeps in its folder."""
+    return name in OWN or name.startswith("log-") or any(end in name for end in (".damaged", ".new", ".partial"))
+
+
+def _begins(place: Path, beginning: bytes) -> bool:
+    """Whether this is a file that begins so."""
     try:
         if not place.is_file():
             return False
         with place.open("rb") as file:
-            return file.read(len(BEGINNING)) == BEGINNING
+            return file.read(len(beginning)) == beginning
     except OSError:
         return False
 
 
 def _import(chosen: argparse.Namespace, kind: Kind, memory: str | None, named: bool) -> int:
     """Write it; returns the exit code. An unsound memory or recording is an error; a recording of another sensor is
-    not."""
-    from scroll_tactile.errors import ChannelCountError, FieldError, ScrollTactileError
+    not, nor is a file of a kind that anybody has, such as a table of names, unless it was opened by hand."""
+    from scroll_tactile.errors import ChannelCountError, FieldError, RecordingError, ScrollTactileError
     from store import StoreError
 
     try:
@@ -123,6 +136,9 @@ def _import(chosen: argparse.Namespace, kind: Kind, memory: str | None, named: b
     except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
         print(f"rerun-importer-scroll-tactile: {error}", file=sys.stderr)
         others = isinstance(error, ChannelCountError | FieldError) and not (chosen.topic or chosen.field)
+        if not (chosen.memory or chosen.topic or chosen.field or chosen.preset):  # the environment names the memory
+            anybodys = chosen.path.is_dir() or chosen.path.suffix.lower() in (".csv", ".npy")
+            others |= kind == "readings" and anybodys and isinstance(error, RecordingError)
         return INCOMPATIBLE if others or (kind == "bag" and not named) else 1
     return 0
 

@@ -12,9 +12,10 @@ from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.matching.likelihood import LEVELS
+from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.prediction.judging import HeldOutTouch
 from scroll_tactile.report.facts import MemoryFacts
-from scroll_tactile.results import Health
+from scroll_tactile.results import Health, Observation
 from scroll_tactile.viewer.streams import entity, layout, rerun
 
 __all__ = ["log_memory"]
@@ -38,7 +39,8 @@ class _MemoryLog:
     def __init__(self, stream: Any, learner: TactileLearner, prefix: str) -> None:
         self.stream, self.learner, self.prefix, self.rr = stream, learner, prefix, rerun()
         self.facts = MemoryFacts(learner, risk=0.05)
-        self.rows = {row.key: row for row in self.facts.journal if row.state != "retracted"}
+        self.learned = [row for row in self.facts.journal if row.state != "retracted"]
+        self.rows = {(row.material, row.key): row for row in self.learned}  # one touch can be of several materials
         most = sorted(self.facts.counts, key=lambda name: (-self.facts.counts[name], name))
         self.names = set(most[:MOST_MATERIALS])
 
@@ -62,20 +64,21 @@ class _MemoryLog:
 
     def _about(self, health: Health | None) -> None:
         facts, sensor = self.facts, self.learner.sensor
-        lines = [f"**{printable(sensor.name)}**, {sensor.channels} channels, {sensor.rate:g} readings a second.", ""]
+        lines = [f"{printable(sensor.name)}, {sensor.channels} channels, {sensor.rate:g} readings a second.", ""]
         lines += [f"{sum(facts.counts.values())} touches of {len(facts.counts)} materials.", ""]
         if health is not None:
             lines += [f"Sensor: {in_words(health, printable)}. {advice(health)}", ""]
         if len(self.names) < len(facts.counts):
             lines += [f"Lines are shown of the {len(self.names)} materials with the most touches.", ""]
         lines += [f"- not shown: {printable(why)}" for why in facts.missing]
-        text = self.rr.TextDocument("\n".join(lines), media_type="text/markdown")
+        # As Markdown a name that came from elsewhere could have the viewer fetch a picture.
+        text = self.rr.TextDocument("\n".join(lines), media_type="text/plain")
         self.stream.log(self._path("about"), text, static=True)
 
     def _counts(self) -> None:
         """How many touches of each material there were after each row."""
         points: dict[str, list[tuple[int, float]]] = {}
-        for row in self.rows.values():
+        for row in self.learned:
             if row.material in self.names:
                 points.setdefault(row.material, []).append((row.sequence, row.time))
         for name, own in points.items():
@@ -91,12 +94,12 @@ class _MemoryLog:
 
     def _kept(self) -> None:
         for place, touch in enumerate(self.facts.kept, start=1):
-            self._at(touch.key, place)
+            self._at(touch, place)
             tensor = self.rr.Tensor(touch.levels, dim_names=("channel", "time"), value_range=(0, LEVELS - 1))
             self.stream.log(self._path("touch"), tensor)
             if touch.material in self.names:
                 self.stream.log(self._path(entity("touches", touch.material)), tensor)
-            row = self.rows.get(touch.key)
+            row = self._row(touch)
             source = "" if row is None or row.source is None else f", from {printable(row.source)}"
             self._event(f"kept: {printable(touch.material)}{source}")
 
@@ -108,8 +111,8 @@ class _MemoryLog:
             return
         place = {touch.key: i for i, touch in enumerate(self.facts.kept, start=1)}
         styled: set[str] = set()
-        for touch in sorted(found, key=lambda touch: (self._row(touch.key, place.get(touch.key, 0)), touch.key)):
-            self._at(touch.key, place.get(touch.key, 0))
+        for touch in sorted(found, key=lambda touch: (self._place(touch, place.get(touch.key, 0)), touch.key)):
+            self._at(touch, place.get(touch.key, 0))
             path = entity("held_out", touch.material)
             if touch.material in self.names:
                 if path not in styled:
@@ -147,15 +150,18 @@ class _MemoryLog:
     def _event(self, text: str, level: str = "INFO") -> None:
         self.stream.log(self._path("events"), self.rr.TextLog(text, level=level))
 
-    def _row(self, key: bytes, place: int) -> int:
+    def _row(self, touch: KeptTouch | HeldOutTouch) -> Observation | None:
+        return self.rows.get((touch.material, touch.key))
+
+    def _place(self, touch: KeptTouch | HeldOutTouch, place: int) -> int:
         """The row of a touch in the journal; where that is not known, its place among the kept ones."""
-        row = self.rows.get(key)
+        row = self._row(touch)
         return place if row is None else row.sequence
 
-    def _at(self, key: bytes, place: int) -> None:
-        row = self.rows.get(key)
+    def _at(self, touch: KeptTouch | HeldOutTouch, place: int) -> None:
+        row = self._row(touch)
         self.stream.reset_time()
-        self.stream.set_time(OBSERVATION, sequence=self._row(key, place))
+        self.stream.set_time(OBSERVATION, sequence=self._place(touch, place))
         if row is not None:
             self.stream.set_time(OBSERVED, timestamp=row.time)
 

@@ -80,16 +80,21 @@ def log_recording(
     """Play a recording to a learner, as a live session, and write what it meets to a stream of Rerun.
 
     Its touches are its episodes, or the contacts that are found after two seconds at rest. Where there are neither, one
-    of at most a minute is one touch from end to end. learner: of the readings' sensor; an empty one finds contacts.
-    risk: as for `TactileLearner.live`.
+    of at most a minute is one touch from end to end, and of a longer one there are the readings.
+
+    learner: of the readings' sensor; an empty one finds contacts. risk: as for `TactileLearner.live`.
     """
     log = TouchLog(stream, learner.sensor, prefix)
     play = _Play(log, learner, recording, risk)
     if recording.episodes:
         for episode in recording.episodes:
             play.touch(episode.begin, episode.end, episode.name or "no name")
-    elif len(recording) and not play.contacts() and play.seconds <= LONGEST:
-        play.touch(0, len(recording), "no contact was found; all of it as one touch", again=True)
+    elif len(recording):
+        found = play.contacts()
+        if not found and play.seconds <= LONGEST:
+            play.touch(0, len(recording), "no contact was found; all of it as one touch", again=found is not None)
+        elif found is None:
+            play.readings()
     log.close()
 
 
@@ -109,17 +114,22 @@ class _Play:
         self.seconds = float(self.times[-1] - self.times[0]) if len(recording) else 0.0
         self.lacking = 0
 
-    def contacts(self) -> int:
-        """Find contacts; returns how many were touches."""
+    def contacts(self) -> int | None:
+        """Find contacts; returns how many were touches, and None where none can be found: then nothing was logged."""
         try:
             session = self.learner.live(risk=self.risk)
         except InputError as error:  # an embedding to which every frame of a camera counts
             self.log.event(str(error), float(self.times[0]), "WARN")
-            return 0
+            return None
         with session:
             self._push(session, 0, len(self.rows))
         self.log.show(LiveState(), float(self.times[-1]))
         return session.report.touches
+
+    def readings(self) -> None:
+        """The readings alone."""
+        for row, at in zip(self.rows, self.times.tolist(), strict=True):
+            self.log.take(row, at)
 
     def touch(self, begin: int, end: int, name: str, *, again: bool = False) -> None:
         """Take readings [begin, end) as one touch. again: they were logged before."""

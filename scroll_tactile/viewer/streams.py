@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import socket
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,6 +21,9 @@ VIEWER = "viewer"  # what names the one that runs on this machine
 ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
 View = tuple[str, str, str]  # its kind, its name, and the path of what it shows; of kind "Share" lines from 0 to 1
 ANSWERS_WITHIN = 2.0  # seconds: a viewer that is there takes milliseconds
+TAKEN_WITHIN = 10.0  # seconds, of what was written and is still under way
+HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # of HTTP/2 (RFC 9113, 3.4): no settings
+SETTINGS = 4  # the kind of the frame that answers it
 
 
 def rerun() -> Any:
@@ -40,14 +43,12 @@ def stream_to(target: str) -> Iterator[Any]:
     """A stream of Rerun to a viewer or into a file, closed in the end.
 
     target: "viewer", the one on this machine; the address of another, such as rerun+http://robot:9876/proxy; or a new
-    file that ends with .rrd. Raises InputError for anything else, for a viewer that does not answer and for a file that
-    is there; MissingLibraryError.
+    file that ends with .rrd. Raises InputError for anything else, for a viewer that does not answer or goes away
+    meanwhile and for a file that is there; MissingLibraryError.
     """
     stream = rerun().RecordingStream(APPLICATION)
     if target == VIEWER or target.startswith(("rerun://", "rerun+http://", "rerun+https://")):
-        address = ADDRESS if target == VIEWER else target
-        _require_viewer(address)
-        stream.connect_grpc(address)
+        _connect(stream, ADDRESS if target == VIEWER else target)
     elif target.endswith(".rrd"):
         if Path(target).exists() or not Path(target).parent.is_dir():
             why = "is there already" if Path(target).exists() else "has no folder"
@@ -57,17 +58,50 @@ def stream_to(target: str) -> Iterator[Any]:
         raise InputError(f"expected 'viewer', the address of one, or a file that ends with .rrd; came {target!r:.80}")
     try:
         yield stream
-        stream.flush()
-    finally:
+    except BaseException:
+        with suppress(InputError):
+            _finish(stream, target)
+        raise
+    _finish(stream, target)
+
+
+def _connect(stream: Any, address: str) -> None:
+    """To a viewer. Raises InputError for an address that is none, and where none answers."""
+    _require_viewer(address)
+    try:
+        stream.connect_grpc(address)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"expected the address of a viewer, such as rerun+http://robot:9876/proxy, with /proxy at its end; came "
+            f"{address!r:.80} ({error})"
+        ) from None
+
+
+def _finish(stream: Any, target: str) -> None:
+    """Have all that was written taken, and close. Raises InputError where a viewer, or a disk, takes no more."""
+    try:
+        stream.flush(timeout_sec=TAKEN_WITHIN)
         stream.disconnect()
+    except (RuntimeError, ValueError) as error:
+        rerun().unregister_shutdown()  # which would wait without end for what cannot be sent
+        what = "its disk may be full" if target.endswith(".rrd") else "the viewer went away, or stands still"
+        raise InputError(
+            f"expected {target} to take all that was to be shown; {what} ({error}): start it again"
+        ) from None
 
 
 def _require_viewer(address: str) -> None:
-    """Raise InputError where nothing listens: the SDK tries for ever, and says so nowhere."""
-    parts = urlsplit(address)
+    """Raise InputError where none answers: the SDK tries for ever, and says so nowhere. One that is reached through TLS
+    is not asked."""
     try:
+        parts = urlsplit(address)
         place = parts.hostname or "127.0.0.1", parts.port or 9876
-        socket.create_connection(place, timeout=ANSWERS_WITHIN).close()
+        with socket.create_connection(place, timeout=ANSWERS_WITHIN) as asked:
+            if parts.scheme == "rerun+http":
+                asked.sendall(HELLO)
+                answer = asked.recv(9)
+                if answer[3:4] != bytes([SETTINGS]):
+                    raise OSError("what listens there is none")
     except (OSError, ValueError) as error:
         raise InputError(
             f"no viewer answers at {address} ({error}): start `rerun` there first, or give a file that ends with .rrd"

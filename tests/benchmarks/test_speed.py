@@ -15,6 +15,7 @@ from commands import refused, run
 import scroll_tactile
 from examples.benchmarks import checkouts as sides_of
 from examples.benchmarks import many_materials, speed
+from examples.benchmarks.adapting import _whole_lines
 from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.speed_bench import Sizes
@@ -135,6 +136,21 @@ def test_a_process_that_ended_without_a_close_left_what_it_acknowledged(without_
             assert worker.memory() <= worker.memory("peak")
     assert disk_bytes(tmp_path / "memory") > disk_bytes(tmp_path / "memory", "log-*") > 3 * 100 * 8
     assert READ_BYTES == NAME_BYTES
+
+
+def test_touches_of_another_seed_are_not_taken_for_ones_own(tmp_path):
+    made = [("m0", speed.np.zeros((100, 8), "float32"))]
+    for _ in range(2):
+        write_touches(tmp_path / "touches", SKIN, made, 100, seed=0, each=1)
+    for other in ({"seed": 1, "each": 1}, {"seed": 0, "each": 2}):
+        with pytest.raises(InputError, match="give another folder"):
+            write_touches(tmp_path / "touches", SKIN, made, 100, **other)
+
+
+def test_what_was_measured_is_found_again_up_to_a_line_that_was_cut(tmp_path):
+    (tmp_path / "cache").write_text('[["a", 1], {}]\n[["b", 2]')
+    assert _whole_lines(tmp_path / "cache") == [[["a", 1], {}]]
+    assert (tmp_path / "cache").read_text() == '[["a", 1], {}]\n'
 
 
 def test_the_command_measures_prints_and_writes_it(tmp_path, monkeypatch, measured):

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from commands import refused
 from live_touches import slide
+from robot_sets import FIELD, robot_set
 from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner
-from scroll_tactile.errors import InputError
-from scroll_tactile.planner import server
+from scroll_tactile.errors import InputError, ObservationError
+from scroll_tactile.planner import served, server
 
 pytest.importorskip("mcp", reason="the extra mcp is not installed")
 
@@ -84,7 +85,7 @@ def test_what_is_felt_known_and_to_be_touched_again(folder):
 
 
 def test_what_cannot_be_is_a_tools_error_that_says_what_to_do(folder):
-    files = [("what_is_felt", {"file": name}) for name in ("../outside.npy", "link.npy", "day", "/dev/zero", "a\0b")]
+    files = [("what_is_felt", {"file": name}) for name in ("../outside.npy", "link.npy", ".", "/dev/zero", "a\0b")]
     calls = [
         ("what_is_felt", {}),
         ("what_is_felt", {"readings": [[0.5, 0.5]] * 9, "file": "day/t.npy"}),
@@ -129,21 +130,67 @@ def test_only_with_learn_it_observes_and_retracts(folder, tmp_path):
     with TactileLearner.open(tmp_path / "memory", mode="read") as learner:
         assert learner.digest() == before and learner.materials == {}
     with TactileLearner.open(tmp_path / "other", sensor=PAD, embedding=SMALL) as learner:
-        server._Tools(learner, folder / "files").observe("b", file="day/t.npy")
+        server._Tools(learner, served.Served(folder / "files")).observe("b", file="day/t.npy")
         assert [each.source for each in learner.observations()] == ["day/t.npy"]
 
 
+def test_a_planner_can_follow_what_it_is_told_of_a_file(folder, tmp_path):
+    import h5py
+
+    touch = slide("b", 50, np.random.default_rng(5))
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        file["left"], file["right"] = touch, touch[::-1]
+    np.save(tmp_path / "wide.npy", np.hstack([touch, touch]))
+    robot_set(tmp_path / "set", [("b", touch)])
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "metadata.yaml").symlink_to(folder / "outside.npy")
+    calls = [
+        {"file": "two.h5"},
+        {"file": "two.h5", "field": "left"},
+        {"file": "wide.npy"},
+        {"file": "wide.npy", "columns": "0:2"},
+        {"file": "set"},
+        {"file": "set", "field": FIELD},
+        {"file": "linked"},
+        {"readings": touch.tolist(), "field": "left"},
+    ]
+    _, answers = talk(folder, "--files", tmp_path, calls=[("what_is_felt", each) for each in calls])
+    several, left, wide, some, episodes, whole, linked, both = answers
+    assert "such as file='two.h5', field='left'" in several and "columns='0:2'" in wide and FIELD in episodes
+    assert left["material"] == some["material"] == whole["material"] == "b"
+    assert "without links" in linked and "are of a file" in both
+    for told in (several, wide, episodes, linked):
+        assert str(tmp_path) not in told and str(folder) not in told
+
+
+def test_it_answers_from_the_memory_as_it_is_by_now_and_retracts_observations_alone(tmp_path):
+    random = np.random.default_rng(1)
+    with TactileLearner.open(tmp_path / "memory", sensor=PAD, embedding=SMALL) as learner:
+        learner.observe("a", slide("a", 50, random))
+        learner.describe("a", {"cotton": 1.0})
+        with TactileLearner.open(tmp_path / "memory", mode="read") as reader:
+            tools = server._Tools(reader, served.Served(None))
+            known = server._explained(tools, tools.what_is_known, ValueError)
+            assert known("b")["touches"] == 0
+            learner.observe("b", slide("b", 50, random))
+            assert known("b")["touches"] == 1
+        tools = server._Tools(learner, served.Served(None))
+        with pytest.raises(ObservationError, match="the number that observe gave"):
+            tools.retract(2)  # the description
+        assert tools.retract(3) == {"retracted": 3} and learner.materials == {"a": 1}
+
+
 def test_a_call_is_bounded(folder, monkeypatch):
-    monkeypatch.setattr(server, "MOST_VALUES", 10)
-    monkeypatch.setattr(server, "LARGEST_FILE", 10)
+    monkeypatch.setattr(served, "MOST_VALUES", 10)
+    monkeypatch.setattr(served, "LARGEST", 10)
     with TactileLearner.open(folder / "memory", mode="read") as learner:
-        tools = server._Tools(learner, folder / "files")
+        tools = server._Tools(learner, served.Served(folder / "files"))
         monkeypatch.setattr(server, "FEW", 10)
         again = tools.what_to_touch_again()
         assert len(again) == 3 and tools.what_to_touch_again(2) == again[:2]
         with pytest.raises(InputError, match="at most 10 numbers"):
             tools.what_is_felt([[0.0, 1.0]] * 6)
-        with pytest.raises(InputError, match="expected a file"):
+        with pytest.raises(InputError, match="expected a recording"):
             tools.what_is_felt(file="day/t.npy")
 
 

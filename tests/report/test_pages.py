@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from browser import Browser
 from commands import refused, run
+from robot_sets import FIELD, robot_set
 
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
@@ -17,8 +18,11 @@ from scroll_tactile.pipelines.learning import store_model
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import held_out_touches
 from scroll_tactile.prediction.predictor import Predictor
+from scroll_tactile.recordings import read_intervals
 from scroll_tactile.report import memory_page, recording_page, save
-from scroll_tactile.report.page import table
+from scroll_tactile.report.page import cards, table
+from scroll_tactile.report.sensing import health_cards, health_section
+from scroll_tactile.results import Health
 from scroll_tactile.simulation.scene import Scene
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
@@ -443,6 +447,59 @@ def test_the_command_tells_memories_from_recordings(learner, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["page.html", "touch.csv"]
 
 
+def _learned_by_its_line(folder, source, *options):
+    """Makes the page by the command, and pastes its line: the words of that, and what the memory then holds."""
+    made = run("report", source, folder / "page.html", *options)
+    assert made.exit_code == 0, made.output
+    (command,) = pasted((folder / "page.html").read_text())
+    (folder / "sensor.json").write_text(PAD.model_dump_json())
+    given = {"memory": folder / "memory", "sensor.json": folder / "sensor.json", "MATERIAL": "silk"}
+    done = run(*[given.get(word, word) for word in command[1:]])
+    assert done.exit_code == 0, done.output
+    with TactileLearner.open(folder / "memory", mode="read") as learner:
+        return command, learner.materials
+
+
+def test_the_line_has_the_table_and_the_sensor_that_the_page_was_given(tmp_path):
+    np.save(tmp_path / "touch.npy", Scene(sensor=PAD).touch("silk", 0).readings)
+    (tmp_path / "pad.json").write_text(PAD.model_dump_json())
+    cut = tmp_path / "cut.csv"
+    cut.write_text("file,begin,end,material\ntouch.npy,0,0.5,oak\ntouch.npy,0.5,0.9,silk\n")
+    options = "--rate", "50", "--sensor", tmp_path / "pad.json", "--labels", cut
+    command, materials = _learned_by_its_line(tmp_path, tmp_path / "touch.npy", *options)
+    assert command[4:] == ["--sensor", str(tmp_path / "pad.json"), "--labels", str(cut)]
+    assert materials == {"oak": 1, "silk": 1}
+    intervals = read_intervals(cut)
+    html = recording_page(tmp_path / "touch.npy", rate=50.0, sensor=PAD, intervals=intervals)
+    assert pasted(html)[0][4:] == ["--sensor", "sensor.json", "--labels", "labels.csv"]
+    assert "labels.csv, the table of its touches" in words(html)
+
+
+def test_the_line_has_the_field_that_the_page_chose(tmp_path):
+    import h5py
+
+    scene = Scene(sensor=PAD)
+    with h5py.File(tmp_path / "two.h5", "w") as file:
+        file["left"], file["right"] = scene.touch("silk", 0).readings, scene.touch("silk", 1).readings
+    command, materials = _learned_by_its_line(tmp_path, tmp_path / "two.h5")
+    assert command[4:] == ["--sensor", "sensor.json", "--field", "left", "--label", "MATERIAL"]
+    assert materials == {"silk": 1}
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_episodes_without_names_are_given_one_in_the_line(tmp_path, named):
+    scene = Scene(sensor=PAD)
+    folder = robot_set(tmp_path / "set", [(name, scene.touch(name, 0).readings) for name in scene.materials[:2]])
+    if not named:
+        (folder / "meta/tasks.parquet").unlink()
+    command, materials = _learned_by_its_line(tmp_path, folder)
+    assert command[4:8] == ["--sensor", "sensor.json", "--field", FIELD]
+    assert command[8:] == ([] if named else ["--label", "MATERIAL"])
+    assert materials == (dict.fromkeys(scene.materials[:2], 1) if named else {"silk": 2})
+    text = words((tmp_path / "page.html").read_text())
+    assert ("2 touches of 2 names" if named else "2 touches, its episodes, of which some have no name") in text
+
+
 def test_intervals_cut_a_recording_on_its_page(tmp_path):
     path = _table(tmp_path)
     cut = tmp_path / "cut.csv"
@@ -493,6 +550,20 @@ def test_what_it_measures_is_shown_held_out():
     learner = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
     learner.observe("felt", scene.touch("felt", 0))
     assert "What it measures" not in words(memory_page(learner))
+
+
+def test_a_name_is_escaped_once_on_a_page():
+    changed = Health(3, None, (), "material", 100.0, 0.01, 10, 9, ("A&B 'x'",), ((1, 0.1), (3, 2.1)))
+    for html in (cards(health_cards(changed)), health_section(changed)):
+        assert "A&B 'x' feels otherwise" in words(html)
+    assert "the one that learned: a material changed" in words(cards(health_cards(changed)))
+    scene, learner = Scene(sensor=PAD), TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
+    learner.declare(Quantity(name="size", unit="'&", low=0.0, high=4.0, resolution=0.01))
+    for i in range(10):
+        for name in scene.materials[:3]:
+            learner.observe(name, scene.touch(name, i, force=0.5 + 0.1 * i), values={"size": 0.5 + 0.1 * i})
+    text = words(memory_page(learner, risk=0.2))
+    assert "'& on average" in text and "'& wide" in text and "&#x27;" not in text
 
 
 def test_each_axis_of_labels_has_a_section():

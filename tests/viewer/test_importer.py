@@ -95,6 +95,27 @@ def test_a_memory_shows_what_it_keeps_and_says(folder, tmp_path, started):
     assert "17 touches of 3 materials" in found["/hand/about"][-1].values["TextDocument:text"][0]
 
 
+def test_names_of_a_memory_are_plain_text_to_the_viewer(tmp_path, started):
+    sensor = PAD.model_copy(update={"name": "x ![p](http://127.0.0.1/leak.png)"})
+    with TactileLearner.open(tmp_path / "memory", sensor=sensor, embedding=SMALL) as learner:
+        learner.observe("a", slide("a", 50, np.random.default_rng(1)))
+    assert started(tmp_path / "memory", out=tmp_path / "m.rrd")[0] == 0
+    (kind,) = {row.values["TextDocument:media_type"][0] for row in rows(tmp_path / "m.rrd")["/about"]}
+    assert kind == "text/plain"
+
+
+def test_a_touch_that_is_of_two_materials_counts_with_each(tmp_path, started):
+    touch = slide("a", 50, np.random.default_rng(1))
+    with TactileLearner.open(tmp_path / "memory", sensor=PAD, embedding=SMALL) as learner:
+        for name in "aab":
+            learner.observe(name, touch, again=True)
+    assert started(tmp_path / "memory", out=tmp_path / "m.rrd")[0] == 0
+    found = rows(tmp_path / "m.rrd")
+    assert scalars(found, "/count/a", "observation") == [(1, [1.0]), (2, [2.0])]
+    assert scalars(found, "/count/b", "observation") == [(3, [1.0])]
+    assert {row.times["observation"] for row in found["/touches/a"]} <= {1, 2}
+
+
 def test_a_recording_shows_the_answers_of_a_live_session(folder, tmp_path, started):
     assert started(folder / "shift.npy", SCROLL_TACTILE_MEMORY=str(folder / "memory"), out=tmp_path / "r.rrd")[0] == 0
     found = rows(tmp_path / "r.rrd")
@@ -206,6 +227,31 @@ def test_readings_of_another_sensor_are_left_alone_before_they_are_read(folder, 
         with pytest.raises(SystemExit) as end:
             importer.main([str(tmp_path / "damaged.bag"), *more])
         assert end.value.code == code and "damaged.bag" in capsys.readouterr().err
+
+
+def test_files_of_others_are_left_alone_where_the_environment_names_a_memory(folder, tmp_path, started):
+    (tmp_path / "names.csv").write_text("name,age\nbob,3\n")
+    (tmp_path / "letter.csv").write_text("dear sir,\nhello you\nx,y,z,w\n")
+    np.save(tmp_path / "objects.npy", np.array([{}, 1], object), allow_pickle=True)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "metadata.yaml").write_text("hello: 1\n")
+    memory = str(folder / "memory")
+    for name in ("names.csv", "letter.csv", "objects.npy", "site"):
+        code, size, _ = started(tmp_path / name, "--application-id", name, SCROLL_TACTILE_MEMORY=memory)
+        assert (code, size) == (importer.INCOMPATIBLE, 0), name
+    assert started(tmp_path / "letter.csv", "--memory", memory)[0] == 1
+
+
+def test_an_option_that_there_is_not_is_an_error_by_hand(folder, started):
+    code, size, error = started(folder / "shift.npy", "--memroy", folder / "memory")
+    assert (code, size) == (2, 0) and "came --memroy" in error
+
+
+def test_a_recording_that_lies_in_a_memorys_folder_is_shown_by_itself(folder, tmp_path, started):
+    shutil.copytree(folder / "memory", tmp_path / "memory")
+    np.save(tmp_path / "memory" / "mine.npy", slide("a", 50, np.random.default_rng(7)))
+    code, size, error = started(tmp_path / "memory" / "mine.npy", "--memory", folder / "memory")
+    assert (code, error) == (0, "") and size > 0
 
 
 def test_a_damaged_memory_is_an_error_that_says_so(folder, tmp_path, started):

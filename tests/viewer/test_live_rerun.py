@@ -5,22 +5,26 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
 from commands import refused, run
-from live_touches import shift, slide
+from live_touches import GEL as SCENE
+from live_touches import frames, shift, slide
 from rrd import rows, scalars, tensors, texts
 from touches import PAD, SMALL
 
-from scroll_tactile import Quantity, Sensor, TactileLearner
+from scroll_tactile import Frames, Quantity, Sensor, TactileLearner
 from scroll_tactile.live.answers import LiveState, LiveTouch
+from scroll_tactile.recordings import Recording, Report
 from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.gel import SMALL as GEL
+from scroll_tactile.viewer import recording_log, streams
 from scroll_tactile.viewer.streams import stream_to
 from scroll_tactile.viewer.touch_log import TouchLog
 
@@ -85,6 +89,47 @@ def test_a_viewer_that_listens_gets_it(folder, tmp_path):
     assert len(tensors(rows(tmp_path / "got.rrd"), "/touch")) == 3
 
 
+@contextmanager
+def _listener(said):
+    """What accepts connections, says this to each, and closes it if that is not nothing; its port."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = []
+
+        def accept():
+            with suppress(OSError):
+                while True:
+                    taken.append(server.accept()[0])
+                    if said is not None:
+                        taken[-1].sendall(said)
+                        taken[-1].shutdown(socket.SHUT_RDWR)
+
+        threading.Thread(target=accept, daemon=True).start()
+        yield server.getsockname()[1]
+        for connection in taken:
+            connection.close()
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (None, "no viewer answers"),
+        (b"SSH-2.0-OpenSSH_9.6\r\n", "no viewer answers"),
+        (b"\0\0\0\4\0\0\0\0\0", "the viewer went away"),
+    ],
+)
+def test_a_viewer_that_says_nothing_or_goes_away_is_one_red_line(folder, said, words, monkeypatch):
+    monkeypatch.setattr(streams, "ANSWERS_WITHIN", 0.5)
+    with _listener(said) as port:
+        how = "live", folder / "memory", folder / "shift.npy", "--rerun", f"rerun+http://127.0.0.1:{port}/proxy"
+        assert words in refused(*how)
+
+
+def test_an_address_without_its_end_is_one_red_line(folder):
+    with _listener(b"\0\0\0\4\0\0\0\0\0") as port:
+        how = "live", folder / "memory", folder / "shift.npy", "--rerun", f"rerun+http://127.0.0.1:{port}"
+        assert "/proxy at its end" in refused(*how)
+
+
 def _listens(port):
     with socket.socket() as tried:
         return tried.connect_ex(("127.0.0.1", port)) == 0
@@ -141,6 +186,19 @@ def test_lines_end_with_a_touch_and_estimates_without_a_number_are_left_out(tmp_
     assert values[0] == (pytest.approx(3.2), [0.9]) and np.isnan(values[1][1][0])
     assert "/answer/novelty" not in found and "/answer/known" not in found and "/estimate/force" not in found
     assert "revised" in texts(found, "/events")[0]
+
+
+@pytest.mark.parametrize("seconds", [0.0, 60.0])
+def test_a_cameras_frames_are_shown_where_contacts_cannot_be_found(tmp_path, monkeypatch, seconds):
+    monkeypatch.setattr(recording_log, "LONGEST", 60.0 - seconds)
+    shown = np.asarray(frames(SCENE.materials[1], 7, 12))
+    recording = Recording("x", None, "", shown, np.arange(20) / GEL.rate, (), Report(20, None))
+    learner = TactileLearner(sensor=GEL, embedding=Frames(rest=None))
+    with stream_to(str(tmp_path / "c.rrd")) as stream:
+        recording_log.log_recording(stream, recording, learner)
+    found = rows(tmp_path / "c.rrd")
+    assert sum("Image:buffer" in row.values for row in found["/readings"]) == 20
+    assert any("no contact" in text for text in texts(found, "/events")) == (not seconds)
 
 
 def test_a_cameras_frames_are_pictures(tmp_path):

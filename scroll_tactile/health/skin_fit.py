@@ -14,7 +14,7 @@ and τ are those under which the touches are likeliest (Laplace's approximation;
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -227,7 +227,7 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     return Fitted(gains, offsets, fit.lost, first, second, float((before - after).sum()) / 2)
 
 
-def guess_of_lost(touches: Sequence[Floats], lost: npt.NDArray[np.bool_], step: float) -> npt.NDArray[np.float32]:
+def guess_of_lost(touches: Iterable[Floats], lost: npt.NDArray[np.bool_], step: float) -> npt.NDArray[np.float32]:
     """The weights (m, n − m + 1) by which m lost channels are guessed from the others, the last of each a constant.
 
     Least squares over all readings of earlier touches, (T, n) each, shares of the range in steps of `step`; what
@@ -235,9 +235,9 @@ def guess_of_lost(touches: Sequence[Floats], lost: npt.NDArray[np.bool_], step: 
     """
     n, m = len(lost), int(np.count_nonzero(lost))
     count, total, squares = 0, np.zeros(n), np.zeros((n, n))
-    for shares in touches:
+    for shares in touches if m else ():
         count, total, squares = count + len(shares), total + shares.sum(axis=0), squares + shares.T @ shares
-    if not count or not m:
+    if not count:
         return np.zeros((m, n - m + 1), np.float32)
     mean = total / count
     covariance = squares / count - np.outer(mean, mean)

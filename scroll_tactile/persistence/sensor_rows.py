@@ -197,7 +197,7 @@ def adapt_to(
     shares = [(touch.readings - low) / (high - low) for touch in touches]
     found = fitted(reference, shares, list(touches.values()), ends)
     span = np.broadcast_to(high - low, (sensor.channels,))
-    earlier = [(of[:, (of != MISSING).all(axis=0)] / (LEVELS - 1)).T for of in kept]
+    earlier = ((of[:, (of != MISSING).all(axis=0)] / (LEVELS - 1)).T for of in kept)  # one by one: levels are bytes
     correction = Correction(
         found.gains.astype(np.float32),
         (found.offsets * span).astype(np.float32),

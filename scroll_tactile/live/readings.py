@@ -20,7 +20,7 @@ from scroll_tactile.prediction.predictor import Predictor, nothing_known
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.correction import Correction, corrected_stream
-from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import Scale
 
 __all__ = ["GrowingTouch", "Recent", "TouchRows", "is_touch"]
@@ -139,6 +139,14 @@ class GrowingTouch:
     def stream(self, count: int) -> Stream:
         """The stream of its first readings, corrected. Raises StreamError where they make none."""
         return corrected_stream(self.extractor.stream(self.rows.first(count)), self.correction)
+
+    def rest_before(self) -> Stream | None:
+        """What was read at rest before it, corrected; None where that is too little, or nothing but missing values."""
+        try:
+            rest = None if self.rest is None else validate(self.rest, self.predictor.recipe.sensor)
+        except StreamError:
+            return None
+        return None if rest is None else corrected_stream(rest, self.correction)
 
     def predict(self, stream: Stream) -> Prediction:
         """The prediction for the beginning of it, as `learner.predict` gives it."""

@@ -29,8 +29,7 @@ from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.results import Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.contact import MOST_FRAMES, Rest
-from scroll_tactile.signals.correction import corrected_stream
-from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings, validate
+from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
 
 __all__ = ["LiveSession"]
 
@@ -330,7 +329,7 @@ class LiveSession:
             self._leave(touch)
             return
         before = touch.prediction if touch.decided else None
-        prediction, rest = touch.predict(stream), self._rest_before(touch)
+        prediction, rest = touch.predict(stream), touch.rest_before()
         revised = before if before is not None and _says(before) != _says(prediction) else None
         self.touch, self._thing = stream, (*touch.earlier, stream)[-MOST_EARLIER:]
         self.report.touches += 1
@@ -342,13 +341,6 @@ class LiveSession:
         self._settled = touch.settled
         if self._notes is not None:
             self._notes.take(self._ended[-1])
-
-    def _rest_before(self, touch: GrowingTouch) -> Stream | None:
-        """What was read at rest before a touch; None where that is too little, or nothing but missing values."""
-        try:
-            return None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
-        except StreamError:
-            return None
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""

@@ -51,7 +51,7 @@ class Served:
             raise InputError(f"expected at most {MOST_VALUES} numbers in a touch; cut it, or name a file")
         return readings
 
-    def told(self, text: str) -> str:
+    def without_paths(self, text: str) -> str:
         """An error's text as a planner is to read it: the folder is not named, and lines to copy are its own."""
         text = text if self._folder is None else text.replace(f"{self._folder}{os.sep}", "")
         return CALL.sub(r"such as file=\1", text)

@@ -58,7 +58,7 @@ def _explained(tools: _Tools, tool: Any, as_error: type[Exception]) -> Callable[
             tools.learner.refresh()  # a client keeps its server for days, and others may learn meanwhile
             return tool(*values, **named)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
-            raise as_error(tools.told(str(error)) or type(error).__name__) from error
+            raise as_error(tools.without_paths(str(error)) or type(error).__name__) from error
 
     return explained
 
@@ -69,10 +69,10 @@ class _Tools:
     def __init__(self, learner: TactileLearner, served: Served) -> None:
         self.learner, self.served = learner, served
 
-    def told(self, text: str) -> str:
+    def without_paths(self, text: str) -> str:
         """An error's text without the paths of this machine."""
         path = self.learner.path
-        return self.served.told(text if path is None else text.replace(str(path), "the memory"))
+        return self.served.without_paths(text if path is None else text.replace(str(path), "the memory"))
 
     def what_is_felt(
         self,

@@ -150,7 +150,7 @@ def test_a_result_is_whole_or_not_there(tmp_path, capsys):
     result = {"mean": 0.1 + 0.2, "nan": float("nan"), "rows": [[i, i / 3] for i in range(40)], "names": ["x" * 70] * 2}
     write_result(tmp_path / "r.json", result)
     text = (tmp_path / "r.json").read_text()
-    assert json.loads(text)["rows"][1] == [1, 0.33333333] and json.loads(text)["nan"] is None
+    assert json.loads(text)["rows"][1] == [1, 0.333333] and json.loads(text)["nan"] is None
     assert max(map(len, text.splitlines())) <= 120 and "0.3," in text
     with pytest.raises(InputError, match="cannot be written"):
         write_result(tmp_path / "none" / "r.json", result)

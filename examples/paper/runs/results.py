@@ -107,7 +107,7 @@ def write(context: typer.Context, result: Mapping[str, Any]) -> None:
 
 
 def write_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result as JSON, whole or not at all: short values and numbers side by side, of eight digits, NaN as null.
+    """Write a result as JSON, whole or not at all: short values and numbers side by side, of six digits, NaN as null.
 
     Raises InputError where the file cannot be written.
     """
@@ -122,7 +122,7 @@ def write_result(path: Path, result: Mapping[str, Any]) -> None:
 
 def _rounded(value: Any) -> Any:
     if isinstance(value, float):
-        return float(f"{value:.8g}") if math.isfinite(value) else None
+        return float(f"{value:.6g}") if math.isfinite(value) else None
     if isinstance(value, Mapping):
         return {key: _rounded(part) for key, part in value.items()}
     return [_rounded(part) for part in value] if isinstance(value, list | tuple) else value

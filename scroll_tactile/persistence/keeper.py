@@ -53,6 +53,11 @@ class MemoryKeeper(ABC):
         return None if self._ledger.store is None else self._ledger.store.path
 
     @property
+    def has_health(self) -> bool:
+        """Whether `health` can be asked: the memory has a path, and its sensor 1 to 256 channels."""
+        return self.path is not None and has_numbers(self.sensor)
+
+    @property
     def memory(self) -> Memory:
         """What it has learned: statistics, sample, exemplars, descriptions and f*. Read it; never change it."""
         return self._ledger.read(lambda memory, _: memory)

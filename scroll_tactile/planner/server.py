@@ -12,7 +12,6 @@ from pydantic import Field
 from scroll_tactile import __version__
 from scroll_tactile.errors import ObservationError, ScrollTactileError
 from scroll_tactile.health.advice import advice, in_words
-from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 from scroll_tactile.planner.served import Columns, File, Place, Readings, Served, Topic
@@ -98,8 +97,7 @@ class _Tools:
         counts, described = learner.materials, learner.descriptions
         if material is not None:
             return {"touches": counts.get(material, 0), "description": described.get(material)}
-        watched = learner.path is not None and has_numbers(learner.sensor)
-        health = learner.health() if watched else None
+        health = learner.health() if learner.has_health else None
         return {
             "sensor": learner.sensor.model_dump(mode="json", include={"name", "channels", "rate", "unit"}),
             "materials": dict(sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))[:LISTED]),

@@ -10,7 +10,6 @@ from datetime import UTC, datetime
 import numpy as np
 
 from scroll_tactile import __version__
-from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.report.charts import dated, histogram, timeline
 from scroll_tactile.report.drawing import shown
@@ -61,7 +60,7 @@ def memory_page(
     grown = growing_answers(facts)
     show("channels", 2, STEPS)
     sensor = learner.sensor
-    found = learner.health() if learner.path is not None and has_numbers(sensor) else None
+    found = learner.health() if learner.has_health else None
     # What tells most comes first; when it was taught is of use to few.
     exemplars = facts.exemplars if sensor.camera else {}
     strips = exemplar_pictures(sensor, facts.kept, exemplars)

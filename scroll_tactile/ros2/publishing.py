@@ -8,7 +8,6 @@ from typing import Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.health.advice import advice, in_words
-from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.ros2.answer_fields import Answer
 from scroll_tactile.ros2.bridge import RESTLESS, Bridge
 from scroll_tactile.ros2.interfaces import interface, kept
@@ -142,7 +141,7 @@ class Diagnostics:
     def _changed(self) -> tuple[str, str] | None:
         """The level and the text of a change of the sensor; None where none is seen, or where it cannot be told."""
         learner = self._bridge.learner
-        if learner.path is None or not has_numbers(learner.sensor):
+        if not learner.has_health:
             return None
         try:
             found = learner.health(after=int(self._node.get_parameter("health_after").value))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.ros2.fingers import Finger, fingers_of, new_sensor
 from scroll_tactile.ros2.interfaces import Quality, interface, require_rclpy
 from scroll_tactile.ros2.listening import Listener
@@ -89,7 +88,7 @@ class _Served:
             learner = TactileLearner.open(path, sensor=sensor, mode=values["mode"])
         try:
             learner.live(risk=values["risk"], contact="manual", of=values["of"] or None).close()
-            if learner.path is not None and has_numbers(learner.sensor):
+            if learner.has_health:
                 self._warm_health(learner, values["health_after"])
         except BaseException:
             if learner is not self._own:

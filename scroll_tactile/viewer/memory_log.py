@@ -9,7 +9,6 @@ import numpy as np
 
 from scroll_tactile.errors import ScrollTactileError, printable
 from scroll_tactile.health.advice import advice, in_words
-from scroll_tactile.health.channel_numbers import has_numbers
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.matching.likelihood import LEVELS
 from scroll_tactile.matching.match import KeptTouch
@@ -130,7 +129,7 @@ class _MemoryLog:
                 self._event(f"held out, a touch of {printable(touch.material)} is called unknown", "WARN")
 
     def _health(self) -> Health | None:
-        if self.learner.path is None or not has_numbers(self.learner.sensor):
+        if not self.learner.has_health:
             return None
         health = self.learner.health()
         if health.grew:

@@ -249,8 +249,9 @@ def test_another_robots_touches_are_a_stream_of_their_own(memory: Path, tmp_path
 def test_what_cannot_be_told_is_refused(tmp_path: Path) -> None:
     with pytest.raises(errors.InputError, match="without a path"):
         TactileLearner(sensor=PAD).health()
+    assert not TactileLearner(sensor=PAD).has_health
     with TactileLearner.open(tmp_path / "memory", sensor=PAD) as learner:
-        assert learner.health() == Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
+        assert learner.has_health and learner.health() == Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
         for wrong in ({"bound": 0}, {"bound": "1"}, {"after": -1}, {"until": True}):
             with pytest.raises(errors.InputError):
                 learner.health(**wrong)
@@ -262,6 +263,7 @@ def test_what_cannot_be_told_is_refused(tmp_path: Path) -> None:
     for name, sensor, what in (("camera", sensors.GELSIGHT, "has pixels"), ("wide", wide, "has 300")):
         made = TactileLearner.open(tmp_path / name, sensor=sensor, embedding=Kernels(dimension=64))
         with made as learner, pytest.raises(errors.InputError, match=what):
+            assert not learner.has_health
             learner.health()
 
 

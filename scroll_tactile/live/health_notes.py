@@ -37,7 +37,7 @@ class HealthNotes:
     it saw none. warn: called with a text for each kind of failure once: a full disk must not end a session. materials:
     whether answers are by materials, without which touches have no name.
 
-    Raises InputError as `TactileLearner.health` does: it needs a memory on disk.
+    A memory with a damaged row is warned of. Raises InputError as `TactileLearner.health` does: it needs one on disk.
     """
 
     def __init__(
@@ -52,7 +52,10 @@ class HealthNotes:
         self._warned: set[type[Exception]] = set()
         self._last: LiveTouch | None = None  # until another ended: meanwhile it may be learned
         self._told = False
-        learner.health()  # or raises
+        try:
+            learner.health()
+        except StoreError as error:  # a damaged row is no reason to feel nothing: what comes is noted behind it
+            self._warn_once(error)
 
     def take(self, ended: LiveTouch | None) -> None:
         """Take the touch that ended; None where the session did: note the touch before it and the rest, and look."""
@@ -80,4 +83,4 @@ class HealthNotes:
     def _warn_once(self, error: Exception) -> None:
         if type(error) not in self._warned:
             self._warned.add(type(error))
-            self._warn(f"the health of the sensor is not noted: {error}")
+            self._warn(f"the health of the sensor cannot be told: {error}")

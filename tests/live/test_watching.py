@@ -92,7 +92,25 @@ def test_by_an_axis_rest_alone_is_noted_and_a_failure_is_warned_of_once(
         monkeypatch.setattr(TactileLearner, "sense", full)
         for _ in range(3):
             notes.take(ended(SCENE.touch(NAMES[0], 93), "north", rest=rest()))
-        assert warned == ["the health of the sensor is not noted: no space left on device"]
+        assert warned == ["the health of the sensor cannot be told: no space left on device"]
+
+
+def test_a_damaged_row_is_warned_of_once_and_ends_no_session(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told, warned = list[Health](), list[str]()
+    with TactileLearner.open(memory) as learner:
+        before, rows = learner.health().touches, learner.health
+
+        def damaged() -> Health:
+            raise StoreError("row 7 is damaged")
+
+        monkeypatch.setattr(learner, "health", damaged)
+        notes = HealthNotes(learner, told.append, warned.append)
+        for _ in range(2):
+            notes.take(ended(SCENE.touch(NAMES[0], 93), None, rest=rest()))
+        assert warned == ["the health of the sensor cannot be told: row 7 is damaged"]
+        assert rows().touches == before + 2
+    with pytest.raises(errors.InputError, match="without a path"):
+        HealthNotes(TactileLearner(sensor=PAD), None, pytest.fail)
 
 
 def test_a_session_calls_back(memory: Path) -> None:

@@ -56,7 +56,7 @@ def promised(words: list[str], folder: Path, output: str) -> bool:
         "learn": f"learned: {len(MATERIALS) * TOUCHES} touches of {len(MATERIALS)} materials",
         "observe": "observed 5 times",
         "predict": "oak with",
-        "memory merge": "1 streams were observed by both",
+        "memory merge": "1 stream observed by both",
         "memory export": "2 materials, ",
         "fleet": "touches from",
         "report": "written: page.html",

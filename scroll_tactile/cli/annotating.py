@@ -10,6 +10,7 @@ import typer
 
 from scroll_tactile.cli.options import AsJson, Clock, Columns, Field, materials_of
 from scroll_tactile.cli.terminal import opened, progress_bar, say, say_json, shown
+from scroll_tactile.cli.wording import counted
 
 if TYPE_CHECKING:
     from scroll_tactile.pipelines.annotating.annotation_run import Annotated as Done
@@ -89,12 +90,13 @@ def _report(done: Done, cut: TouchCut, as_json: bool) -> None:
         kept = None if done.kept is None else str(done.kept)
         say_json(vars(done) | {"output": str(done.output), "kept": kept})
         return
+    touches, frames = counted(done.touches, "touch"), counted(done.frames, "frame")
     say(
-        f"[bold]annotated:[/] {done.episodes} episodes, {done.touches} touches; of {done.frames} frames "
-        f"{done.answered} have an answer, {done.events} an event"
+        f"[bold]annotated:[/] {counted(done.episodes, 'episode')}, {touches}; of {frames} {done.answered} have an "
+        f"answer, {done.events} an event"
     )
     if not done.touches:
         say(f"[yellow]no touch was found:[/] {NO_TOUCH[cut]}")
     if done.left_out:
-        say(f"[bold]left out:[/] {done.left_out} frames whose readings are NaN or infinite")
+        say(f"[bold]left out:[/] {counted(done.left_out, 'frame')} whose readings are NaN or infinite")
     say(f"written: {shown(done.output)}" + (f"; as it was before: {shown(done.kept)}" if done.kept else ""))

@@ -41,6 +41,7 @@ from scroll_tactile.cli.terminal import (
     shown,
     verdict,
 )
+from scroll_tactile.cli.wording import counted
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import optional
 
@@ -116,12 +117,14 @@ def _report_learned(done: Learned, held: int, as_json: bool) -> None:
         }
         say_json(found)
         return
-    of = f" of {len(done.learned)} materials" if count else ""
-    say(f"[bold]learned:[/] {count} touches{of} from {done.files} files; {held} are in the memory now")
+    of = f" of {counted(len(done.learned), 'material')}" if count else ""
+    say(
+        f"[bold]learned:[/] {counted(count, 'touch')}{of} from {counted(done.files, 'file')}; the memory has {held} now"
+    )
     for name, touches in sorted(done.learned.items()):
         say(f"  {touches:>6}  {shown(name)}")
     if done.skipped:
-        say(f"[bold]skipped:[/] {done.skipped} touches that it had already")
+        say(f"[bold]skipped:[/] {counted(done.skipped, 'touch')} that it had already")
     say_refused(done.refused)
 
 
@@ -210,13 +213,13 @@ def _report_fleet(done: FleetReport, as_json: bool) -> None:
         return
     rate = done.observations / done.seconds if done.seconds else 0.0
     say(
-        f"[bold]learned:[/] {done.observations} touches from {done.sources} sources in {done.seconds:.1f} s, "
-        f"{rate:.0f} a second; {done.held} are in the memory now"
+        f"[bold]learned:[/] {counted(done.observations, 'touch')} from {counted(done.sources, 'source')} in "
+        f"{done.seconds:.1f} s, {rate:.0f} a second; the memory has {done.held} now"
     )
     if done.repeated:
-        say(f"[bold]skipped:[/] {done.repeated} touches that came before")
+        say(f"[bold]skipped:[/] {counted(done.repeated, 'touch')} that came before")
     if done.deaths:
-        say(f"[bold]begun again:[/] {done.deaths} jobs whose workers ended")
+        say(f"[bold]begun again:[/] {counted(done.deaths, 'job')} whose worker ended")
     say_refused(done.refused)
     say(f"[bold]digest:[/] {done.digest}")
 

@@ -36,6 +36,7 @@ from scroll_tactile.cli.terminal import (
     shown,
     verdict,
 )
+from scroll_tactile.cli.wording import counted
 from scroll_tactile.errors import DescriptionError, InputError, printable
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 
@@ -242,9 +243,9 @@ def inspect(memory: MemoryFolder, as_json: Annotated[bool, typer.Option("--json"
     for name, count in materials.items():
         table.add_row(shown(name), str(count))
     console().print(table)
-    say(f"[bold]observations:[/] {sum(materials.values())} of {len(materials)} materials")
+    say(f"[bold]observations:[/] {sum(materials.values())} of {counted(len(materials), 'material')}")
     say(f"[bold]kept touches:[/] {kept}")
-    say(f"[bold]sensor:[/] {shown(sensor.name)}, {sensor.channels} channels at {sensor.rate:g} Hz")
+    say(f"[bold]sensor:[/] {shown(sensor.name)}, {counted(sensor.channels, 'channel')} at {sensor.rate:g} Hz")
     say(
         f"[bold]embedding:[/] {shown(embedding.name)}, {embedding.dimension} features, "
         f"fingerprint {embedding.fingerprint[:12]}"

@@ -9,6 +9,7 @@ import typer
 
 from scroll_tactile.cli.options import Axis, MemoryFolder
 from scroll_tactile.cli.terminal import opened, say, shown
+from scroll_tactile.cli.wording import counted
 from scroll_tactile.errors import InputError
 
 __all__ = ["PASSED_ON", "mcp", "ros2"]
@@ -80,8 +81,8 @@ def ros2(
     how |= {"contact": contact, "of": of, "watch": watch, "sensor": sensor}
     met = serve(memory, topic or "", field or "", arguments=context.args, **how)
     count = met.pop("materials", 0)
-    counted = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
-    say(f"{shown(memory or 'the memory')}: {count} materials. {counted}")
+    met_in_words = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
+    say(f"{shown(memory or 'the memory')}: {counted(count, 'material')}. {met_in_words}")
 
 
 def mcp(

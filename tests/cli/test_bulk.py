@@ -80,7 +80,7 @@ class TestLearn:
     def test_a_new_memory_from_folders(self, tmp_path: Path, data: Path) -> None:
         result = run("learn", tmp_path / "new", data, "--sensor", "roboskin", "--label-by", "folder")
         assert result.exit_code == 0, result.output
-        assert "learned: 6 touches of 2 materials from 6 files; 6 are in the memory now" in result.stdout
+        assert "learned: 6 touches of 2 materials from 6 files; the memory has 6 now" in result.stdout
         found = json.loads(run("learn", tmp_path / "new", data, "--label-by", "folder", "--json").stdout)
         expected = {"files": 6, "touches": 0, "learned": {}, "skipped": 6, "refused": [], "observations": 6}
         assert found == expected
@@ -93,7 +93,7 @@ class TestLearn:
         words = (memory, data / "silk", tmp_path / "bad.npy", tmp_path / "none.npy", "--label", "silk")
         result = run("learn", *words)
         assert result.exit_code == 1
-        assert "learned: 3 touches of 1 materials from 4 files" in result.stdout
+        assert "learned: 3 touches of 1 material from 4 files" in result.stdout
         lines = [line for line in result.stderr.splitlines() if line.startswith("refused:")]
         assert len(lines) == 2 and "bad.npy" in lines[1] and "it is not there" in lines[0]
         found = json.loads(run("learn", *words, "--json").stdout)
@@ -135,7 +135,7 @@ class TestLearn:
         (tmp_path / "labels.csv").write_text("file,begin,end,material\nt.csv,0,0.5,silk\nt.csv,0.5,1,wool\n")
         result = run("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "labels.csv")
         assert result.exit_code == 0, result.output
-        assert "2 touches of 2 materials from 1 files" in result.stdout
+        assert "2 touches of 2 materials from 1 file;" in result.stdout
         listed = [json.loads(line) for line in run("memory", "list", memory, "--json").stdout.splitlines()]
         assert [row["source"].partition("t.csv")[2] for row in listed] == ["[0:25]", "[25:50]"]
         for text, said in (

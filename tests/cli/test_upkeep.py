@@ -121,7 +121,7 @@ class TestRetracting:
         assert merged.exit_code == 0 and "12 observations came in" in merged.output
         assert "no observation" in refused("memory", "forget", tmp_path / "other", "--source", "robot")
         forgotten = run("memory", "forget", tmp_path / "other", "--source", "robot 7")
-        assert forgotten.exit_code == 0 and "12 observations were retracted" in forgotten.output
+        assert forgotten.exit_code == 0 and "12 observations retracted" in forgotten.output
         with TactileLearner.open(tmp_path / "other") as learner:
             assert learner.digest() == before
         assert "a material, or a source" in refused("memory", "forget", tmp_path / "other")
@@ -134,8 +134,8 @@ class TestRetracting:
         assert sizes[2] < sizes[1]
 
     def test_retract_and_forget(self, path):
-        assert "row 2 was retracted; 11 observations are left" in words(run("memory", "retract", path, 2))
-        assert "b/ü: 3 observations were retracted; 2 materials are left" in words(run("memory", "forget", path, "b/ü"))
+        assert "row 2 was retracted; 11 observations left" in words(run("memory", "retract", path, 2))
+        assert "b/ü: 3 observations retracted; 2 materials left" in words(run("memory", "forget", path, "b/ü"))
         assert "was retracted already" in refused("memory", "retract", path, 2)
         assert "'b/ü' was never observed" in refused("memory", "forget", path, "b/ü")
         with TactileLearner.open(path, **SETTINGS) as learner:
@@ -146,7 +146,7 @@ class TestRetracting:
             for name, touch in [("a", (0, 60)), ("d", (1, 60))]:
                 other.observe(name, stream(touch))
         result = words(run("memory", "merge", path, tmp_path / "other", "--shared", "once"))
-        assert "1 observations came in; 1 streams were observed by both; 13 are there now" in result
+        assert "1 observation came in, 1 stream observed by both; 13 are there now" in result
         with TactileLearner.open(path, **SETTINGS) as learner:
             require_same(learner, [*OBSERVED, ("d", (1, 60))])
             assert f"digest: {learner.digest()}" in result

@@ -402,7 +402,7 @@ def test_a_recording_shows_its_signal_and_gaps_and_proposes_touches(browser, tmp
     given = {"memory": tmp_path / "m", "sensor.json": tmp_path / "sensor.json", "MATERIAL": "silk"}
     made = run(*[given.get(word, word) for word in command[1:]])
     assert made.exit_code == 0, made.output
-    assert "4 touches of 1 materials" in made.output
+    assert "4 touches of 1 material from" in made.output
     save(html, tmp_path / "page.html")
     browser.show(tmp_path / "page.html", 390)
     assert browser.evaluate("document.documentElement.scrollWidth") <= 390

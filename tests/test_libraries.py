@@ -3,6 +3,7 @@
 import ast
 import importlib.metadata
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -123,9 +124,19 @@ def test_every_extra_that_is_named_is_there():
             if isinstance(call, ast.Call) and getattr(call.func, "id", "") in ("optional", "missing", "install_line"):
                 named.update(node.value for node in ast.walk(call.args[1]) if isinstance(node, ast.Constant))
     assert {"torch", "ros", "hdf5"} < named <= {*extras, "onnxruntime"}
-    assert "pip install 'scroll-tactile[" not in "".join(
-        path.read_text() for path in (ROOT / "scroll_tactile").rglob("*.py")
-    )
+
+
+def test_no_text_has_one_install_from_a_package_index_where_it_is_not():
+    texts = [
+        path
+        for kind in ("py", "md", "ipynb")
+        for room in ("scroll_tactile", "examples")
+        for path in (ROOT / room).rglob(f"*.{kind}")
+    ]
+    texts += [ROOT / "README.md", *(ROOT / ".site").rglob("*.md"), *(ROOT / ".github").rglob("*.md")]
+    assert len(texts) > 300
+    found = [path for path in texts if re.search(r"""pip install[^\n]* ['"\\]*scroll-tactile\b""", path.read_text())]
+    assert found == []
 
 
 TAKE_TORCH = [

@@ -15,7 +15,7 @@ from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.prediction.judging import HeldOutTouch
 from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.results import Health, Observation
-from scroll_tactile.viewer.streams import entity, layout, rerun
+from scroll_tactile.viewer.streams import Colours, entity, layout, rerun
 
 __all__ = ["log_memory"]
 
@@ -42,6 +42,7 @@ class _MemoryLog:
         self.rows = {(row.material, row.key): row for row in self.learned}  # one touch can be of several materials
         most = sorted(self.facts.counts, key=lambda name: (-self.facts.counts[name], name))
         self.names = set(most[:MOST_MATERIALS])
+        self.colours = Colours()
 
     def write(self) -> None:
         """All of it; what takes longest comes last."""
@@ -87,7 +88,9 @@ class _MemoryLog:
                 self.rr.TimeColumn(OBSERVED, timestamp=times),
             ]
             path = self._path(entity("count", name))
-            self.stream.log(path, self.rr.SeriesLines(interpolation_mode="StepAfter"), static=True)
+            self.stream.log(
+                path, self.rr.SeriesLines(colors=[self.colours.of(name)], interpolation_mode="StepAfter"), static=True
+            )
             counts = self.rr.Scalars.columns(scalars=np.arange(1.0, len(own) + 1))
             self.stream.send_columns(path, columns, counts)
 
@@ -116,7 +119,9 @@ class _MemoryLog:
             if touch.material in self.names:
                 if path not in styled:
                     styled.add(path)
-                    self.stream.log(self._path(path), self.rr.SeriesPoints(), static=True)
+                    self.stream.log(
+                        self._path(path), self.rr.SeriesPoints(colors=[self.colours.of(touch.material)]), static=True
+                    )
                 self.stream.log(self._path(path), self.rr.Scalars(_own(touch)))
             if math.isfinite(touch.novelty):
                 self.stream.log(self._path("novelty/novelty"), self.rr.Scalars(touch.novelty))

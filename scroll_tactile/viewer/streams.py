@@ -14,7 +14,7 @@ from scroll_tactile.errors import InputError, printable
 from scroll_tactile.libraries import optional
 from scroll_tactile.results import Prediction
 
-__all__ = ["APPLICATION", "VIEWER", "entity", "in_words", "layout", "rerun", "stream_to"]
+__all__ = ["APPLICATION", "VIEWER", "Colours", "entity", "in_words", "layout", "rerun", "stream_to"]
 
 APPLICATION = "scroll-tactile"
 VIEWER = "viewer"  # what names the one that runs on this machine
@@ -24,6 +24,24 @@ ANSWERS_WITHIN = 2.0  # seconds: a viewer that is there takes milliseconds
 TAKEN_WITHIN = 10.0  # seconds, of what was written and is still under way
 HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # of HTTP/2 (RFC 9113, 3.4): no settings
 SETTINGS = 4  # the kind of the frame that answers it
+
+
+# Light enough for a dark viewer, dark enough for a light one; neighbours in the list are far from each other.
+COLOURS = (
+    *((70, 150, 255), (255, 140, 40), (60, 190, 100), (235, 80, 95), (160, 115, 250)),
+    *((215, 180, 30), (30, 190, 200), (240, 115, 200), (165, 125, 85), (140, 155, 170)),
+)
+
+
+class Colours:
+    """A colour for each name, in the order in which they come: Rerun's own, by the path, are often alike."""
+
+    def __init__(self) -> None:
+        self._places: dict[str, int] = {}
+
+    def of(self, name: str) -> tuple[int, int, int]:
+        """Red, green and blue, 0 to 255; the same for the same name, and after as many names as there are again."""
+        return COLOURS[self._places.setdefault(name, len(self._places)) % len(COLOURS)]
 
 
 def rerun() -> Any:
@@ -113,7 +131,7 @@ def layout(prefix: str, left: Sequence[View], right: Sequence[View], time: str) 
     rrb = importlib.import_module("rerun.blueprint")
     more: dict[str, dict[str, Any]] = {
         "Tensor": {"view_fit": "fill"},
-        "Share": {"axis_y": rrb.ScalarAxis(range=(0, 1))},
+        "Share": {"axis_y": rrb.ScalarAxis(range=(-0.03, 1.03))},
     }
 
     def column(views: Sequence[View]) -> Any:

@@ -12,7 +12,7 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down, tactile_image
-from scroll_tactile.viewer.streams import entity, in_words, layout, rerun
+from scroll_tactile.viewer.streams import Colours, entity, in_words, layout, rerun
 
 __all__ = ["TIME", "TouchLog"]
 
@@ -41,6 +41,7 @@ class TouchLog:
         self._before: LiveState | None = None
         self._dated: bool | None = None
         self._lines: set[str] = set()
+        self._colours = Colours()
         left = [("Tensor", "touch", "touch"), ("Tensor", "readings", "readings"), ("TextLog", "events", "events")]
         if sensor.camera:
             left[1] = ("Spatial2D", "readings", "readings")
@@ -108,7 +109,11 @@ class TouchLog:
         chances = dict(prediction.ranking)
         self._names |= dict.fromkeys(name for name, _ in prediction.ranking[:SHOWN])
         for name in self._names:
-            self._scalar(entity("answer", "probability", name), chances.get(name, 0.0), at)
+            path = entity("answer", "probability", name)
+            if path not in self._lines:
+                lines = self._rr.SeriesLines(colors=[self._colours.of(name)])
+                self._stream.log(self._path(path), lines, static=True)
+            self._scalar(path, chances.get(name, 0.0), at)
         if math.isfinite(prediction.novelty):
             self._scalar("answer/novelty", prediction.novelty, at)
         if prediction.known is not None:

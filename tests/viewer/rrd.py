@@ -1,6 +1,7 @@
 """Files of Rerun, read again by its own reader."""
 
 from collections import defaultdict
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,3 +62,14 @@ def _number(value: Any) -> float:
     if hasattr(value, "total_seconds"):
         return float(value.total_seconds())
     return float(value.timestamp()) if hasattr(value, "timestamp") else float(value)
+
+
+def colours(found: dict[str, list[Row]], paths: Iterable[str]) -> list[int]:
+    """The colour of each of these lines, or of its points, as it was logged."""
+    return [
+        value[0]
+        for path in paths
+        for row in found[path]
+        for name, value in row.values.items()
+        if name in ("SeriesLines:colors", "SeriesPoints:colors")
+    ]

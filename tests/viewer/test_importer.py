@@ -11,7 +11,7 @@ import bags
 import numpy as np
 import pytest
 from live_touches import shift, slide
-from rrd import rows, scalars, tensors, texts
+from rrd import colours, rows, scalars, tensors, texts
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner
@@ -92,6 +92,8 @@ def test_a_memory_shows_what_it_keeps_and_says(folder, tmp_path, started):
         assert datetime.fromtimestamp(last, UTC).year == datetime.now(UTC).year
         unknown = [touch for touch in facts.held_out if touch.answer == touch.material and not touch.known]
         assert sum("called unknown" in text for text in texts(found, "/hand/events")) == len(unknown)
+    held, counted = ([f"/hand/{room}/{name}" for name in "abc"] for room in ("held_out", "count"))
+    assert colours(found, held) == colours(found, counted) and len(set(colours(found, held))) == 3
     assert "17 touches of 3 materials" in found["/hand/about"][-1].values["TextDocument:text"][0]
 
 

@@ -15,7 +15,7 @@ import pytest
 from commands import refused, run
 from live_touches import GEL as SCENE
 from live_touches import frames, shift, slide
-from rrd import rows, scalars, tensors, texts
+from rrd import colours, rows, scalars, tensors, texts
 from touches import PAD, SMALL
 
 from scroll_tactile import Frames, Quantity, Sensor, TactileLearner
@@ -55,6 +55,8 @@ def test_what_is_printed_is_what_is_streamed(folder, tmp_path):
         name: [value for _, (value,) in scalars(found, f"/answer/probability/{name}", "time") if not np.isnan(value)]
         for name in "abc"
     }
+    lines_of = [f"/answer/probability/{name}" for name in "abc" if written[name]]
+    assert len(set(colours(found, lines_of))) == len(lines_of) == len(colours(found, lines_of)) > 1
     for line in answers:  # JSON has six digits
         assert line["probability"] in [float(f"{value:.6g}") for value in written[line["material"]]]
     novelty = [value for _, (value,) in scalars(found, "/answer/novelty", "time") if not np.isnan(value)]

@@ -91,6 +91,7 @@ class Bridge:
         self._touch: Stream | None = None  # the last of the session before this one
         self.paused = False
         self._learned: list[Receipt] = []  # by this bridge; the last may be taken back, see `learned`
+        self.receipt: Receipt | None = None  # of the last `learn`, also of a touch that was learned before
         self._met: dict[str, int] = {}  # by the sessions before this one
         self._answer, self._warn = answer, warn
         self._notes = HealthNotes(learner, None, warn, materials=of is None) if watch else None
@@ -164,7 +165,7 @@ class Bridge:
         touch = self._ended_touch("to learn")
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
             raise InputError(f"{why}, or touch it again")
-        receipt = self.learner.observe(material, touch)
+        receipt = self.receipt = self.learner.observe(material, touch)
         if receipt.repeated:
             return f"{receipt.material}: the last touch was learned already, as observation {receipt.sequence}"
         self._learned.append(receipt)

@@ -162,8 +162,8 @@ class TactileNode:
     def _learn(self, request: Any, response: Any) -> Any:
         """Serve scroll_tactile_msgs/srv/Learn."""
         _answer(response, lambda: self.bridge.learn(request.material))
-        if response.success and self.bridge.learned is not None:
-            response.observation = self.bridge.learned.sequence
+        if response.success and self.bridge.receipt is not None:
+            response.observation = self.bridge.receipt.sequence
         return response
 
     def _take(self, message: Any, published: float, lost: int) -> None:

@@ -171,6 +171,10 @@ def test_a_touch_is_learned_once_and_forgotten(tmp_path):
         assert made.learn("felt").startswith("felt: ")
         assert own.materials["felt"] == 1
         assert "learned already, as observation" in made.learn("felt") and own.materials["felt"] == 1
+        again, _, _ = bridge(source=own)  # as after a restart
+        run(again)
+        assert "learned already" in again.learn("felt") and again.learned is None
+        assert again.receipt == made.receipt == made.learned is not None
         with pytest.raises(errors.InputError, match="already, as 'felt' and not as 'denim': relabel one of them"):
             made.learn("denim")
         assert made.forget("felt") == "felt: 1 observation forgotten"

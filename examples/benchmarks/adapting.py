@@ -8,10 +8,9 @@ are five, adapt the memory; the rest are judged, as they were recorded, as the o
 
 from __future__ import annotations
 
-import json as text
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import typer
 
-from examples.benchmarks.health import Touches, read_sets
+from examples.benchmarks.health import Measured, Touches, read_sets
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner
@@ -142,15 +141,6 @@ def _sets(data: Path | None, seed: int, only: str | None) -> Iterator[Touches]:
     return (touches for touches in read_sets(data, seed) if only is None or touches.name.startswith(only))
 
 
-def _whole_lines(cache: Path) -> list[Any]:
-    """What was measured before; the last line is taken off where a run was killed as it wrote it."""
-    written = cache.read_bytes()
-    whole = written[: written.rfind(b"\n") + 1]
-    if whole != written:
-        cache.write_bytes(whole)
-    return [text.loads(line) for line in whole.splitlines()]
-
-
 def run_adapting(
     data: Path | None,
     *,
@@ -162,24 +152,16 @@ def run_adapting(
     note: Callable[[str], None],
 ) -> Record:
     """A record for each set and case. cache: a file of what was measured already, one line a unit."""
-    done: dict[tuple[Any, ...], Record] = {}
-    if cache is not None and cache.is_file():
-        done = {tuple(key): value for key, value in _whole_lines(cache)}
-    records = []
+    measured, records = Measured(cache), []
     with one_thread(), TemporaryDirectory() as folder:
         for touches in _sets(data, seed, only):
             learned = Learned(touches, Path(folder), seed)
             for case in CASES:
                 note(f"{touches.name}: {case}")
-                own = []
-                for unit in range(seed, seed + units):
-                    key = (touches.name, case, unit, judged)
-                    if key not in done:
-                        done[key] = run_unit(learned, case, unit, judged)
-                        if cache is not None:
-                            with cache.open("a", encoding="utf-8") as file:
-                                file.write(text.dumps([key, done[key]]) + "\n")
-                    own.append(done[key])
+                own = [
+                    measured.get((touches.name, case, unit, judged), partial(run_unit, learned, case, unit, judged))
+                    for unit in range(seed, seed + units)
+                ]
                 records.append(summed(touches.name, case, own))
             if "learner" in vars(learned):
                 learned.learner.close()

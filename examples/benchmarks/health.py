@@ -10,6 +10,7 @@ from __future__ import annotations
 import json as text
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import process_time
 from typing import Annotated, Any
@@ -32,7 +33,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.simulation.scene import Scene
 
-__all__ = ["health", "run_health"]
+__all__ = ["Measured", "health", "run_health"]
 
 Record = dict[str, Any]
 Floats = npt.NDArray[np.float64]
@@ -218,6 +219,29 @@ def beside_peers(touches: Touches, sound: list[Any], orders: int, seed: int) -> 
     return peer_records(touches.name, cases), {"set": touches.name} | oracle_difference(cases["none"][0])
 
 
+class Measured:
+    """What was measured before, by its key. cache: a file with a line for each, which what is measured is added to."""
+
+    def __init__(self, cache: Path | None) -> None:
+        self._cache = cache
+        self._done: dict[tuple[Any, ...], Record] = {}
+        if cache is not None and cache.is_file():
+            written = cache.read_bytes()
+            whole = written[: written.rfind(b"\n") + 1]
+            if whole != written:  # a run was killed as it wrote the last line
+                cache.write_bytes(whole)
+            self._done = {tuple(key): value for key, value in map(text.loads, whole.splitlines())}
+
+    def get(self, key: tuple[Any, ...], measure: Callable[[], Record]) -> Record:
+        """What was measured, now or before."""
+        if key not in self._done:
+            self._done[key] = measure()
+            if self._cache is not None:
+                with self._cache.open("a", encoding="utf-8") as file:
+                    file.write(text.dumps([key, self._done[key]]) + "\n")
+        return self._done[key]
+
+
 def run_health(
     data: Path | None,
     *,
@@ -229,9 +253,7 @@ def run_health(
     note: Callable[[str], None],
 ) -> Record:
     """A record for each set and case. cache: a file of what was measured already, one line an order. only: the set."""
-    done: dict[tuple[Any, ...], Record] = {}
-    if cache is not None and cache.is_file():
-        done = {tuple(key): value for key, value in map(text.loads, cache.read_text("utf-8").splitlines())}
+    measured = Measured(cache)
     records, compared, oracles = list[Record](), list[Record](), list[Record]()
     with one_thread():
         for touches in read_sets(data, seed):
@@ -244,15 +266,10 @@ def run_health(
                 compared, oracles = compared + others, [*oracles, oracle]
             for case in (*NONE, *ONE, *MANY, *AT_REST) if orders else ():
                 note(f"{touches.name}: {case}")
-                own = []
-                for order in range(seed, seed + orders):
-                    key = (touches.name, case, order)
-                    if key not in done:
-                        done[key] = run_order(touches, sound, case, order)
-                        if cache is not None:
-                            with cache.open("a", encoding="utf-8") as file:
-                                file.write(text.dumps([key, done[key]]) + "\n")
-                    own.append(done[key])
+                own = [
+                    measured.get((touches.name, case, order), partial(run_order, touches, sound, case, order))
+                    for order in range(seed, seed + orders)
+                ]
                 records.append(summed(touches.name, case, own))
     found = {"bench": "health", "bound": BOUND, "records": records, "peers": compared, "oracles": oracles}
     return found | ({"skipped": lacking()} if peers else {})

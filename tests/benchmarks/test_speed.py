@@ -15,8 +15,8 @@ from commands import refused, run
 import scroll_tactile
 from examples.benchmarks import checkouts as sides_of
 from examples.benchmarks import many_materials, speed
-from examples.benchmarks.adapting import _whole_lines
 from examples.benchmarks.checkouts import HERE, NAME_BYTES, Worker, checkouts, disk_bytes, write_touches
+from examples.benchmarks.health import Measured
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.speed_bench import Sizes
 from examples.benchmarks.speed_touches import SKIN
@@ -149,8 +149,12 @@ def test_touches_of_another_seed_are_not_taken_for_ones_own(tmp_path):
 
 def test_what_was_measured_is_found_again_up_to_a_line_that_was_cut(tmp_path):
     (tmp_path / "cache").write_text('[["a", 1], {}]\n[["b", 2]')
-    assert _whole_lines(tmp_path / "cache") == [[["a", 1], {}]]
-    assert (tmp_path / "cache").read_text() == '[["a", 1], {}]\n'
+    for _ in range(2):
+        cached = Measured(tmp_path / "cache")
+        assert cached.get(("a", 1), pytest.fail) == {}
+        assert cached.get(("b", 2), lambda: {"found": 3}) == {"found": 3}
+    assert (tmp_path / "cache").read_text() == '[["a", 1], {}]\n[["b", 2], {"found": 3}]\n'
+    assert Measured(None).get(("a",), lambda: {"now": 1}) == {"now": 1}
 
 
 def test_the_command_measures_prints_and_writes_it(tmp_path, monkeypatch, measured):

@@ -28,10 +28,11 @@ MOST_STEPS = 2**20
 MOST_QUANTITIES = 64  # of a memory
 LONGEST_UNIT = 40  # characters
 
-_NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
+# Each text is read in one way, or a long heading from elsewhere would take a power of its length.
+_NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]+)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 # Its name and unit in brackets; a range and a resolution, which a table's heading may leave out.
 WRITTEN = re.compile(
-    rf"(?P<name>\S.*?)\s*\[(?P<unit>[^\[\]]+)\]"
+    rf"(?P<name>\S(?:.*?\S)?)\s*\[(?P<unit>[^\[\]]+)\]"
     rf"(?:\s*(?P<low>{_NUMBER})\s*\.\.\s*(?P<high>{_NUMBER})\s+step\s+(?P<resolution>{_NUMBER}))?"
 )
 _Number = Annotated[FiniteFloat, Field(strict=False)]

@@ -96,6 +96,8 @@ class Sensor(BaseModel):
 
     @model_validator(mode="after")
     def _touch_holds_a_reading(self) -> Self:
+        if not math.isfinite(self.rate * self.duration):
+            raise ValueError(f"{self.duration:g} s at {self.rate:g} Hz holds more readings than can be counted")
         if self.readings < 1:
             raise ValueError(f"{self.duration:g} s at {self.rate:g} Hz holds no reading")
         return self

@@ -68,6 +68,7 @@ def test_a_sensor_is_frozen():
         ({"camera": True}, r"a camera needs layout=\(height, width, 3\); it is None"),
         ({"camera": True, "layout": (3, 2, 1)}, r"it is \(3, 2, 1\)"),
         ({"duration": 0.001}, "0.001 s at 50 Hz holds no reading"),
+        ({"duration": 1e308}, r"1e\+308 s at 50 Hz holds more readings than can be counted"),
         ({"colour": "red"}, "Extra inputs"),
         ({"low": (0.0,) * 5}, "low has 5 entries for 6 channels: give one, or one each"),
         ({"high": (1.0,) * 7}, "high has 7 entries for 6 channels"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Iterator, Mapping
@@ -42,6 +43,7 @@ __all__ = ["live"]
 
 SHOWN = 5  # materials
 BAR = 30  # characters of a probability of one
+LONGEST_LINE = 2**24  # characters of a reading, of a camera, too
 
 
 def live(
@@ -169,7 +171,7 @@ def _rows(
         raise InputError(
             f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
         )
-    for number, line in enumerate(sys.stdin, start=1):
+    for number, line in enumerate(_lines(), start=1):
         if not line.strip():
             continue
         try:
@@ -178,6 +180,16 @@ def _rows(
             raise InputError(
                 f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
             ) from None
+
+
+def _lines() -> Iterator[str]:
+    """Lines of the standard input, however long it is. Raises InputError where one does not end."""
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(errors="backslashreplace")  # what is no text is no number, which is said of its line
+    while line := sys.stdin.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE and not line.endswith("\n"):
+            raise InputError(f"standard input: expected a line a reading, of less than {LONGEST_LINE} characters")
+        yield line
 
 
 def _parted(row: npt.NDArray[np.float64], timed: bool) -> tuple[float | None, npt.NDArray[np.float64]]:

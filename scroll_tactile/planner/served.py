@@ -24,10 +24,11 @@ CALL = re.compile(r"^read\((.*)\)$", re.MULTILINE)  # the line to copy of a reco
 Readings = Annotated[
     list[list[float]] | None, Field(description="Rows of one touch in time, each with the sensor's channels.")
 ]
-File = Annotated[str | None, Field(description="In place of readings: a recording in the served folder, by its path.")]
-Topic = Annotated[str | None, Field(description="Of a file with several topics: the one to read.")]
-Place = Annotated[str | None, Field(description="Of a file with several fields: the one to read.")]
-Columns = Annotated[str | None, Field(description="Of a file with more channels: those to take, such as 0:2.")]
+Text = Annotated[str, Field(max_length=1000)]
+File = Annotated[Text | None, Field(description="In place of readings: a recording in the served folder, by its path.")]
+Topic = Annotated[Text | None, Field(description="Of a file with several topics: the one to read.")]
+Place = Annotated[Text | None, Field(description="Of a file with several fields: the one to read.")]
+Columns = Annotated[Text | None, Field(description="Of a file with more channels: those to take, such as 0:2.")]
 
 
 class Served:

@@ -56,7 +56,7 @@ def _explained(tools: _Tools, tool: Any, as_error: type[Exception]) -> Callable[
         try:
             tools.learner.refresh()  # a client keeps its server for days, and others may learn meanwhile
             return tool(*values, **named)
-        except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
+        except (ScrollTactileError, StoreError, OSError, MemoryError, UnicodeError) as error:
             raise as_error(tools.without_paths(str(error)) or type(error).__name__) from error
 
     return explained

@@ -100,8 +100,9 @@ def matched(field: str, keys: Collection[str], source: str) -> tuple[str, str]:
     """
     if field in keys:
         return field, ""
-    written = re.fullmatch(r"\s*(.*?)\s*((?:\[[^\]]*\])?)\s*", field, re.DOTALL)
-    name, rest = written.groups() if written else (field, "")
+    name, rest = field.strip(), ""
+    if name.endswith("]") and (begin := name.find("[", name.rfind("]", 0, -1) + 1)) >= 0:
+        name, rest = name[:begin].rstrip(), name[begin:]
     if name in keys:
         return name, rest
     ends = [key for key in keys if re.split(r"[/.]", key)[-1] == name or key.endswith(f"/{name}")]

@@ -99,6 +99,13 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,x\n"))
     with pytest.raises(replay.InputError, match="line 2"):
         list(replay._rows(replay.Path("-")))
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"1,2\n\xff\xfe,1\n"), encoding="utf-8"))
+    with pytest.raises(replay.InputError, match=r"line 2.*xff"):
+        list(replay._rows(replay.Path("-")))
+    monkeypatch.setattr(replay, "LONGEST_LINE", 8)
+    monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,456789\n"))
+    with pytest.raises(replay.InputError, match="a line a reading, of less than 8 characters"):
+        list(replay._rows(replay.Path("-")))
 
 
 @pytest.mark.parametrize("option", ["--mcap", "--rerun"])

@@ -156,6 +156,15 @@ def test_a_quantity_is_read_as_it_is_written(quantity):
             Quantity.parsed(text)
 
 
+@pytest.mark.parametrize(
+    "text", [f"a [N] {'1' * 3000}..{'1' * 3000} step x", f"a{' ' * 20000}x", "a [N]" * 3000 + " 0"]
+)
+def test_a_long_heading_from_elsewhere_is_refused_at_once(text):
+    """Each number could once be read in as many ways as it has digits, which would not end."""
+    with pytest.raises(InputError, match="expected a quantity such as"):
+        Quantity.parsed(text)
+
+
 def test_the_command_line_declares_observes_answers_and_lists_them(data, tmp_path):
     memory = str(tmp_path / "m")
     TactileLearner.open(memory, **SETTINGS).close()

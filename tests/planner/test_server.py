@@ -93,14 +93,23 @@ def test_what_cannot_be_is_a_tools_error_that_says_what_to_do(folder):
         ("what_is_felt", {"readings": [[0.1, 0.2], [0.1]]}),
         ("what_is_felt", {"readings": [[0.5, 0.5]] * 4, "scene": ["nothing"]}),
         ("what_is_felt", {"readings": "no numbers"}),
+        ("what_is_felt", {"file": "day/t.npy", "field": "a" + " " * 5000 + "x"}),
         ("what_to_touch_again", {"most": 10**9}),
         ("observe", {"material": "d", "readings": [[0.5, 0.5]] * 9}),
         *files,
     ]
     _, answers = talk(folder, "--files", folder / "files", calls=calls)
-    told = ["one of them", "one of them", "(T, 2)", "Were values lost", "nothing", "readings", "most", "observe"] + [
-        "in the served folder"
-    ] * 5
+    told = [
+        "one of them",
+        "one of them",
+        "(T, 2)",
+        "Were values lost",
+        "nothing",
+        "readings",
+        "1000",
+        "most",
+        "observe",
+    ] + ["in the served folder"] * 5
     for (name, arguments), answer, words in zip(calls, answers, told, strict=True):
         assert isinstance(answer, str) and words in answer, (name, arguments, answer)
         assert str(folder) not in answer
@@ -192,6 +201,8 @@ def test_a_call_is_bounded(folder, monkeypatch):
             tools.what_is_felt([[0.0, 1.0]] * 6)
         with pytest.raises(InputError, match="expected a recording"):
             tools.what_is_felt(file="day/t.npy")
+        with pytest.raises(ArithmeticError, match="surrogates not allowed"):  # the server's own error, which is told
+            server._explained(tools, tools.what_is_felt, ArithmeticError)(file="a\ud800.npy")
 
 
 def test_what_cannot_be_served_is_one_red_line(folder):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import FieldError
-from scroll_tactile.recordings.paths import FieldPath
+from scroll_tactile.recordings.paths import FieldPath, matched
 
 
 @dataclass
@@ -106,3 +106,24 @@ def test_any_text_is_a_path_or_a_field_error(text):
     except FieldError:
         return
     assert reading.ndim == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("obs/skin", ("obs/skin", "")),
+        (" skin ", ("obs/skin", "")),
+        ("skin [0:3] ", ("obs/skin", "[0:3]")),
+        ("skin[[1]", ("obs/skin", "[[1]")),
+        ("a[0][1]", ("a[0]", "[1]")),
+        ("a[0]", ("a[0]", "")),
+    ],
+)
+def test_a_field_of_arrays_is_found_with_the_index_behind_it(text, found):
+    assert matched(text, ["obs/skin", "a[0]"], "x.h5") == found
+
+
+@pytest.mark.parametrize("text", ["a" + " " * 5000 + "x", "[" * 20000 + "]x", "skin]", "skin[", "[0]", "]"])
+def test_a_field_of_arrays_that_is_not_there_is_refused_however_long(text):
+    with pytest.raises(FieldError, match="has no field"):
+        matched(text, ["obs/skin"], "x.h5")

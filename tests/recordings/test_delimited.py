@@ -7,6 +7,7 @@ import pytest
 
 from scroll_tactile.errors import FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, iterate, read
+from scroll_tactile.recordings.delimited import is_number
 
 
 def table(folder: Path, text: str, name: str = "t.csv") -> Path:
@@ -125,3 +126,13 @@ def test_the_slow_way_gives_the_same_as_the_fast(tmp_path):
     (tmp_path / "slow.csv").write_text("\n".join(",".join(f'"{c}"' for c in line.split(",")) for line in text.split()))
     for name in ("fast", "slow"):
         np.testing.assert_array_equal(read(tmp_path / f"{name}.csv").readings, values)
+
+
+@pytest.mark.parametrize(
+    ("cell", "is_one"),
+    [("1", True), ("1.", True), (".5", True), ("-1.5e-3", True), ("inf", True), ("1.e5", True), (" 2 ", True)]
+    + [("", False), (".", False), ("1_0", False), ("e5", False), ("1.2.3", False), ("1" * 200_000 + "x", False)],
+    ids=lambda value: str(value)[:12],
+)
+def test_a_cell_is_a_number_or_not_however_long(cell, is_one):
+    assert is_number(cell) is is_one

@@ -19,6 +19,7 @@ from scroll_tactile.errors import InputError, RecordingError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
 from scroll_tactile.pipelines.annotating.frame_answers import Cut, Episodes
+from scroll_tactile.pipelines.annotating.noted import COUNTS, LOGS, require_movable, require_no_links, require_notes
 from scroll_tactile.pipelines.annotating.placing import MADE, RECORD, clear, place, require_own_folders
 from scroll_tactile.pipelines.annotating.rewriting import (
     copy_others,
@@ -42,7 +43,6 @@ from scroll_tactile.recordings.recording import only_columns
 
 __all__ = ["Annotated", "annotate"]
 
-LOGS = "mcap"  # the folder of the episodes' logs
 WORK = ".annotating"  # the suffix of the folder that is worked in, behind the name of the one that is made
 
 
@@ -127,7 +127,9 @@ def annotate(
     asked |= {"replace": replace}
     work = target.with_name(target.name + WORK)
     with alone_in(work, target):
+        require_no_links(work)
         record = RunFile(work / RECORD, {"dataset": str(Path(dataset).resolve()), "target": str(target.resolve())})
+        require_notes(record.notes, work, in_place=in_place)
         try:
             differs = _differing(record, asked, work)
             if "moving" not in record.notes:
@@ -221,6 +223,7 @@ class _Rewritten:
             require_each_once(self.source, self.names)
             state = _state_of(self.source.path)
         if in_place:
+            require_movable(self.names)
             require_own_folders(self.target, [*self.names, "meta/info.json", *[f"{LOGS}/*.mcap"] * self.logged])
         self.in_place = in_place
         if self.record.notes.setdefault("source", state) != state:
@@ -319,5 +322,4 @@ def _state_of(folder: Path) -> str:
 
 def _summary(done: dict[str, dict[str, int]], episodes: int) -> dict[str, int]:
     """What all files together have."""
-    counted = {name: sum(of[name] for of in done.values()) for name in ("frames", "answered", "touches", "events")}
-    return {"episodes": episodes, **counted, "left_out": sum(of["left_out"] for of in done.values())}
+    return {"episodes": episodes} | {name: sum(of[name] for of in done.values()) for name in COUNTS}

@@ -291,7 +291,7 @@ def _frames(
 
 def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
     """The columns that give way. Raises InputError where there are some without replace, or of somebody else."""
-    ours = [name for name, about in source.features.items() if is_written(about)]
+    ours = [name for name, about in source.features.items() if is_written(name, about)]
     wanted = [name for name in ours if (made.language if name == EVENTS else made.numbers)]
     there = [name for name in made.features if name in source.features]
     if strangers := [name for name in there if name not in ours and name != EVENTS]:

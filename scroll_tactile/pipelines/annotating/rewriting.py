@@ -172,7 +172,7 @@ def write_metadata(
         written.append("meta/stats.json")
     info = _json(source, "info.json")
     features = _without(info["features"], [name for name in dropped if name != EVENTS])
-    theirs = {EVENTS: features[EVENTS]} if EVENTS in features and not is_written(features[EVENTS]) else {}
+    theirs = {EVENTS: features[EVENTS]} if EVENTS in features and not is_written(EVENTS, features[EVENTS]) else {}
     info["features"] = features | columns.features | theirs  # what others say of their events stays
     _write_json(folder / "meta" / "info.json", info)
     return [*written, "meta/info.json"]

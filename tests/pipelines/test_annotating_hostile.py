@@ -1,0 +1,39 @@
+"""Data sets that claim what is not so: nothing of theirs is lost, and what is refused is refused before the answers."""
+
+import json
+
+import live_touches
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from live_touches import slide
+from robot_sets import robot_set, whole
+
+from scroll_tactile import annotate
+from scroll_tactile.pipelines.annotating import annotation_run
+
+FRAMES = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    random = np.random.default_rng(5)
+    return robot_set(tmp_path / "set", [(f"slide {m}", slide(m, 50, random).astype(np.float32)) for m in "ab"])
+
+
+@pytest.fixture
+def unanswered(monkeypatch):
+    """Nothing is answered."""
+    monkeypatch.setattr(annotation_run, "write_data", lambda *_: pytest.fail("answered"))
+
+
+@pytest.mark.parametrize("name", ["timestamp", "note"])
+def test_what_a_robot_recorded_is_never_replaced_whoever_is_said_to_have_written_it(folder, name):
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"][name]["info"] = {"written by": "scroll-tactile"}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    before = pq.read_table(folder / FRAMES)
+    annotate(live_touches.learner(), folder, field="pad", in_place=True, replace=True)
+    assert whole(folder).select(before.schema.names).equals(before)
+    assert name in json.loads((folder / "meta/info.json").read_text())["features"]

@@ -37,3 +37,20 @@ def test_what_a_robot_recorded_is_never_replaced_whoever_is_said_to_have_written
     annotate(live_touches.learner(), folder, field="pad", in_place=True, replace=True)
     assert whole(folder).select(before.schema.names).equals(before)
     assert name in json.loads((folder / "meta/info.json").read_text())["features"]
+
+
+@pytest.mark.parametrize("data", [b"", b"some", b"some" * 300_000])
+def test_the_holes_of_a_file_are_copied_as_holes(folder, data):
+    with (folder / "notes.bin").open("wb") as file:
+        file.write(data[:4])
+        file.seek(1 << 28)
+        file.write(data)
+        file.truncate(1 << 29)
+    if 512 * (folder / "notes.bin").stat().st_blocks > 1 << 26:
+        pytest.skip("a file has no holes here: the file system writes them out")
+    copy = annotate(live_touches.learner(), folder, field="pad").output / "notes.bin"
+    assert copy.stat().st_size == 1 << 29 and 512 * copy.stat().st_blocks < 1 << 26
+    with copy.open("rb") as file:
+        assert file.read(5) == data[:4].ljust(5, b"\0")
+        file.seek((1 << 28) - 1)
+        assert file.read(len(data) + 2) == b"\0" + data + b"\0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 _LONGEST = 1 << 26  # bytes of stats.json
+_PIECE = 1 << 20  # bytes that are copied at a time
 _COUNTS = ("count",)  # statistics that are whole numbers, whatever they are of
 _DRAFT = ".new"  # at the end of a file's name while it is written: no reader takes it for one of the set's
 
@@ -261,7 +263,29 @@ def copied(path: Path, target: Path, *, linked: bool = False) -> None:
             with suppress(OSError):  # other devices, and file systems without
                 os.link(path, draft)
                 return
-        shutil.copyfile(path, draft)
+        _copy(path, draft)
+
+
+def _copy(path: Path, target: Path) -> None:
+    """Copy a file's bytes. Its holes stay holes where the system tells them: it may claim to be larger than a disk."""
+    about = path.stat()
+    if not hasattr(os, "SEEK_DATA") or 512 * about.st_blocks >= about.st_size:
+        shutil.copyfile(path, target)
+        return
+    with path.open("rb", buffering=0) as file, target.open("wb") as copy:
+        end = 0
+        while end < about.st_size:
+            try:
+                at = file.seek(end, os.SEEK_DATA)
+            except OSError as error:
+                if error.errno != errno.ENXIO:  # nothing but a hole is left
+                    raise
+                break
+            end = file.seek(at, os.SEEK_HOLE)
+            copy.seek(file.seek(at))
+            while at < end and (data := file.read(min(end - at, _PIECE))):
+                at += copy.write(data)
+        copy.truncate(about.st_size)
 
 
 @contextmanager

@@ -4,12 +4,14 @@ import json
 
 import live_touches
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from live_touches import slide
-from robot_sets import robot_set, whole
+from robot_sets import FIELD, robot_set, whole
 
 from scroll_tactile import annotate
+from scroll_tactile.errors import RecordingError
 from scroll_tactile.pipelines.annotating import annotation_run
 
 FRAMES = "data/chunk-000/file-000.parquet"
@@ -54,3 +56,27 @@ def test_the_holes_of_a_file_are_copied_as_holes(folder, data):
         assert file.read(5) == data[:4].ljust(5, b"\0")
         file.seek((1 << 28) - 1)
         assert file.read(len(data) + 2) == b"\0" + data + b"\0"
+
+
+def frames(folder, count, **columns):
+    """Write as many frames, which take next to no room on the disk, with these columns in the place of theirs."""
+    none, numbers = np.zeros(count, int), np.arange(count)
+    whole = {"timestamp": numbers / 50, "frame_index": none, "episode_index": none, "index": none, "task_index": none}
+    readings = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(2 * count, np.float32)), 2)
+    packed = dict.fromkeys(("episode_index", "index"), "DELTA_BINARY_PACKED")
+    table = pa.table({FIELD: readings, **(whole | columns)})
+    pq.write_table(table, folder / FRAMES, compression="zstd", use_dictionary=False, column_encoding=packed)
+
+
+def test_logs_are_bounded_by_what_the_data_set_has_on_the_disk(folder, unanswered):
+    frames(folder, 3000, episode_index=np.arange(3000))
+    with pytest.raises(RecordingError, match=r"claims to hold .* steps of work in"):
+        annotate(live_touches.learner(), folder, field="pad", forms=("numbers", "mcap"))
+
+
+def test_short_episodes_that_are_there_have_their_logs(tmp_path, monkeypatch):
+    random = np.random.default_rng(5)
+    folder = robot_set(tmp_path / "set", [("a", slide("a", 10, random)) for _ in range(300)])
+    monkeypatch.setattr(annotation_run._Rewritten, "write", lambda *_: pytest.fail("the answers are begun"))
+    with pytest.raises(pytest.fail.Exception, match="begun"):
+        annotate(live_touches.learner(), folder, field="pad", forms=("numbers", "mcap"))

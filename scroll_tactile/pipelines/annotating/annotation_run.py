@@ -220,7 +220,7 @@ class _Rewritten:
                 raise InputError(f"{self.source.address} has a folder {LOGS!r} already: replace=True writes over it")
             for _ in own_files(self.source.path, "meta" if in_place else ""):
                 pass  # each is checked
-            require_each_once(self.source, self.names)
+            require_each_once(self.source, self.names, logged=self.logged)
             state = _state_of(self.source.path)
         if in_place:
             require_movable(self.names)

@@ -35,6 +35,7 @@ __all__ = [
 
 _LONGEST = 1 << 26  # bytes of stats.json
 _PIECE = 1 << 20  # bytes that are copied at a time
+_LOG = 4096  # steps of work that a log takes
 _COUNTS = ("count",)  # statistics that are whole numbers, whatever they are of
 _DRAFT = ".new"  # at the end of a file's name while it is written: no reader takes it for one of the set's
 
@@ -54,10 +55,11 @@ def names_in(source: LeRobot) -> list[str]:
     return found
 
 
-def require_each_once(source: LeRobot, names: Sequence[str]) -> None:
+def require_each_once(source: LeRobot, names: Sequence[str], *, logged: bool) -> None:
     """Raises RecordingError for an episode in two places: two touches would be made of it, and one log of the two.
 
-    Raises FieldError where frames have no number of their episode.
+    logged: whether each has a log, a file of its own, which counts towards the budget: of what takes next to no room
+    on the disk there could be one a frame. Raises FieldError where frames have no number of their episode.
     """
     found: set[int] = set()
     for name in names:
@@ -75,6 +77,8 @@ def require_each_once(source: LeRobot, names: Sequence[str]) -> None:
                             f"episode {number} of {source.address} is in two places, the second in {name}: expected "
                             "its frames in one file, one after the other"
                         )
+                    if number not in found:
+                        source.budget.work(_LOG * logged)
                     found.add(number)
                     last = number
 

@@ -8,10 +8,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from live_touches import slide
-from robot_sets import FIELD, robot_set, whole
+from robot_sets import FIELD, contents, robot_set, whole
 
 from scroll_tactile import annotate
-from scroll_tactile.errors import RecordingError
+from scroll_tactile.errors import InputError, RecordingError
 from scroll_tactile.pipelines.annotating import annotation_run
 
 FRAMES = "data/chunk-000/file-000.parquet"
@@ -80,3 +80,19 @@ def test_short_episodes_that_are_there_have_their_logs(tmp_path, monkeypatch):
     monkeypatch.setattr(annotation_run._Rewritten, "write", lambda *_: pytest.fail("the answers are begun"))
     with pytest.raises(pytest.fail.Exception, match="begun"):
         annotate(live_touches.learner(), folder, field="pad", forms=("numbers", "mcap"))
+
+
+def test_a_link_to_nothing_takes_the_name_that_metadata_would_be_kept_by(folder, tmp_path):
+    (folder / "meta.before").symlink_to(tmp_path / "nowhere")
+    before = contents(folder / "meta")
+    done = annotate(live_touches.learner(), folder, field="pad", in_place=True)
+    assert done.kept == folder / "meta.before-2" and contents(done.kept) == before
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_no_name_to_keep_metadata_by_is_said_before_anything_is_answered(folder, unanswered):
+    for name in ("meta.before", *(f"meta.before-{number}" for number in range(2, 1000))):
+        (folder / name).mkdir()
+    with pytest.raises(InputError, match=r"everything from meta.before to meta.before-999: remove some, or .*output="):
+        annotate(live_touches.learner(), folder, field="pad", in_place=True)
+    assert not folder.with_name("set.annotating").exists()

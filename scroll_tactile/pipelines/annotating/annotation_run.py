@@ -20,7 +20,7 @@ from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
 from scroll_tactile.pipelines.annotating.frame_answers import Cut, Episodes
 from scroll_tactile.pipelines.annotating.noted import COUNTS, LOGS, require_movable, require_no_links, require_notes
-from scroll_tactile.pipelines.annotating.placing import MADE, RECORD, clear, place, require_own_folders
+from scroll_tactile.pipelines.annotating.placing import MADE, RECORD, clear, free_name, place, require_own_folders
 from scroll_tactile.pipelines.annotating.rewriting import (
     copy_others,
     drafted,
@@ -223,6 +223,7 @@ class _Rewritten:
             require_each_once(self.source, self.names, logged=self.logged)
             state = _state_of(self.source.path)
         if in_place:
+            free_name(self.target)
             require_movable(self.names)
             require_own_folders(self.target, [*self.names, "meta/info.json", *[f"{LOGS}/*.mcap"] * self.logged])
         self.in_place = in_place

@@ -1,6 +1,8 @@
 """Data sets that claim what is not so: nothing of theirs is lost, and what is refused is refused before the answers."""
 
 import json
+import os
+from pathlib import Path
 
 import live_touches
 import numpy as np
@@ -11,8 +13,9 @@ from live_touches import slide
 from robot_sets import FIELD, contents, robot_set, whole
 
 from scroll_tactile import annotate
-from scroll_tactile.errors import InputError, RecordingError
+from scroll_tactile.errors import FieldError, InputError, RecordingError
 from scroll_tactile.pipelines.annotating import annotation_run
+from scroll_tactile.recordings import read
 
 FRAMES = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -96,3 +99,39 @@ def test_no_name_to_keep_metadata_by_is_said_before_anything_is_answered(folder,
     with pytest.raises(InputError, match=r"everything from meta.before to meta.before-999: remove some, or .*output="):
         annotate(live_touches.learner(), folder, field="pad", in_place=True)
     assert not folder.with_name("set.annotating").exists()
+
+
+def changed(folder, name, change):
+    """Write a table of the data set as a function makes it."""
+    pq.write_table(change(pq.read_table(folder / name)), folder / name)
+
+
+def with_column(table, name, values):
+    return table.set_column(table.schema.names.index(name), name, values)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("missing", [1, 100])
+def test_frames_without_the_number_of_their_episode_are_refused_and_nothing_else_is_said(folder, unanswered, missing):
+    values = pa.array([None] * missing + [0] * (100 - missing), pa.int64())
+    changed(folder, FRAMES, lambda table: with_column(table, "episode_index", values))
+    for use in (lambda: annotate(live_touches.learner(), folder, field="pad"), lambda: read(folder, field="pad")):
+        with pytest.raises(FieldError, match=rf"'episode_index' of .* has rows without a number; expected one in each"):
+            use()
+
+
+def test_a_file_without_rows_is_said_to_have_none(folder, unanswered):
+    changed(folder, FRAMES, lambda table: table.slice(0, 0))
+    for use in (lambda: annotate(live_touches.learner(), folder, field="pad"), lambda: read(folder, field="pad")):
+        with pytest.raises(RecordingError, match=r"file-000.parquet has no rows: remove it, or write it again"):
+            use()
+
+
+def test_metadata_in_files_of_any_name_are_copied(folder):
+    name = os.fsencode(folder / "meta") + b"/notes \xff.txt"
+    try:
+        Path(os.fsdecode(name)).write_text("mine")
+    except OSError:
+        pytest.skip("a file has no such name here: the file system takes text only")
+    done = annotate(live_touches.learner(), folder, field="pad", in_place=True)
+    assert (done.kept / os.fsdecode(b"notes \xff.txt")).read_text() == "mine"

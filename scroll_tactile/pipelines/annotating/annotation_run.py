@@ -317,7 +317,7 @@ def _state_of(folder: Path) -> str:
     for path in sorted([*(folder / "data").glob("**/*"), *(folder / "meta").glob("**/*")]):
         if path.is_file():
             about = path.stat()
-            found.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\n".encode())
+            found.update(os.fsencode(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\n"))
     return found.hexdigest()
 
 

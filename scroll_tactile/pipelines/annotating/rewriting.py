@@ -70,6 +70,7 @@ def require_each_once(source: LeRobot, names: Sequence[str], *, logged: bool) ->
             if not source.types.is_integer(kind := file.schema_arrow.field("episode_index").type):
                 raise FieldError(f"column 'episode_index' of {name} holds {kind}; expected whole numbers")
             for batch in file.iter_batches(columns=["episode_index"]):
+                source.require_all(batch.column(0), "episode_index")
                 numbers = batch.column(0).to_numpy(zero_copy_only=False).astype(np.int64)
                 for number in numbers[np.diff(numbers, prepend=numbers[:1] - 1) != 0].tolist():
                     if number in found and number != last:

@@ -116,7 +116,7 @@ def test_frames_without_the_number_of_their_episode_are_refused_and_nothing_else
     values = pa.array([None] * missing + [0] * (100 - missing), pa.int64())
     changed(folder, FRAMES, lambda table: with_column(table, "episode_index", values))
     for use in (lambda: annotate(live_touches.learner(), folder, field="pad"), lambda: read(folder, field="pad")):
-        with pytest.raises(FieldError, match=rf"'episode_index' of .* has rows without a number; expected one in each"):
+        with pytest.raises(FieldError, match=r"'episode_index' of .* has rows without a number; expected one in each"):
             use()
 
 
@@ -135,3 +135,25 @@ def test_metadata_in_files_of_any_name_are_copied(folder):
         pytest.skip("a file has no such name here: the file system takes text only")
     done = annotate(live_touches.learner(), folder, field="pad", in_place=True)
     assert (done.kept / os.fsdecode(b"notes \xff.txt")).read_text() == "mine"
+
+
+TABLES = {
+    "none": (lambda table: table.drop_columns(["episode_index"]), r"0 columns 'episode_index'"),
+    "two": (lambda table: table.append_column("episode_index", table["episode_index"]), r"2 columns .*int64, int64"),
+    "lists": (lambda table: with_column(table, "episode_index", pa.array([[0], [1]])), r"1 columns .*list"),
+    "texts": (lambda table: with_column(table, "episode_index", pa.array(["0", "1"])), r"1 columns .*string"),
+}
+
+
+@pytest.mark.parametrize(("change", "said"), TABLES.values(), ids=TABLES)
+def test_tables_of_episodes_are_looked_at_before_anything_is_answered(folder, unanswered, change, said):
+    changed(folder, EPISODES, change)
+    with pytest.raises(FieldError, match=rf"{EPISODES} of .* has {said}.*expected one of whole numbers"):
+        annotate(live_touches.learner(), folder, field="pad")
+    assert not folder.with_name("set-annotated.annotating").exists()
+
+
+def test_statistics_are_looked_at_before_anything_is_answered(folder, unanswered):
+    (folder / "meta/stats.json").write_text("[1]")
+    with pytest.raises(RecordingError, match=r"meta/stats.json of .* is a list; expected names"):
+        annotate(live_touches.learner(), folder, field="pad")

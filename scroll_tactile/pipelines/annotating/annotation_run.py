@@ -27,6 +27,7 @@ from scroll_tactile.pipelines.annotating.rewriting import (
     names_in,
     own_files,
     require_each_once,
+    require_metadata,
     statistics_in,
     wanted_statistics,
     write_data,
@@ -220,6 +221,7 @@ class _Rewritten:
                 raise InputError(f"{self.source.address} has a folder {LOGS!r} already: replace=True writes over it")
             for _ in own_files(self.source.path, "meta" if in_place else ""):
                 pass  # each is checked
+            require_metadata(self.source, self.made)
             require_each_once(self.source, self.names, logged=self.logged)
             state = _state_of(self.source.path)
         if in_place:

@@ -27,6 +27,7 @@ __all__ = [
     "names_in",
     "own_files",
     "require_each_once",
+    "require_metadata",
     "statistics_in",
     "wanted_statistics",
     "write_data",
@@ -82,6 +83,24 @@ def require_each_once(source: LeRobot, names: Sequence[str], *, logged: bool) ->
                         source.budget.work(_LOG * logged)
                     found.add(number)
                     last = number
+
+
+def require_metadata(source: LeRobot, columns: TouchColumns) -> None:
+    """Raises FieldError or RecordingError for metadata that no statistics of answers can be added to."""
+    wanted_statistics(source, source.column())
+    for path in _tables(source, columns):
+        schema = schema_of(source, path)
+        kinds = [field.type for field in schema if field.name == "episode_index"]
+        if any(own.startswith("stats/") for own in schema.names) and [*map(source.types.is_integer, kinds)] != [True]:
+            raise FieldError(
+                f"{path.relative_to(source.path)} of {source.address} has {len(kinds)} columns 'episode_index' "
+                f"({', '.join(map(str, kinds))!s:.100}); expected one of whole numbers"
+            )
+
+
+def _tables(source: LeRobot, columns: TouchColumns) -> list[Path]:
+    """The tables of episodes, to which statistics of columns of numbers are added."""
+    return sorted((source.path / "meta" / "episodes").glob("**/*.parquet")) if columns.numbers else []
 
 
 def write_data(
@@ -159,7 +178,7 @@ def write_metadata(
     from pyarrow import parquet
 
     written = []
-    for path in sorted((source.path / "meta" / "episodes").glob("**/*.parquet")) if columns.numbers else ():
+    for path in _tables(source, columns):
         name = os.path.normpath(path.relative_to(source.path))
         schema = schema_of(source, path)
         if any(own.startswith("stats/") for own in schema.names):
@@ -199,8 +218,6 @@ def _with_statistics(table: Any, columns: TouchColumns, episodes: Mapping[int, A
     """A table of episodes with the statistics of the answers in each."""
     import pyarrow as pa
 
-    if "episode_index" not in table.schema.names:
-        raise FieldError("meta/episodes has no column 'episode_index'")
     gone = tuple(f"stats/{name}/" for name in [*dropped, *columns.numbers])
     table = table.drop_columns([name for name in table.schema.names if name.startswith(gone)])
     example: dict[str, Any] = next(iter(episodes.values()), {})

@@ -19,13 +19,15 @@ from scroll_tactile.errors import InputError, RecordingError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
 from scroll_tactile.pipelines.annotating.frame_answers import Cut, Episodes
-from scroll_tactile.pipelines.annotating.placing import MADE, RECORD, clear, place, require_own_folders
+from scroll_tactile.pipelines.annotating.noted import COUNTS, LOGS, require_movable, require_no_links, require_notes
+from scroll_tactile.pipelines.annotating.placing import MADE, RECORD, clear, free_name, place, require_own_folders
 from scroll_tactile.pipelines.annotating.rewriting import (
     copy_others,
     drafted,
     names_in,
     own_files,
     require_each_once,
+    require_metadata,
     statistics_in,
     wanted_statistics,
     write_data,
@@ -42,7 +44,6 @@ from scroll_tactile.recordings.recording import only_columns
 
 __all__ = ["Annotated", "annotate"]
 
-LOGS = "mcap"  # the folder of the episodes' logs
 WORK = ".annotating"  # the suffix of the folder that is worked in, behind the name of the one that is made
 
 
@@ -127,7 +128,9 @@ def annotate(
     asked |= {"replace": replace}
     work = target.with_name(target.name + WORK)
     with alone_in(work, target):
+        require_no_links(work)
         record = RunFile(work / RECORD, {"dataset": str(Path(dataset).resolve()), "target": str(target.resolve())})
+        require_notes(record.notes, work, in_place=in_place)
         try:
             differs = _differing(record, asked, work)
             if "moving" not in record.notes:
@@ -218,9 +221,12 @@ class _Rewritten:
                 raise InputError(f"{self.source.address} has a folder {LOGS!r} already: replace=True writes over it")
             for _ in own_files(self.source.path, "meta" if in_place else ""):
                 pass  # each is checked
-            require_each_once(self.source, self.names)
+            require_metadata(self.source, self.made)
+            require_each_once(self.source, self.names, logged=self.logged)
             state = _state_of(self.source.path)
         if in_place:
+            free_name(self.target)
+            require_movable(self.names)
             require_own_folders(self.target, [*self.names, "meta/info.json", *[f"{LOGS}/*.mcap"] * self.logged])
         self.in_place = in_place
         if self.record.notes.setdefault("source", state) != state:
@@ -288,7 +294,7 @@ def _frames(
 
 def _dropped(source: LeRobot, made: TouchColumns, replace: bool) -> list[str]:
     """The columns that give way. Raises InputError where there are some without replace, or of somebody else."""
-    ours = [name for name, about in source.features.items() if is_written(about)]
+    ours = [name for name, about in source.features.items() if is_written(name, about)]
     wanted = [name for name in ours if (made.language if name == EVENTS else made.numbers)]
     there = [name for name in made.features if name in source.features]
     if strangers := [name for name in there if name not in ours and name != EVENTS]:
@@ -313,11 +319,10 @@ def _state_of(folder: Path) -> str:
     for path in sorted([*(folder / "data").glob("**/*"), *(folder / "meta").glob("**/*")]):
         if path.is_file():
             about = path.stat()
-            found.update(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\n".encode())
+            found.update(os.fsencode(f"{path.relative_to(folder)}\0{about.st_size}\0{about.st_mtime_ns}\n"))
     return found.hexdigest()
 
 
 def _summary(done: dict[str, dict[str, int]], episodes: int) -> dict[str, int]:
     """What all files together have."""
-    counted = {name: sum(of[name] for of in done.values()) for name in ("frames", "answered", "touches", "events")}
-    return {"episodes": episodes, **counted, "left_out": sum(of["left_out"] for of in done.values())}
+    return {"episodes": episodes} | {name: sum(of[name] for of in done.values()) for name in COUNTS}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.pipelines.annotating.rewriting import copied, own_files
 from scroll_tactile.pipelines.runfile import RunFile
 
-__all__ = ["MADE", "RECORD", "clear", "place", "require_own_folders"]
+__all__ = ["MADE", "RECORD", "clear", "free_name", "place", "require_own_folders"]
 
 RECORD = "annotation.json"
 MADE = "set"  # the folder of what is written, beside the record: a data set may have a file of any name
@@ -65,11 +66,19 @@ def place(target: Path, work: Path, record: RunFile) -> Path | None:
     return kept
 
 
+def free_name(target: Path) -> str:
+    """The name in a data set by which `meta/` can be kept as it was. Raises InputError where all are taken."""
+    names = ["meta.before", *(f"meta.before-{number}" for number in range(2, 1000))]
+    for name in names:
+        if not os.path.lexists(target / name):
+            return name
+    raise InputError(f"{target} has everything from {names[0]} to {names[-1]}: remove some, or give output=")
+
+
 def _kept(target: Path, made: Path, record: RunFile) -> str:
     """The name of the folder that keeps `meta/` as it was; it is copied once."""
     if "kept" not in record.notes:
-        names = ["meta.before", *(f"meta.before-{number}" for number in range(2, 1000))]
-        name = next(name for name in names if not (target / name).exists())
+        name = free_name(target)
         draft = made / "meta.kept"
         shutil.rmtree(draft, ignore_errors=True)
         for own, path in own_files(target, "meta"):

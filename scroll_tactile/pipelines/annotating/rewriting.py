@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import os
@@ -26,6 +27,7 @@ __all__ = [
     "names_in",
     "own_files",
     "require_each_once",
+    "require_metadata",
     "statistics_in",
     "wanted_statistics",
     "write_data",
@@ -33,6 +35,8 @@ __all__ = [
 ]
 
 _LONGEST = 1 << 26  # bytes of stats.json
+_PIECE = 1 << 20  # bytes that are copied at a time
+_LOG = 4096  # steps of work that a log takes
 _COUNTS = ("count",)  # statistics that are whole numbers, whatever they are of
 _DRAFT = ".new"  # at the end of a file's name while it is written: no reader takes it for one of the set's
 
@@ -52,10 +56,11 @@ def names_in(source: LeRobot) -> list[str]:
     return found
 
 
-def require_each_once(source: LeRobot, names: Sequence[str]) -> None:
+def require_each_once(source: LeRobot, names: Sequence[str], *, logged: bool) -> None:
     """Raises RecordingError for an episode in two places: two touches would be made of it, and one log of the two.
 
-    Raises FieldError where frames have no number of their episode.
+    logged: whether each has a log, a file of its own, which counts towards the budget: of what takes next to no room
+    on the disk there could be one a frame. Raises FieldError where frames have no number of their episode.
     """
     found: set[int] = set()
     for name in names:
@@ -66,6 +71,7 @@ def require_each_once(source: LeRobot, names: Sequence[str]) -> None:
             if not source.types.is_integer(kind := file.schema_arrow.field("episode_index").type):
                 raise FieldError(f"column 'episode_index' of {name} holds {kind}; expected whole numbers")
             for batch in file.iter_batches(columns=["episode_index"]):
+                source.require_all(batch.column(0), "episode_index")
                 numbers = batch.column(0).to_numpy(zero_copy_only=False).astype(np.int64)
                 for number in numbers[np.diff(numbers, prepend=numbers[:1] - 1) != 0].tolist():
                     if number in found and number != last:
@@ -73,8 +79,28 @@ def require_each_once(source: LeRobot, names: Sequence[str]) -> None:
                             f"episode {number} of {source.address} is in two places, the second in {name}: expected "
                             "its frames in one file, one after the other"
                         )
+                    if number not in found:
+                        source.budget.work(_LOG * logged)
                     found.add(number)
                     last = number
+
+
+def require_metadata(source: LeRobot, columns: TouchColumns) -> None:
+    """Raises FieldError or RecordingError for metadata that no statistics of answers can be added to."""
+    wanted_statistics(source, source.column())
+    for path in _tables(source, columns):
+        schema = schema_of(source, path)
+        kinds = [field.type for field in schema if field.name == "episode_index"]
+        if any(own.startswith("stats/") for own in schema.names) and [*map(source.types.is_integer, kinds)] != [True]:
+            raise FieldError(
+                f"{path.relative_to(source.path)} of {source.address} has {len(kinds)} columns 'episode_index' "
+                f"({', '.join(map(str, kinds))!s:.100}); expected one of whole numbers"
+            )
+
+
+def _tables(source: LeRobot, columns: TouchColumns) -> list[Path]:
+    """The tables of episodes, to which statistics of columns of numbers are added."""
+    return sorted((source.path / "meta" / "episodes").glob("**/*.parquet")) if columns.numbers else []
 
 
 def write_data(
@@ -152,7 +178,7 @@ def write_metadata(
     from pyarrow import parquet
 
     written = []
-    for path in sorted((source.path / "meta" / "episodes").glob("**/*.parquet")) if columns.numbers else ():
+    for path in _tables(source, columns):
         name = os.path.normpath(path.relative_to(source.path))
         schema = schema_of(source, path)
         if any(own.startswith("stats/") for own in schema.names):
@@ -172,7 +198,7 @@ def write_metadata(
         written.append("meta/stats.json")
     info = _json(source, "info.json")
     features = _without(info["features"], [name for name in dropped if name != EVENTS])
-    theirs = {EVENTS: features[EVENTS]} if EVENTS in features and not is_written(features[EVENTS]) else {}
+    theirs = {EVENTS: features[EVENTS]} if EVENTS in features and not is_written(EVENTS, features[EVENTS]) else {}
     info["features"] = features | columns.features | theirs  # what others say of their events stays
     _write_json(folder / "meta" / "info.json", info)
     return [*written, "meta/info.json"]
@@ -192,8 +218,6 @@ def _with_statistics(table: Any, columns: TouchColumns, episodes: Mapping[int, A
     """A table of episodes with the statistics of the answers in each."""
     import pyarrow as pa
 
-    if "episode_index" not in table.schema.names:
-        raise FieldError("meta/episodes has no column 'episode_index'")
     gone = tuple(f"stats/{name}/" for name in [*dropped, *columns.numbers])
     table = table.drop_columns([name for name in table.schema.names if name.startswith(gone)])
     example: dict[str, Any] = next(iter(episodes.values()), {})
@@ -261,7 +285,29 @@ def copied(path: Path, target: Path, *, linked: bool = False) -> None:
             with suppress(OSError):  # other devices, and file systems without
                 os.link(path, draft)
                 return
-        shutil.copyfile(path, draft)
+        _copy(path, draft)
+
+
+def _copy(path: Path, target: Path) -> None:
+    """Copy a file's bytes. Its holes stay holes where the system tells them: it may claim to be larger than a disk."""
+    about = path.stat()
+    if not hasattr(os, "SEEK_DATA") or 512 * about.st_blocks >= about.st_size:
+        shutil.copyfile(path, target)
+        return
+    with path.open("rb", buffering=0) as file, target.open("wb") as copy:
+        end = 0
+        while end < about.st_size:
+            try:
+                at = file.seek(end, os.SEEK_DATA)
+            except OSError as error:
+                if error.errno != errno.ENXIO:  # nothing but a hole is left
+                    raise
+                break
+            end = file.seek(at, os.SEEK_HOLE)
+            copy.seek(file.seek(at))
+            while at < end and (data := file.read(min(end - at, _PIECE))):
+                at += copy.write(data)
+        copy.truncate(about.st_size)
 
 
 @contextmanager

@@ -124,8 +124,10 @@ def _checked(kind: Any) -> Any:
     return kind
 
 
-def is_written(about: Any) -> bool:
-    """Whether an annotation wrote a feature, by what meta/info.json says of it."""
+def is_written(name: str, about: Any) -> bool:
+    """Whether an annotation wrote a feature, by its name, which is one that it gives, and what meta/info.json says."""
+    if name != EVENTS and not name.startswith(PREFIX):
+        return False
     info = about.get("info") if isinstance(about, dict) else None
     return isinstance(info, dict) and info.get("written by") == _WRITER
 

@@ -203,6 +203,8 @@ class LeRobot(Source):
         numbers = {}
         for name in ("episode_index", "frame_index", "task_index"):
             if name in batch.schema.names:
+                if name == "episode_index":
+                    self.require_all(batch.column(name), name)
                 numbers[name] = self._rows(batch.column(name), name).astype(np.int64).reshape(-1)
         for episode, task in zip(
             numbers.get("episode_index", np.empty(0)), numbers.get("task_index", np.empty(0)), strict=False
@@ -258,6 +260,11 @@ class LeRobot(Source):
             kind = kind.value_type
         if not (self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)):
             raise FieldError(f"column {name!r} of {self.address} holds {kind}; expected numbers")
+
+    def require_all(self, column: Any, name: str) -> None:
+        """Raises FieldError where rows of a column have no value."""
+        if column.null_count:
+            raise FieldError(f"column {name!r} of {self.address} has rows without a number; expected one in each")
 
     def _ragged(self, name: str) -> None:
         raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")

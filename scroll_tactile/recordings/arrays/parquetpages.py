@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from scroll_tactile.errors import RecordingError
 from scroll_tactile.recordings.bounds import Budget
 
 __all__ = ["LONGEST_LIST", "require_bounded_pages"]
@@ -77,10 +78,15 @@ def _chosen(
 
 
 def _charge(file: BinaryIO, column: _Struct, size: int, budget: Budget) -> None:
-    """Charge the budget for what the pages of a column claim; raises ValueError where they leave their place."""
+    """Charge the budget for what the pages of a column claim; raises ValueError where they leave their place.
+
+    Raises RecordingError where there are none, as in a file without rows.
+    """
     place = column[9, _I64]
     if 0 < (dictionary := column.get((11, _I64), 0)) < place:
         place = dictionary
+    if not place and not column[5, _I64]:  # as pyarrow writes it
+        raise RecordingError(f"{file.name} has no rows: remove it, or write it again")
     end, values = place + column[7, _I64], 0
     if end > size:
         raise ValueError(f"a column ends at byte {end}, behind the {size} bytes of all")

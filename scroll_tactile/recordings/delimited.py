@@ -18,7 +18,7 @@ from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, So
 from scroll_tactile.recordings.bounds import stored_bytes
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = ["Delimited", "is_missing", "is_number", "is_table"]
+__all__ = ["Delimited", "is_missing", "is_number", "is_table", "missing_cells"]
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "?"))
 _LONGEST = 1 << 24  # characters in a line; a longer one is no table's
@@ -48,6 +48,17 @@ def is_missing(cell: str) -> bool:
     return cell.strip().lower() in _MISSING
 
 
+def missing_cells(delimiter: str) -> re.Pattern[str]:
+    """What finds the cells of a line that are missing.
+
+    It has one way to read a run of spaces: where nothing could stand between two runs, it would try each place.
+    """
+    mark = re.escape(delimiter)
+    tokens = "|".join(re.escape(token) for token in sorted(filter(None, _MISSING), key=len, reverse=True))
+    space = rf"[^\S{mark}]*"
+    return re.compile(rf"(?:(?<={mark})|^){space}(?:(?:{tokens}){space})?(?={mark}|$)", re.IGNORECASE)
+
+
 class Delimited(Source):
     """A table of text; see `Source`.
 
@@ -69,9 +80,7 @@ class Delimited(Source):
         self.width = len(rows[0][1])
         if self.width > _MOST_COLUMNS:
             raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
-        mark = re.escape(self.delimiter)
-        tokens = "|".join(re.escape(token) for token in sorted(_MISSING, key=len, reverse=True))
-        self._empty = re.compile(rf"(?:(?<={mark})|^)[^\S{mark}]*(?:{tokens})[^\S{mark}]*(?={mark}|$)", re.IGNORECASE)
+        self._empty = missing_cells(self.delimiter)
         self.header = self._header(rows)
         names = rows[0][1] if self.header else [str(i) for i in range(self.width)]
         if not self.header and self.comment and len(self.comment.split()) == self.width:

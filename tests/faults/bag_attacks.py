@@ -92,6 +92,28 @@ def idl(member: str = "float data[3];", constant: str = "") -> Attack:
     return mcap(lambda: [message(ONE)], text, form="ros2idl")
 
 
+def hole(begin: bytes, size: int, end: bytes = b"", name: str = "x.mcap") -> Attack:
+    """A file that takes up little of the disk."""
+
+    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
+        with (folder / name).open("wb") as file:
+            file.write(begin)
+            file.seek(size, os.SEEK_CUR)
+            file.write(end or bytes(4))
+        return folder / name, SKIN
+
+    return make
+
+
+def small_fields(count: int) -> bytes:
+    """A ROS 1 bag of a header with a number of fields, a few bytes each."""
+    fields = (struct.pack("<I", 1) + b"=") * count
+    return b"#ROSBAG V2.0\n" + struct.pack("<I", len(fields)) + fields
+
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
 def db3(change: Callable[[Any], None]) -> Attack:
     """A ROS 2 SQLite file in which something else is done."""
 
@@ -193,6 +215,15 @@ BAGS: dict[str, Attack] = {
     "R7 idl: a power": idl(constant="const long X = " + " * ".join(["99999999"] * 20_000) + ";"),
     "R7 idl: lengths in one line": idl(", ".join(f"data{i}[1]" for i in range(20_000)).join(("float ", ";"))),
     "R7 idl: comments never closed": idl("/* " * 400_000),
+    "R7 bag: a header in a hole": hole(b"#ROSBAG V2.0\n" + struct.pack("<I", 10**9), 10**9, name="x.bag"),
+    "R7 bag: a chunk in a hole": hole(
+        b"#ROSBAG V2.0\n" + struct.pack("<II", 8, 4) + b"op=\5" + struct.pack("<I", 10**9), 10**9, name="x.bag"
+    ),
+    "R7 bag: a header of many fields": hole(small_fields(10**7), 0, name="x.bag"),
+    "R7 bag: a header of zeros": hole(b"#ROSBAG V2.0\n" + struct.pack("<I", 1 << 20), 1 << 20, name="x.bag"),
+    "R7 mcap: a message in a hole": hole(MAGIC + struct.pack("<BQ", 5, 1 << 30), 1 << 30, b"\x0f"),
+    "R7 mcap: a schema in a hole": hole(MAGIC + struct.pack("<BQ", 3, 1 << 30), 1 << 30, b"\x0f"),
+    "R7 mcap: half a chunk in a hole": hole(MAGIC + struct.pack("<BQ", 6, 1 << 40), 1 << 30),
     "R7 db3: a view": db3(view),
     "R7 db3: generated": db3(generated),
     "R7 yaml: aliases": yaml(ALIASES),

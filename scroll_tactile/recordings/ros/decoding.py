@@ -45,6 +45,7 @@ class MessageTypes:
         reader = self.readers.get(channel)
         if reader is None:
             given = self.given.get(channel.type, "")
+            budget.work(len(given or channel.definition) // _NESTED)
             budget.work(_A_LINE * _lines(channel, given))
             reader = self.readers[channel] = _reader(channel, given)
         budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)

@@ -18,10 +18,12 @@ from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, So
 from scroll_tactile.recordings.bounds import stored_bytes
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = ["Delimited", "is_missing", "is_number", "is_table", "missing_cells"]
+__all__ = ["LONGEST", "Delimited", "is_missing", "is_number", "is_table", "missing_cells"]
+
+LONGEST = 1 << 24
+"""Characters in a line; a longer one is no table's."""
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "?"))
-_LONGEST = 1 << 24  # characters in a line; a longer one is no table's
 _MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
 _SEEN = 200  # lines are looked at to say what a table is
 _TIME = re.compile(
@@ -289,9 +291,9 @@ class Delimited(Source):
 
     def _lines(self, file: TextIO) -> Iterator[tuple[int, str]]:
         number = 0
-        while line := file.readline(_LONGEST):
+        while line := file.readline(LONGEST):
             number += 1
-            if len(line) == _LONGEST:
+            if len(line) == LONGEST:
                 raise RecordingError(f"{self.address}, row {number}, is longer than any table's; is it another file?")
             if line.startswith("#"):
                 self.comment = line.lstrip("#").strip()

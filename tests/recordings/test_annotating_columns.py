@@ -131,3 +131,12 @@ def test_texts_that_cannot_be_written_again_are_refused_in_words(tmp_path, kind,
     with pytest.raises(RecordingError, match=rf"column 'observation\.notes.* {said}.*leave it out, or write it as"):
         next(row_groups(source, source.files()[0]))
     assert read(path, field="observation.tactile.tip").readings.shape == TIP.shape
+
+
+@pytest.mark.parametrize("kind", [pa.list_(pa.string()), pa.list_(pa.string(), 1), pa.map_(pa.string(), pa.string())])
+def test_a_column_of_lists_is_no_column_of_labels(tmp_path, kind):
+    value = [("a", "b")] if hasattr(kind, "key_type") else ["a"]
+    path = lerobot(tmp_path / "s", notes=("string", pa.array([value] * 30, kind)))
+    said = r"file-000\.parquet of .* has no column 'observation\.notes' of texts, one a row"
+    with pytest.raises(FieldError, match=said):
+        read(path, field="observation.tactile.tip", annotate=["slip [label] from observation.notes"])

@@ -18,10 +18,12 @@ from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, So
 from scroll_tactile.recordings.bounds import stored_bytes
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = ["Delimited", "is_missing", "is_number", "is_table"]
+__all__ = ["LONGEST", "Delimited", "is_missing", "is_number", "is_table", "missing_cells"]
+
+LONGEST = 1 << 24
+"""Characters in a line; a longer one is no table's."""
 
 _MISSING = frozenset(("", "nan", "na", "n/a", "null", "none", "-", "?"))
-_LONGEST = 1 << 24  # characters in a line; a longer one is no table's
 _MOST_COLUMNS = 1 << 18  # a picture of 320 × 240 in three colours has 230 400
 _SEEN = 200  # lines are looked at to say what a table is
 _TIME = re.compile(
@@ -48,6 +50,17 @@ def is_missing(cell: str) -> bool:
     return cell.strip().lower() in _MISSING
 
 
+def missing_cells(delimiter: str) -> re.Pattern[str]:
+    """What finds the cells of a line that are missing.
+
+    It has one way to read a run of spaces: where nothing could stand between two runs, it would try each place.
+    """
+    mark = re.escape(delimiter)
+    tokens = "|".join(re.escape(token) for token in sorted(filter(None, _MISSING), key=len, reverse=True))
+    space = rf"[^\S{mark}]*"
+    return re.compile(rf"(?:(?<={mark})|^){space}(?:(?:{tokens}){space})?(?={mark}|$)", re.IGNORECASE)
+
+
 class Delimited(Source):
     """A table of text; see `Source`.
 
@@ -69,9 +82,7 @@ class Delimited(Source):
         self.width = len(rows[0][1])
         if self.width > _MOST_COLUMNS:
             raise RecordingError(f"{address} has {self.width} columns; expected at most {_MOST_COLUMNS}")
-        mark = re.escape(self.delimiter)
-        tokens = "|".join(re.escape(token) for token in sorted(_MISSING, key=len, reverse=True))
-        self._empty = re.compile(rf"(?:(?<={mark})|^)[^\S{mark}]*(?:{tokens})[^\S{mark}]*(?={mark}|$)", re.IGNORECASE)
+        self._empty = missing_cells(self.delimiter)
         self.header = self._header(rows)
         names = rows[0][1] if self.header else [str(i) for i in range(self.width)]
         if not self.header and self.comment and len(self.comment.split()) == self.width:
@@ -280,9 +291,9 @@ class Delimited(Source):
 
     def _lines(self, file: TextIO) -> Iterator[tuple[int, str]]:
         number = 0
-        while line := file.readline(_LONGEST):
+        while line := file.readline(LONGEST):
             number += 1
-            if len(line) == _LONGEST:
+            if len(line) == LONGEST:
                 raise RecordingError(f"{self.address}, row {number}, is longer than any table's; is it another file?")
             if line.startswith("#"):
                 self.comment = line.lstrip("#").strip()

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, InputError, RecordingError
 from scroll_tactile.quantities import Quantity
+from scroll_tactile.recordings.bounds import require_file
+from scroll_tactile.recordings.delimited import LONGEST
 from scroll_tactile.recordings.headings import Heading, Noted
 from scroll_tactile.recordings.paths import nearest
 from scroll_tactile.recordings.recording import Episode, Recording
 
 __all__ = ["Interval", "Touch", "declared_quantities", "read_intervals", "touches"]
+
+_MOST, _LONGEST_NAMES = 1 << 25, 1 << 16  # characters of a table of intervals, which are a million; and of its names
 
 
 @dataclass(frozen=True)
@@ -204,11 +208,13 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], dict[str, Heading], li
     Names without brackets are in lower case.
     """
     try:
+        require_file(Path(fspath(path)))
         with Path(fspath(path)).open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline(1 << 16)
+            lines = _lines(path, file)
+            first = next(lines, "")
             delimiter = next((mark for mark in ";\t," if mark in first), ",")
             cells = [cell.strip() for cell in next(csv.reader([first], delimiter=delimiter), [])]
-            table = [(i + 2, row) for i, row in enumerate(csv.reader(file, delimiter=delimiter)) if any(row)]
+            table = [(i + 2, row) for i, row in enumerate(csv.reader(lines, delimiter=delimiter)) if any(row)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path} cannot be read as a table of intervals: {error}") from error
     headings = {cell: heading for cell in cells if (heading := Heading.found(cell)) is not None}
@@ -221,6 +227,18 @@ def _table(path: str | PathLike[str]) -> tuple[list[str], dict[str, Heading], li
     if twice := sorted({name for name in noted if noted.count(name) > 1}):
         raise FieldError(f"{path} has several columns {twice[0]!r} with a unit; expected one")
     return names, headings, table
+
+
+def _lines(path: str | PathLike[str], file: TextIO) -> Iterator[str]:
+    """The lines of a table; raises RecordingError where it, or one of them, is longer than any table's."""
+    total, longest = 0, _LONGEST_NAMES
+    while line := file.readline(longest):
+        total += len(line)
+        if len(line) == longest or total > _MOST:
+            what = f"more than {_MOST} characters" if total > _MOST else f"a line of {longest} characters and more"
+            raise RecordingError(f"{path} has {what}; expected a table of intervals: is it another file?")
+        yield line
+        longest = LONGEST
 
 
 def _interval(

@@ -39,11 +39,13 @@ def mcap_chunk(data: bytes, form: str = "zstd") -> bytes:
 FLOATS = "float32[] data"
 
 
-def mcap(chunks: Callable[[], list[bytes]], definition: str = FLOATS, kind: str = "a/msg/B") -> Attack:
+def mcap(
+    chunks: Callable[[], list[bytes]], definition: str = FLOATS, kind: str = "a/msg/B", form: str = "ros2msg"
+) -> Attack:
     """An MCAP of one topic, /skin."""
 
     def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        head = record(3, struct.pack("<H", 1) + text(kind.encode()) + text(b"ros2msg") + text(definition.encode()))
+        head = record(3, struct.pack("<H", 1) + text(kind.encode()) + text(form.encode()) + text(definition.encode()))
         head += record(4, struct.pack("<HH", 1, 1) + text(b"/skin") + text(b"cdr") + text(b""))
         body = head + b"".join(chunks()) + record(15, bytes(4))
         (folder / "x.mcap").write_bytes(b"\x89MCAP0\r\n" + body)
@@ -82,6 +84,34 @@ def tower(levels: int, wide: int) -> str:
     parts = [f"a/L0[{wide}] data"]
     parts += [f"MSG: a/L{i}\na/L{i + 1}[{wide}] data" for i in range(levels)]
     return ("\n" + "=" * 80 + "\n").join([*parts, f"MSG: a/L{levels}\n"])
+
+
+def idl(member: str = "float data[3];", constant: str = "") -> Attack:
+    """A definition in IDL with a member and a constant."""
+    text = f"module a {{ module msg {{ {constant} struct B {{ {member} }}; }}; }};"
+    return mcap(lambda: [message(ONE)], text, form="ros2idl")
+
+
+def hole(begin: bytes, size: int, end: bytes = b"", name: str = "x.mcap") -> Attack:
+    """A file that takes up little of the disk."""
+
+    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
+        with (folder / name).open("wb") as file:
+            file.write(begin)
+            file.seek(size, os.SEEK_CUR)
+            file.write(end or bytes(4))
+        return folder / name, SKIN
+
+    return make
+
+
+def small_fields(count: int) -> bytes:
+    """A ROS 1 bag of a header with a number of fields, a few bytes each."""
+    fields = (struct.pack("<I", 1) + b"=") * count
+    return b"#ROSBAG V2.0\n" + struct.pack("<I", len(fields)) + fields
+
+
+MAGIC = b"\x89MCAP0\r\n"
 
 
 def db3(change: Callable[[Any], None]) -> Attack:
@@ -174,6 +204,26 @@ BAGS: dict[str, Attack] = {
     "R7 msg: fields": mcap(lambda: [message(ONE)], "".join(f"float32 f{i}\n" for i in range(20_000))),
     "R7 msg: a tower": mcap(lambda: [message(ONE)], tower(12, 10)),
     "R7 msg: of itself": mcap(lambda: [message(ONE)], "a/B data"),
+    "R7 idl: a constant in parentheses": idl(constant="const long X = " + "(" * 9 + "1" + ")" * 9 + ";"),
+    "R7 idl: many in parentheses": idl(constant="".join(f"const long X{i} = (1);" for i in range(2000))),
+    "R7 idl: a length in parentheses": idl("float data[((((1))))];"),
+    "R7 idl: a sequence's in parentheses": idl("sequence<float,/**/((((1))))> data;"),
+    "R7 idl: a text's in parentheses": idl("string<((((1))))> data;"),
+    "R7 idl: a default in parentheses": idl('@verbatim (text=")") @default(value=((((1))))) float data;'),
+    "R7 idl: sequences in sequences": idl("sequence<" * 24 + "float" + ">" * 24 + " data;"),
+    "R7 idl: a shift": idl(constant="const long X = 1 << 800000000000;"),
+    "R7 idl: a power": idl(constant="const long X = " + " * ".join(["99999999"] * 20_000) + ";"),
+    "R7 idl: lengths in one line": idl(", ".join(f"data{i}[1]" for i in range(20_000)).join(("float ", ";"))),
+    "R7 idl: comments never closed": idl("/* " * 400_000),
+    "R7 bag: a header in a hole": hole(b"#ROSBAG V2.0\n" + struct.pack("<I", 10**9), 10**9, name="x.bag"),
+    "R7 bag: a chunk in a hole": hole(
+        b"#ROSBAG V2.0\n" + struct.pack("<II", 8, 4) + b"op=\5" + struct.pack("<I", 10**9), 10**9, name="x.bag"
+    ),
+    "R7 bag: a header of many fields": hole(small_fields(10**7), 0, name="x.bag"),
+    "R7 bag: a header of zeros": hole(b"#ROSBAG V2.0\n" + struct.pack("<I", 1 << 20), 1 << 20, name="x.bag"),
+    "R7 mcap: a message in a hole": hole(MAGIC + struct.pack("<BQ", 5, 1 << 30), 1 << 30, b"\x0f"),
+    "R7 mcap: a schema in a hole": hole(MAGIC + struct.pack("<BQ", 3, 1 << 30), 1 << 30, b"\x0f"),
+    "R7 mcap: half a chunk in a hole": hole(MAGIC + struct.pack("<BQ", 6, 1 << 40), 1 << 30),
     "R7 db3: a view": db3(view),
     "R7 db3: generated": db3(generated),
     "R7 yaml: aliases": yaml(ALIASES),

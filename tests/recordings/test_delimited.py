@@ -4,10 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from scroll_tactile.errors import FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, iterate, read
-from scroll_tactile.recordings.delimited import is_number
+from scroll_tactile.recordings.delimited import is_missing, is_number, missing_cells
 
 
 def table(folder: Path, text: str, name: str = "t.csv") -> Path:
@@ -138,3 +140,18 @@ def test_the_slow_way_gives_the_same_as_the_fast(tmp_path):
 )
 def test_a_cell_is_a_number_or_not_however_long(cell, is_one):
     assert is_number(cell) is is_one
+
+
+def test_a_cell_of_many_spaces_is_read(tmp_path):
+    spaces = " " * (1 << 20)
+    path = table(tmp_path, f"a,b\n1,2\n3,{spaces}4\n5,{spaces}\n")
+    assert repr(read(path).readings.tolist()) == repr([[1.0, 2.0], [3.0, 4.0], [5.0, NAN]])
+
+
+@given(st.lists(st.sampled_from(["1", "n", "na", "N/A", "Null", "none", "nan", "-", "?", " ", "  ", ",", "\t", ";"])))
+def test_the_cells_that_are_missing_are_found_in_a_line(parts):
+    line = "".join(parts)
+    for mark in ",;\t":
+        cells = ["nan" if is_missing(cell) else cell for cell in line.split(mark)]
+        assert missing_cells(mark).sub("nan", line) == mark.join(cells)
+        assert missing_cells(mark).sub("nan", line + "\n").split() == mark.join(cells).split()

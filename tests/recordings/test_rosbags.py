@@ -501,6 +501,51 @@ def test_definitions_in_idl(tmp_path):
         assert read(path, topic="/skin", field="{v.{x,y},e}").readings.tolist() == [[0.5, 0.25, 1, 2, 3]] * 3
 
 
+IDL = """
+// generated from rosidl_adapter/resource/msg.idl.em
+// with input from pkg/msg/Skin.msg (an array)
+module pkg {
+  module msg {
+    typedef float float__3[3];
+    module Skin_Constants {
+      @verbatim (language="comment", text=
+        "what (perhaps) \\"it\\" is << 1 * 2" "\\n" "((")
+      const int16 LOW = -1;
+      const string NAME = "a (b) // c @d(e)";
+      const double REST = 0.5;
+    };
+    @verbatim (language="comment", text="a skin")
+    struct Skin {
+      /* its count (of touches) */
+      @default (value=7)
+      @unit(value="mm (each)")
+      int32 count;
+      @default (value="x @ (y)") string<8> name;
+      @key float__3 e; float a, b[2];
+      sequence<double, 4> rest;
+    };
+  };
+};
+"""
+
+
+def test_definitions_in_idl_as_ros_2_makes_them(tmp_path):
+    data = struct.pack("<BBHiI4s3f3fI2d", 0, 1, 0, 7, 4, b"abc\0", 1, 2, 3, 4, 5, 6, 2, 8, 9)
+    definition = IDL.encode()
+    path = mcap(tmp_path / "m.mcap", [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition)], [(1, 0, data)] * 3)
+    assert read(path, topic="/skin", field="{count,e,a,b}").readings.tolist() == [[7, 1, 2, 3, 4, 5, 6]] * 3
+
+
+def test_a_definition_in_idl_that_is_refused_is_given_as_msg(tmp_path):
+    definition = b"module pkg { module msg { struct Skin { float e[(2)]; }; }; };"
+    data = struct.pack("<BBH2f", 0, 1, 0, 1, 2)
+    path = mcap(tmp_path / "m.mcap", [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition)], [(1, 0, data)] * 3)
+    with pytest.raises(RecordingError, match=r"Pass the type's \.msg file in definitions="):
+        read(path, topic="/skin", field="e")
+    given = {"pkg/msg/Skin": "float32[2] e"}
+    assert read(path, topic="/skin", field="e", definitions=given).readings.tolist() == [[1, 2]] * 3
+
+
 @pytest.mark.parametrize(
     ("counts", "lost"),
     [

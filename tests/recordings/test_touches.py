@@ -1,12 +1,24 @@
 """Touches out of recordings: how they are cut, and what names them."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from folder_attacks import no_file
 
-from scroll_tactile.errors import FieldError, InputError
-from scroll_tactile.recordings import Episode, Interval, Recording, Report, read_intervals, resampled, touches
+from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile.recordings import (
+    Episode,
+    Interval,
+    Recording,
+    Report,
+    declared_quantities,
+    read_intervals,
+    resampled,
+    touches,
+)
+from scroll_tactile.recordings.delimited import LONGEST
 
 
 def recording(source="/data/felt/run.1.mcap", start=0.0, episodes=(), count=100, topic="/rh/denim"):
@@ -103,6 +115,32 @@ def test_a_table_of_intervals(tmp_path):
             read_intervals(path, ["a.bag"])
     with pytest.raises(InputError, match="cannot be read"):
         read_intervals(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize("kind", ["fifo", "socket", "folder"])
+def test_a_table_of_intervals_is_a_file(tmp_path, kind):
+    no_file(tmp_path / "labels.csv", kind)
+    with pytest.raises(RecordingError, match=r"labels.csv is a [A-Za-z]+; expected a file"):
+        read_intervals(tmp_path / "labels.csv")
+    with pytest.raises(RecordingError, match="/dev/zero is a device; expected a file"):
+        declared_quantities("/dev/zero")
+
+
+def test_a_table_of_intervals_is_no_longer_than_one_is(tmp_path, monkeypatch):
+    path = tmp_path / "labels.csv"
+    names, row = "file,begin,end,material\n", "a.bag,1,2,felt\n"
+    path.write_text(names.strip() + "," * 65536)
+    with pytest.raises(RecordingError, match=r"a line of 65536 characters and more; expected a table of intervals"):
+        read_intervals(path)
+    path.write_text(names + "a.bag,1,2," + "," * LONGEST)
+    with pytest.raises(RecordingError, match=f"a line of {LONGEST} characters and more; expected a table"):
+        read_intervals(path)
+    monkeypatch.setattr(sys.modules[Interval.__module__], "_MOST", len(names + row * 9))
+    path.write_text(names + row * 9)
+    assert len(read_intervals(path)) == 9
+    path.write_text(names + row * 10)
+    with pytest.raises(RecordingError, match=f"more than {len(names + row * 9)} characters; expected a table"):
+        read_intervals(path)
 
 
 def test_resampling_is_linear_and_leaves_gaps_open():

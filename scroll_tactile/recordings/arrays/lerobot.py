@@ -167,7 +167,8 @@ class LeRobot(Source):
     def opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
 
-        texts: the columns of which each text is to be in memory once, and not once for every row that has it.
+        texts: the columns of which each text is to be in memory once, and not once for every row that has it; raises
+        FieldError for one that is not there, or of lists.
 
         The budget is charged for what their pages claim, before pyarrow opens it. What the footer holds
         about columns is not read by pyarrow: where that is damaged, pyarrow ends the process.
@@ -176,7 +177,15 @@ class LeRobot(Source):
         self.budget.add(stored_bytes(path))
         require_bounded_pages(path, columns, self.budget)
         limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": LONGEST_LIST}
-        return self.parquet.ParquetFile(path, pre_buffer=False, read_dictionary=texts, **limits)
+        try:
+            return self.parquet.ParquetFile(path, pre_buffer=False, read_dictionary=texts, **limits)
+        except KeyError as error:
+            name = next((text for text in texts or () if error.args == (text.encode(),)), None)
+            if name is None:
+                raise
+            raise FieldError(
+                f"{path.name} of {self.address} has no column {name!r} of texts, one a row; expected texts, no lists"
+            ) from error
 
     def _table(self, file: Any, numbers: list[str], text: str | None = None) -> dict[str, list[Any]]:
         """Some columns of a small parquet table, whole: of numbers, and one of texts."""

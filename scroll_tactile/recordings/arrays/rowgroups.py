@@ -17,6 +17,7 @@ from scroll_tactile.recordings.bounds import Budget
 __all__ = ["codec_of", "row_groups", "schema_of"]
 
 _WIDEST = 64  # bytes of a value of fixed length: a decimal, or a hash
+_VIEWS = ("string_view", "binary_view")  # which pyarrow makes of no dictionary
 
 
 def schema_of(source: LeRobot, path: Path) -> Any:
@@ -65,6 +66,12 @@ def _texts(file: Any, path: Path) -> list[str]:
                 f"column {column.path!r} of {path} holds texts of an extension type, which cannot be bounded: leave it "
                 "out, or write it as plain texts"
             )
+        for kind in kinds:
+            if hasattr(kind, "key_type") or str(kind) in _VIEWS:
+                raise RecordingError(
+                    f"column {column.path!r} of {path} holds texts as {kind}, which cannot be written again: leave it "
+                    "out, or write it as plain texts, or lists of them"
+                )
         found += [] if any(hasattr(kind, "index_type") for kind in kinds) else [column.path]
     return found
 

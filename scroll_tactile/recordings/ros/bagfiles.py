@@ -7,6 +7,7 @@ cut or a full disk, gives its whole messages up to there, and a large one needs 
 from __future__ import annotations
 
 import bz2
+import os
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -17,9 +18,21 @@ from typing import Any, BinaryIO, NamedTuple
 
 from scroll_tactile.errors import InputError, RecordingError
 from scroll_tactile.libraries import missing
-from scroll_tactile.recordings.bounds import LARGEST, Budget
+from scroll_tactile.recordings.bounds import LARGEST, Budget, on_disk
 
-__all__ = ["DAMAGE", "Channel", "CutOff", "Message", "Scan", "decompress", "inflated", "scan_bag", "take", "zstd"]
+__all__ = [
+    "DAMAGE",
+    "Channel",
+    "CutOff",
+    "Message",
+    "Scan",
+    "decompress",
+    "holes_of",
+    "inflated",
+    "scan_bag",
+    "take",
+    "zstd",
+]
 
 
 @dataclass(frozen=True)
@@ -64,12 +77,23 @@ class CutOff(Exception):
 DAMAGE = (ValueError, RuntimeError, OSError, EOFError, KeyError, struct.error)  # what decompressors and parsers raise
 
 
-def take(file: BinaryIO, size: int, left: int) -> bytes:
-    """The next `size` bytes; raises CutOff where there are fewer, before any memory is taken for them."""
+def holes_of(file: BinaryIO, budget: Budget) -> Budget | None:
+    """What the bytes of a file are taken from: a budget where it has holes, which are read and are nowhere stored."""
+    about = os.fstat(file.fileno())
+    return budget if on_disk(about) < about.st_size else None
+
+
+def take(file: BinaryIO, size: int, left: int, holes: Budget | None = None) -> bytes:
+    """The next `size` bytes; raises CutOff where there are fewer, before any memory is taken for them.
+
+    holes: as of `holes_of`; raises RecordingError where it has no room for as many.
+    """
     if size > left:
         raise CutOff(f"a record of {size} bytes is claimed where {left} are left")
     if size > LARGEST:  # what is left may be a hole
         raise CutOff(f"a record of {size} bytes is claimed")
+    if holes is not None:
+        holes.take(size)
     data = file.read(size)
     if len(data) < size:
         raise CutOff("it ends in the middle of a record")
@@ -137,6 +161,8 @@ def inflated(path: Path, folder: Path, budget: Budget) -> Path:
 
 _BAG = b"#ROSBAG V2.0\n"
 _A_RECORD = 4  # steps of work
+_FIELDS_A_STEP = 4
+_LONGEST_HEADER = 1 << 20  # bytes; a message's definition is in one of them, and those of MoveIt take 100 KB
 _MESSAGE, _BAG_HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 
 
@@ -146,51 +172,63 @@ def scan_bag(path: Path, scan: Scan) -> Iterator[Message]:
     with path.open("rb") as file:
         if file.read(len(_BAG)) != _BAG:
             raise RecordingError(f"{path} does not begin as a ROS 1 bag does, with {_BAG.decode().strip()!r}")
-        reader = _Bag(scan)
+        reader, holes = _Bag(scan), holes_of(file, scan.budget)
         try:
-            _index(file, size, reader)
+            _index(file, size, reader, holes)
             while file.tell() < size:
-                header, length = _record_head(file, size)
+                header, length = _record_head(file, size, scan.budget, holes)
                 left = size - file.tell()
                 if length > left and header.get(b"op") == bytes([_CHUNK]):
-                    yield from reader.chunk(header, file.read(min(left, LARGEST)), whole=False)
+                    left = min(left, LARGEST)
+                    yield from reader.chunk(header, take(file, left, left, holes), whole=False)
                     raise CutOff("it ends in the middle of a chunk")
-                yield from reader.record(header, take(file, length, size - file.tell()))
+                yield from reader.record(header, take(file, length, left, holes))
         except CutOff as error:
             scan.cut_off = str(error)
 
 
-def _record_head(file: BinaryIO, size: int) -> tuple[dict[bytes, bytes], int]:
+def _record_head(
+    file: BinaryIO, size: int, budget: Budget, holes: Budget | None = None
+) -> tuple[dict[bytes, bytes], int]:
     """A record's header, and how many bytes of data follow."""
     (length,) = struct.unpack("<I", take(file, 4, size - file.tell()))
-    header = _header(take(file, length, size - file.tell()))
+    if length > _LONGEST_HEADER:
+        raise CutOff(f"a record's header of {length} bytes is claimed")
+    header = _header(take(file, length, size - file.tell(), holes), budget)
     (length,) = struct.unpack("<I", take(file, 4, size - file.tell()))
     return header, length
 
 
-def _header(data: bytes) -> dict[bytes, bytes]:
+def _header(data: bytes, budget: Budget) -> dict[bytes, bytes]:
+    """The fields of a header; raises CutOff for what is none, RecordingError where the budget has no time for it."""
+    if len(data) > _LONGEST_HEADER:
+        raise CutOff(f"a record's header has {len(data)} bytes")
     fields: dict[bytes, bytes] = {}
-    i = 0
+    i = count = 0
     while i < len(data):
         (length,) = struct.unpack_from("<I", data, i)
-        name, _, value = data[i + 4 : i + 4 + length].partition(b"=")
+        name, mark, value = data[i + 4 : i + 4 + length].partition(b"=")
+        if not mark:
+            raise CutOff(f"a field of a record's header is {name!r:.60}; expected name=value")
         fields[name] = value
         i += 4 + length
+        count += 1
+    budget.work(count // _FIELDS_A_STEP)
     return fields
 
 
-def _index(file: BinaryIO, size: int, reader: _Bag) -> None:
+def _index(file: BinaryIO, size: int, reader: _Bag, holes: Budget | None) -> None:
     """Take the connections at the end of a whole bag: those in a damaged chunk are needed by later ones."""
-    begin = file.tell()
-    header, _ = _record_head(file, size)
+    begin, budget = file.tell(), reader.scan.budget
+    header, _ = _record_head(file, size, budget, holes)
     with suppress(*DAMAGE, CutOff):
         (start,) = struct.unpack("<Q", header[b"index_pos"])
         file.seek(start if 0 < start < size else size)
         while file.tell() < size:
-            header, length = _record_head(file, size)
+            header, length = _record_head(file, size, budget, holes)
             if header[b"op"] != bytes([_CONNECTION]):
                 break
-            for _ in reader.record(header, take(file, length, size - file.tell())):
+            for _ in reader.record(header, take(file, length, size - file.tell(), holes)):
                 pass
     file.seek(begin)
 
@@ -221,7 +259,7 @@ class _Bag:
             inside = decompress(header[b"compression"].decode(), data, size, self.scan.budget, whole=whole)
             chunk = BytesIO(inside)
             while chunk.tell() < len(inside):
-                inner, length = _record_head(chunk, len(inside))
+                inner, length = _record_head(chunk, len(inside), self.scan.budget)
                 if inner.get(b"op") == bytes([_CHUNK]):
                     raise ValueError("a chunk is claimed inside a chunk")
                 yield from self.record(inner, take(chunk, length, len(inside) - chunk.tell()))
@@ -231,7 +269,7 @@ class _Bag:
             self.scan.damaged += whole
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
-        fields = _header(data)
+        fields = _header(data, self.scan.budget)
         topic = header.get(b"topic", fields.get(b"topic", b"")).decode()
         name = fields[b"type"].decode()
         name = name if "/msg/" in name else name.replace("/", "/msg/", 1)

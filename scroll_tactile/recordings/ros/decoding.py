@@ -17,6 +17,7 @@ from scroll_tactile.libraries import missing
 from scroll_tactile.recordings.blocks import Request
 from scroll_tactile.recordings.bounds import Budget
 from scroll_tactile.recordings.paths import fields_of
+from scroll_tactile.recordings.ros import idl
 from scroll_tactile.recordings.ros.bagfiles import Channel
 
 __all__ = ["MessageTypes"]
@@ -44,7 +45,8 @@ class MessageTypes:
         reader = self.readers.get(channel)
         if reader is None:
             given = self.given.get(channel.type, "")
-            budget.work(_A_LINE * _lines(given or channel.definition))
+            budget.work(len(given or channel.definition) // _NESTED)
+            budget.work(_A_LINE * _lines(channel, given))
             reader = self.readers[channel] = _reader(channel, given)
         budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)
         try:
@@ -67,9 +69,13 @@ class _MessageReader:
     nested: bool = True
 
 
-def _lines(text: str) -> int:
+def _lines(channel: Channel, given: str) -> int:
     """How many lines of a definition define something; raises RecordingError where they are too many."""
-    count = sum(1 for line in re.split(r"[\n;]", text) if line.strip() and not line.lstrip().startswith("#"))
+    if channel.idl and not given:
+        count = idl.weight(channel.definition)
+    else:
+        lines = re.split(r"[\n;]", given or channel.definition)
+        count = sum(1 for line in lines if line.strip() and not line.lstrip().startswith("#"))
     if count > _MOST_LINES:
         raise RecordingError(f"a definition of a message has {count} lines; expected at most {_MOST_LINES}")
     return count
@@ -90,10 +96,9 @@ def _reader(channel: Channel, given: str) -> _MessageReader:
     store = get_typestore(Stores.EMPTY)
     text = given or channel.definition
     try:
-        if text and channel.idl:
-            # A definition that needs others holds them all, each below a line of = and one with its name.
-            for part in text.split("=" * 80 + "\n"):
-                store.register(get_types_from_idl(re.sub(r"\AIDL: .*\n", "", part)) if part else {})
+        if text and channel.idl and not given:
+            for part in idl.parts(text):
+                store.register(get_types_from_idl(part))
         elif text:
             store.register(get_types_from_msg(text, channel.type))
     except Exception as error:

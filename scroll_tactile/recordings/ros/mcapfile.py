@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from scroll_tactile.errors import InputError, RecordingError
-from scroll_tactile.recordings.bounds import LARGEST
-from scroll_tactile.recordings.ros.bagfiles import DAMAGE, Channel, CutOff, Message, Scan, decompress, take
+from scroll_tactile.recordings.bounds import LARGEST, Budget
+from scroll_tactile.recordings.ros.bagfiles import DAMAGE, Channel, CutOff, Message, Scan, decompress, holes_of, take
 
 __all__ = ["scan_mcap"]
 
@@ -29,8 +29,8 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise RecordingError(f"{path} does not begin as an MCAP file does")
-        reader = _Mcap(scan)
-        _summary(file, size, reader)
+        reader, holes = _Mcap(scan), holes_of(file, scan.budget)
+        _summary(file, size, reader, holes)
         try:
             while True:
                 scan.budget.work()
@@ -44,15 +44,16 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
                     continue
                 left = size - file.tell()
                 if kind == _MCAP_CHUNK and length > left:
-                    yield from reader.chunk(file.read(min(left, LARGEST)), whole=False)
+                    left = min(left, LARGEST)
+                    yield from reader.chunk(take(file, left, left, holes), whole=False)
                     raise CutOff("it ends in the middle of a chunk")
-                data = take(file, length, size - file.tell())
+                data = take(file, length, left, holes)
                 yield from reader.chunk(data, whole=True) if kind == _MCAP_CHUNK else reader.record(kind, data)
         except CutOff as error:
             scan.cut_off = str(error)
 
 
-def _summary(file: BinaryIO, size: int, reader: _Mcap) -> None:
+def _summary(file: BinaryIO, size: int, reader: _Mcap, holes: Budget | None) -> None:
     """Take the schemas and channels at the end of a whole file: those in a damaged chunk are needed by later ones."""
     begin, tail = file.tell(), 9 + 20 + len(_MAGIC)  # a footer and the magic
     file.seek(max(size - tail, begin))
@@ -64,7 +65,7 @@ def _summary(file: BinaryIO, size: int, reader: _Mcap) -> None:
             while file.tell() < size - tail:
                 reader.scan.budget.work()
                 kind, length = _HEAD.unpack(take(file, _HEAD.size, size - file.tell()))
-                data = take(file, length, size - file.tell())
+                data = take(file, length, size - file.tell(), holes)
                 if kind in (_SCHEMA, _CHANNEL):
                     for _ in reader.record(kind, data):
                         pass

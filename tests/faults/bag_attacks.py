@@ -213,6 +213,7 @@ BAGS: dict[str, Attack] = {
     "R7 idl: sequences in sequences": idl("sequence<" * 24 + "float" + ">" * 24 + " data;"),
     "R7 idl: a shift": idl(constant="const long X = 1 << 800000000000;"),
     "R7 idl: a power": idl(constant="const long X = " + " * ".join(["99999999"] * 20_000) + ";"),
+    "R7 idl: a long text": idl("float data[4];", f'const string X = "{"x" * (1 << 22)}";'),
     "R7 idl: lengths in one line": idl(", ".join(f"data{i}[1]" for i in range(20_000)).join(("float ", ";"))),
     "R7 idl: comments never closed": idl("/* " * 400_000),
     "R7 bag: a header in a hole": hole(b"#ROSBAG V2.0\n" + struct.pack("<I", 10**9), 10**9, name="x.bag"),

@@ -87,7 +87,8 @@ class RunFile:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             draft = _draft(self.path)
-            with draft.open("w", encoding="utf-8") as file:
+            draft.unlink(missing_ok=True)  # a link that came with a folder of others leads to any file
+            with draft.open("x", encoding="utf-8") as file:
                 json.dump({"format": _FORMAT, "plan": self.plan, "notes": self.notes}, file, indent=1)
                 file.flush()
                 os.fsync(file.fileno())

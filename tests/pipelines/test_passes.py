@@ -64,6 +64,14 @@ class TestRunFile:
         again = RunFile(tmp_path / "run" / "notes.json", {"seed": 0})
         assert again.notes == {"a": [1, 2]}
 
+    def test_a_link_in_the_place_of_the_draft_is_not_followed(self, tmp_path):
+        record, others = tmp_path / "run" / "notes.json", tmp_path / "others"
+        others.write_text("theirs")
+        RunFile(record, {"seed": 0})
+        record.with_name("notes.json.new").symlink_to(others)
+        RunFile(record, {"seed": 0}).note("a", 1)
+        assert others.read_text() == "theirs" and RunFile(record, {"seed": 0}).notes["a"] == 1
+
     def test_another_run_is_refused_by_what_differs(self, tmp_path: Path) -> None:
         RunFile(tmp_path / "notes.json", {"seed": 0, "kind": "x"})
         with pytest.raises(InputError, match="seed 0 there, 1 here"):

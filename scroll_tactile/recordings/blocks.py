@@ -74,16 +74,18 @@ class Entry:
 class Contents:
     """What a file has, as `describe` gives it; as text, a table with a line to copy.
 
-    source: the file's address. entries: the numbers in it. looked: how far was looked, where not to the end.
+    source: the file's address. entries: the numbers in it. looked: how far was looked, where not to the end. notes:
+    what could not be read, and why.
     """
 
     source: str
     entries: tuple[Entry, ...]
     looked: str = ""
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         if not self.entries:
-            return f"{self.source} has no numbers in it"
+            return f"{self.source} has no numbers in it" + (f": {'; '.join(self.notes)}" if self.notes else "")
         lines = [f"{self.source} has{f' {self.looked}' if self.looked else ''}:"]
         for entry in self.entries[:40]:
             where = f"{entry.topic}  " if entry.topic else ""
@@ -93,6 +95,7 @@ class Contents:
             lines.append(f"  {where}{entry.field}  {list(entry.shape)}{count}{rate}{kind}")
         if len(self.entries) > 40:
             lines.append(f"  … and {len(self.entries) - 40} more")
+        lines += [f"  not read: {note}" for note in self.notes]
         first = self.entries[0]
         topic = f", topic={first.topic!r}" if first.topic else ""
         lines.append(f"read({self.source!r}{topic}{f', field={first.field!r}' if first.field else ''})")

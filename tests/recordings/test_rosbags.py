@@ -1,6 +1,8 @@
 """Bags of ROS 1 and ROS 2: the numbers to the bit, the clocks, and what goes wrong with them."""
 
 import io
+import math
+import re
 import shutil
 import sqlite3
 import struct
@@ -536,12 +538,28 @@ def test_definitions_in_idl_as_ros_2_makes_them(tmp_path):
     assert read(path, topic="/skin", field="{count,e,a,b}").readings.tolist() == [[7, 1, 2, 3, 4, 5, 6]] * 3
 
 
+def test_arrays_in_json_are_described_as_they_are_read(tmp_path):
+    data = b'{"v": [1, 2.5], "m": [[1, 2, 3], [4, 5, 6]], "n": 7, "s": ["a"], "r": [[1], [2, 3]], "e": [],'
+    data += b' "o": [{"x": [1]}]}'
+    path = mcap(tmp_path / "m.mcap", [(b"/j", b"json", b"J", b"", b"")], [(1, i, data) for i in range(3)])
+    found = {entry.field: entry.shape for entry in describe(path).entries}
+    assert found == {"v": (2,), "m": (2, 3), "o[*].x": (1, 1), "n": (1,)}
+    for field, shape in found.items():
+        assert read(path, topic="/j", field=field).readings.shape == (3, math.prod(shape))
+
+
 def test_a_definition_in_idl_that_is_refused_is_given_as_msg(tmp_path):
     definition = b"module pkg { module msg { struct Skin { float e[(2)]; }; }; };"
     data = struct.pack("<BBH2f", 0, 1, 0, 1, 2)
     path = mcap(tmp_path / "m.mcap", [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition)], [(1, 0, data)] * 3)
     with pytest.raises(RecordingError, match=r"Pass the type's \.msg file in definitions="):
         read(path, topic="/skin", field="e")
+    assert re.search(r"has no numbers in it: a definition in IDL has '\('.*definitions=", str(describe(path)))
+    both = [(b"/skin", b"cdr", b"pkg/msg/Skin", b"ros2idl", definition), (b"/j", b"json", b"J", b"", b"")]
+    path = mcap(tmp_path / "both.mcap", both, [(1, 0, data), (2, 0, b'{"v": [1, 2]}')])
+    *_, why, line = str(describe(path)).splitlines()
+    assert "  not read: a definition in IDL has" in why and line.startswith("read(") and "topic='/j'" in line
+    path = tmp_path / "m.mcap"
     given = {"pkg/msg/Skin": "float32[2] e"}
     assert read(path, topic="/skin", field="e", definitions=given).readings.tolist() == [[1, 2]] * 3
 

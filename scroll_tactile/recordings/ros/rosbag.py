@@ -92,7 +92,7 @@ class RosBag(Source):
         ]
         found.sort(key=lambda entry: not presets.is_known(entry.kind))
         looked = f"in its first {total} messages, among others perhaps" if total == _LOOKED else ""
-        return Contents(self.address, tuple(found), looked)
+        return Contents(self.address, tuple(found), looked, tuple(dict.fromkeys(self.notes)))
 
     def blocks(self) -> Iterator[Block]:
         """The readings of the requested topic; raises FieldError, with what there is, for one that is not there."""
@@ -280,8 +280,8 @@ def _numbers(message: object, before: str = "", depth: int = 0) -> Iterator[tupl
     for name in fields_of(message):
         value = message[name] if isinstance(message, dict) else getattr(message, name)
         text = f"{before}{name}"
-        if isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size:
-            yield text, value.shape
+        if (array := _array(value)) is not None:
+            yield text, array.shape
         elif isinstance(value, list) and value and fields_of(value[0]) and depth < 4:
             inner = list(_numbers(value[0], f"{text}[*].", depth + 1))
             yield from ((path, (len(value), *shape)) for path, shape in inner)
@@ -293,6 +293,14 @@ def _numbers(message: object, before: str = "", depth: int = 0) -> Iterator[tupl
         yield f"{before}{scalars[0]}", (1,)
     elif scalars and not before.startswith(("header.", "stamp.")):
         yield f"{before}{{{','.join(scalars)}}}", (len(scalars),)
+
+
+def _array(value: object) -> npt.NDArray[Any] | None:
+    """An array of numbers, which JSON has as lists; None for anything else, and where there are none."""
+    if isinstance(value, list) and value and isinstance(value[0], int | float | list):
+        with suppress(ValueError):  # of rows that differ in length
+            value = np.asarray(value)
+    return value if isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size else None
 
 
 def _text_in(message: object, channel: Channel) -> str:

@@ -282,7 +282,7 @@ def describe(
         learner.describe(material, shares or None)
         count = learner.materials.get(material, 0)
     now = "its description is removed" if not shares else f"made of {', '.join(map(shown, shares))}"
-    say(f"{shown(material)}: {now}; observed {count} time{'s' * (count != 1)}")
+    say(f"{shown(material)}: {now}; observed {counted(count, 'time')}")
 
 
 def _meant(name: str, known: Iterable[str]) -> str | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 from scroll_tactile.errors import InputError
 from store import LockedError
+from store.files import new_file
 
 try:
     import fcntl
@@ -87,8 +88,7 @@ class RunFile:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             draft = _draft(self.path)
-            draft.unlink(missing_ok=True)  # a link that came with a folder of others leads to any file
-            with draft.open("x", encoding="utf-8") as file:
+            with new_file(draft, "w") as file:  # a link that came with a folder of others leads to any file
                 json.dump({"format": _FORMAT, "plan": self.plan, "notes": self.notes}, file, indent=1)
                 file.flush()
                 os.fsync(file.fileno())

@@ -8,6 +8,7 @@ say nothing about a message's bytes.
 
 from __future__ import annotations
 
+import functools
 import re
 
 from scroll_tactile.errors import RecordingError
@@ -22,13 +23,14 @@ _EXPRESSION, _PIECE = re.compile(r'[=\[,|^&+\-/%~"]|\bw?string ?<|>>'), re.compi
 _AN_EXPRESSION = 8  # pieces that take as long
 
 
-def parts(text: str) -> list[str]:
+@functools.lru_cache(16)  # they are weighed, and then read
+def parts(text: str) -> tuple[str, ...]:
     """The definitions in a text, without comments and annotations, and with nothing in the texts of constants.
 
     One that needs others holds them all, each below a line of = and one with its name. Raises RecordingError for what
     the parser cannot read in the time that its length allows.
     """
-    return [_plain(_HEADER.sub("", part)) for part in text.split(_SEPARATOR) if part]
+    return tuple(_plain(_HEADER.sub("", part)) for part in text.split(_SEPARATOR) if part)
 
 
 def weight(text: str) -> int:

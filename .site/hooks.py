@@ -125,7 +125,7 @@ def _reference() -> dict[str, str]:
 def _origin(module: Any, name: str) -> str:
     """The module in which a public name is made, where that is one of ours."""
     made = str(getattr(getattr(module, name), "__module__", ""))
-    return made if made.startswith(("scroll_tactile", "store")) else str(module.__name__)
+    return made if made.startswith("scroll_tactile") else str(module.__name__)
 
 
 def _overview() -> str:

@@ -13,7 +13,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.ros2 import Answer, TactileNode
+from scroll_tactile.clients.ros2 import Answer, TactileNode
 
 
 class Hand(Node):  # type: ignore[misc]  # of ROS 2, which may not be here

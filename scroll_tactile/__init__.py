@@ -10,21 +10,21 @@ import typing
 
 if typing.TYPE_CHECKING:
     from scroll_tactile import errors, recordings, sensors
+    from scroll_tactile.clients.firmware.c_files import write_firmware
+    from scroll_tactile.clients.firmware.exported_judge import ExportedAnswer, ExportedJudge
+    from scroll_tactile.clients.learning.annotating.annotation_run import Annotated, annotate
+    from scroll_tactile.clients.learning.annotating.answer_log import AnswerLog
+    from scroll_tactile.clients.learning.fleet import FleetReport, learn
+    from scroll_tactile.clients.learning.sources import SourceOptions
     from scroll_tactile.embeddings.frames import Frames
     from scroll_tactile.embeddings.joined import Joined
     from scroll_tactile.embeddings.kernels import Kernels
     from scroll_tactile.embeddings.modules import ModuleEmbedding
     from scroll_tactile.embeddings.protocol import Capabilities, Embedding
     from scroll_tactile.embeddings.vision import Vision
-    from scroll_tactile.firmware.c_files import write_firmware
-    from scroll_tactile.firmware.exported_judge import ExportedAnswer, ExportedJudge
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
-    from scroll_tactile.pipelines.annotating.annotation_run import Annotated, annotate
-    from scroll_tactile.pipelines.annotating.answer_log import AnswerLog
-    from scroll_tactile.pipelines.fleet import FleetReport, learn
-    from scroll_tactile.pipelines.sources import SourceOptions
     from scroll_tactile.quantities import Quantity
     from scroll_tactile.results import (
         Adaptation,
@@ -99,8 +99,8 @@ __version__ = "0.15.0"
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
     "Adaptation": "results",
-    "Annotated": "pipelines.annotating.annotation_run",
-    "AnswerLog": "pipelines.annotating.answer_log",
+    "Annotated": "clients.learning.annotating.annotation_run",
+    "AnswerLog": "clients.learning.annotating.answer_log",
     "Augmented": "signals.copies",
     "Candidates": "results",
     "Capabilities": "embeddings.protocol",
@@ -110,9 +110,9 @@ _MODULES = {
     "Embedding": "embeddings.protocol",
     "Estimate": "results",
     "Health": "results",
-    "ExportedAnswer": "firmware.exported_judge",
-    "ExportedJudge": "firmware.exported_judge",
-    "FleetReport": "pipelines.fleet",
+    "ExportedAnswer": "clients.firmware.exported_judge",
+    "ExportedJudge": "clients.firmware.exported_judge",
+    "FleetReport": "clients.learning.fleet",
     "Frames": "embeddings.frames",
     "Joined": "embeddings.joined",
     "Kernels": "embeddings.kernels",
@@ -129,15 +129,15 @@ _MODULES = {
     "Scene": "simulation.scene",
     "Sensor": "sensors",
     "Settings": "settings",
-    "SourceOptions": "pipelines.sources",
+    "SourceOptions": "clients.learning.sources",
     "Stream": "signals.stream",
     "TactileLearner": "learner",
     "Vision": "embeddings.vision",
-    "annotate": "pipelines.annotating.annotation_run",
+    "annotate": "clients.learning.annotating.annotation_run",
     "check_embedding": "testing.embedding_checks",
     "check_learner": "testing.learner_checks",
-    "learn": "pipelines.fleet",
-    "write_firmware": "firmware.c_files",
+    "learn": "clients.learning.fleet",
+    "write_firmware": "clients.firmware.c_files",
 }
 
 

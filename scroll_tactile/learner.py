@@ -31,7 +31,7 @@ from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 
 if TYPE_CHECKING:
-    from scroll_tactile.firmware.exported_judge import ExportedJudge
+    from scroll_tactile.clients.firmware.exported_judge import ExportedJudge
     from scroll_tactile.live.session import LiveSession
 
 __all__ = ["TactileLearner"]
@@ -337,7 +337,7 @@ class TactileLearner(MemoryKeeper):
         Raises UnknownMaterialError, InputError for an empty scene, a greater one, a camera, or an embedding that is not
         `Kernels`.
         """
-        from scroll_tactile.firmware.quantising import exported_judge
+        from scroll_tactile.clients.firmware.quantising import exported_judge
 
         names = names_of("scene", scene)
         return self._ledger.read(lambda memory, _: exported_judge(self._recipe, memory, names))

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import scroll_tactile_store
+
 import scroll_tactile
-import scroll_tactile.ros2
-import store
+import scroll_tactile.clients.ros2
 from scroll_tactile import errors, recordings, sensors
 
 PAGE = Path(scroll_tactile.__file__).parent / "API.md"
@@ -23,10 +24,10 @@ any release. Arrays are given with their shape and unit; errors are those of `sc
 PARTS = {
     "scroll_tactile": (scroll_tactile, scroll_tactile.__all__),
     "scroll_tactile.recordings": (recordings, recordings.__all__),
-    "scroll_tactile.ros2": (scroll_tactile.ros2, scroll_tactile.ros2.__all__),
+    "scroll_tactile.clients.ros2": (scroll_tactile.clients.ros2, scroll_tactile.clients.ros2.__all__),
     "scroll_tactile.errors": (errors, [name for name, item in vars(errors).items() if inspect.isclass(item)]),
     "scroll_tactile.sensors": (sensors, [name for name in sensors.__all__ if name != "Sensor"]),
-    "store": (store, store.__all__),
+    "scroll_tactile_store": (scroll_tactile_store, scroll_tactile_store.__all__),
 }
 
 
@@ -47,7 +48,7 @@ def _described(name: str, item: Any) -> Iterator[str]:
             yield f"    {name}{_signature(item)}\n"
         yield _text(item)
         if not issubclass(item, BaseException):
-            bases = [base for base in reversed(item.__mro__) if base.__module__.startswith(("scroll_tactile", "store"))]
+            bases = [base for base in reversed(item.__mro__) if base.__module__.startswith("scroll_tactile")]
             for own, member in sorted({own: member for base in bases for own, member in vars(base).items()}.items()):
                 if not own.startswith("_"):
                     yield from _member(name, own, member)

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from examples.benchmarks.__main__ import app as benchmarks
 from examples.paper.__main__ import app as paper
-from scroll_tactile.cli.application import app
+from scroll_tactile.clients.cli.application import app
 
 PAPER = {command.name or command.callback.__name__ for command in paper.registered_commands}
 PAPER |= {group.name for group in paper.registered_groups}

@@ -70,5 +70,5 @@ def quick_checkpoints(request: pytest.FixtureRequest) -> Iterator[None]:
     """Checkpoints are written without zarr, to the same bytes, but in the tests of their writing."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in BY_ZARR:
-            patch.setattr("store.checkpoint_files._write_zarr", write_zarr)
+            patch.setattr("scroll_tactile_store.checkpoint_files._write_zarr", write_zarr)
         yield

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 from forging import describe_again, get_current, get_identity, log_of, put_row, set_current, set_identity
+from scroll_tactile_store.log import LogReader
 from touches import PAD, stream
 
 from scroll_tactile.memory.touch_rows import pack_readings
 from scroll_tactile.signals.stream import validate
-from store.log import LogReader
 
 Attack = Callable[[Path], Any]
 

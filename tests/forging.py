@@ -13,16 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from store import Store
-from store.chunks import ArrayContent
-from store.encoding import array_digest, check_arrays, encode_payload
-from store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
-from store.layout import CURRENT_FILE, checkpoint_path, log_path
-from store.log import LogPlace, LogReader
-from store.records import payload_digest
-from store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
-from store.rows import Rows
+from scroll_tactile_store import Store
+from scroll_tactile_store.chunks import ArrayContent
+from scroll_tactile_store.encoding import array_digest, check_arrays, encode_payload
+from scroll_tactile_store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
+from scroll_tactile_store.layout import CURRENT_FILE, checkpoint_path, log_path
+from scroll_tactile_store.log import LogPlace, LogReader
+from scroll_tactile_store.records import payload_digest
+from scroll_tactile_store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
+from scroll_tactile_store.rows import Rows
 
 PAYLOAD = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")

@@ -91,7 +91,7 @@ class Page:
             self.code = done.exit_code
             return str(done.output)
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-        environment = {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
+        environment = {**os.environ, "PATH": path, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "store")])}
         ended = subprocess.run(["sh", "-c", line], env=environment, capture_output=True, text=True, check=False)
         self.code = ended.returncode
         return ended.stdout + ended.stderr

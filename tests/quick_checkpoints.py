@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scroll_tactile_store.checkpoint_files
 from numcodecs import zstd
+from scroll_tactile_store.checkpoint_files import CheckpointDraft
+from scroll_tactile_store.chunks import ArrayContent
 
-import store.checkpoint_files
-from store.checkpoint_files import CheckpointDraft
-from store.chunks import ArrayContent
-
-WRITTEN_BY_ZARR = store.checkpoint_files._write_zarr
+WRITTEN_BY_ZARR = scroll_tactile_store.checkpoint_files._write_zarr
 
 
 class Group:

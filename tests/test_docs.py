@@ -101,7 +101,7 @@ def test_pages_are_pages_and_their_links_lead_somewhere(path):
 def test_commands_in_the_readme_exist():
     named = set(re.findall(r"scroll-tactile (\w+)", README))
     helped = subprocess.run(
-        [sys.executable, "-m", "scroll_tactile.cli", "--help"],
+        [sys.executable, "-m", "scroll_tactile.clients.cli", "--help"],
         capture_output=True,
         text=True,
         check=True,

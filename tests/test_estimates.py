@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Quantity, Scene, Sensor, TactileLearner
+from scroll_tactile.clients.learning.learning import Answered, Evaluation
+from scroll_tactile.clients.learning.metrics import interval_figures
+from scroll_tactile.clients.learning.sources import SourceTouch
 from scroll_tactile.errors import AnnotationError, InputError
-from scroll_tactile.pipelines.learning import Answered, Evaluation
-from scroll_tactile.pipelines.metrics import interval_figures
-from scroll_tactile.pipelines.sources import SourceTouch
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 SETTINGS = {"sensor": PAD, "embedding": Kernels(dimension=64), "exemplars": 0}

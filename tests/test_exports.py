@@ -12,19 +12,19 @@ from pathlib import Path
 
 import api
 import pytest
+import scroll_tactile_store
 
 import scroll_tactile
-import store
 
 PACKAGES = [
     scroll_tactile,
-    store,
+    scroll_tactile_store,
     *(importlib.import_module(f"scroll_tactile.{name}") for name in ("recordings", "testing")),
 ]
 
 
 def modules():
-    for package in (scroll_tactile, store):
+    for package in (scroll_tactile, scroll_tactile_store):
         yield package.__name__
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             yield found.name
@@ -56,7 +56,7 @@ def test_every_module_names_what_it_offers(name):
 
 
 def test_types_are_shipped():
-    for package in (scroll_tactile, store):
+    for package in (scroll_tactile, scroll_tactile_store):
         assert (Path(package.__file__).parent / "py.typed").exists()
 
 
@@ -66,7 +66,11 @@ FORMATS = "rosbags pyarrow h5py zarr fsspec torch lz4 sqlite3 PIL"
 
 @pytest.mark.parametrize(
     ("package", "others"),
-    [("scroll_tactile", SOME_NEED), ("scroll_tactile.recordings", FORMATS), ("store", "scroll_tactile torch")],
+    [
+        ("scroll_tactile", SOME_NEED),
+        ("scroll_tactile.recordings", FORMATS),
+        ("scroll_tactile_store", "scroll_tactile torch"),
+    ],
 )
 def test_importing_brings_no_library_that_only_some_need(package, others):
     code = f"import sys, {package}; print(*[name for name in {others.split()} if name in sys.modules])"
@@ -84,7 +88,11 @@ def test_the_page_of_public_names_says_what_their_docstrings_say():
 
 
 def test_no_class_and_no_file_has_the_name_of_another():
-    files = [path for package in (scroll_tactile, store) for path in Path(package.__file__).parent.rglob("*.py")]
+    files = [
+        path
+        for package in (scroll_tactile, scroll_tactile_store)
+        for path in Path(package.__file__).parent.rglob("*.py")
+    ]
     trees = [ast.walk(ast.parse(path.read_text(encoding="utf-8"))) for path in files]
     found = {
         "class": Counter(node.name for tree in trees for node in tree if isinstance(node, ast.ClassDef)),

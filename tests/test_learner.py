@@ -8,6 +8,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+from scroll_tactile_store import NotAStoreError, Store, StoreError
 
 import scroll_tactile
 from scroll_tactile import Kernels, Prediction, Sensor, TactileLearner, sensors
@@ -29,7 +30,6 @@ from scroll_tactile.errors import (
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
-from store import NotAStoreError, Store, StoreError
 
 SMALL = Kernels(seed=0, dimension=64)
 PAD = Sensor(name="pad", channels=3, rate=100.0, low=-1.0, high=1.0, unit="N", duration=1.0)

@@ -143,7 +143,7 @@ TAKE_TORCH = [
     "scroll_tactile.Vision",
     "scroll_tactile.ModuleEmbedding",
     "scroll_tactile.Frames()",
-    "importlib.import_module('scroll_tactile.pipelines.onnx_export')",
+    "importlib.import_module('scroll_tactile.clients.learning.onnx_export')",
     "importlib.import_module('scroll_tactile.finetune.fine_tune')",
 ]
 

@@ -22,7 +22,9 @@ def run() -> Any:
     from jupyter_client.manager import AsyncKernelManager
     from nbclient import NotebookClient
 
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    os.environ["PYTHONPATH"] = os.pathsep.join(
+        [str(ROOT), str(ROOT / "store"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    )
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     kernel = AsyncKernelManager(kernel_name="python3", transport="ipc")  # sockets that nobody else can read
     NotebookClient(notebook, km=kernel, timeout=SECONDS, record_timing=False).execute()

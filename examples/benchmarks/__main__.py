@@ -20,7 +20,7 @@ from examples.benchmarks.many_materials import many
 from examples.benchmarks.node_latency import ros2
 from examples.benchmarks.speed import speed
 from examples.benchmarks.vision_speed import vision
-from scroll_tactile.cli.terminal import Commands
+from scroll_tactile.clients.cli.terminal import Commands
 from scroll_tactile.libraries import missing
 
 __all__ = ["app"]

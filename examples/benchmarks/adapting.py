@@ -24,7 +24,7 @@ from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner
 from scroll_tactile.blas import one_thread
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["adapt", "run_adapting"]

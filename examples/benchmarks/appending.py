@@ -19,13 +19,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from scroll_tactile_store.log_writer import LogWriter, create_log
+from scroll_tactile_store.row_encoding import ROW, encode_row
 
 from examples.benchmarks.timing import Timing, timed
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
-from scroll_tactile.cli.terminal import progress_bar
-from store.log_writer import LogWriter, create_log
-from store.row_encoding import ROW, encode_row
+from scroll_tactile.clients.cli.terminal import progress_bar
 
 __all__ = ["log", "run_appending"]
 

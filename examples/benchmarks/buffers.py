@@ -22,7 +22,7 @@ from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.options import Data, Dataset, Json, Seed, read
 from examples.paper.runs.results import show, write
 from scroll_tactile import Embedding, Kernels
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner

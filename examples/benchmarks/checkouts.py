@@ -82,7 +82,7 @@ class Worker:
         # -P: beside the checkout's own path nothing of this folder's is to be imported.
         self._process = subprocess.Popen(
             [sys.executable, "-P", str(HERE / "worker.py"), str(touches)],
-            env={**os.environ, "PYTHONPATH": str(checkout)},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(checkout), str(checkout / "store")])},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -14,17 +14,17 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from scroll_tactile_store import StoreError
 
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import Kernels, Sensor, TactileLearner, sensors
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.learning import learning
+from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.learning.sources import SourceOptions
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.pipelines import learning
-from scroll_tactile.pipelines.fleet import learn
-from scroll_tactile.pipelines.sources import SourceOptions
 from scroll_tactile.simulation.scene import Scene
-from store import StoreError
 
 __all__ = ["DyingExecutor", "fleet", "run_fleet"]
 

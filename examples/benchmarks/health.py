@@ -26,7 +26,7 @@ from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
 from scroll_tactile.blas import one_thread
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.health.channel_numbers import channel_numbers
 from scroll_tactile.health.watch import Watch
 from scroll_tactile.sensors import Sensor

@@ -23,7 +23,7 @@ from examples.benchmarks.vector_peers import GradientSteps, PseudoInverse, Refit
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import Capabilities, Sensor, TactileLearner
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 
 __all__ = ["interleaved", "run_interleaved"]
 

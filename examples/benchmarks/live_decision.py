@@ -20,11 +20,11 @@ from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.options import Data, Folds, Json, Seed, folds_of, read
 from examples.paper.runs.results import show, write
 from examples.paper.studies.replay import novelty_area, rotations
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.learning.metrics import calibration_error
 from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import decision_rule
-from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.judging import answer
 from scroll_tactile.results import Prediction

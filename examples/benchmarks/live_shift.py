@@ -17,7 +17,7 @@ from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import Sensor, TactileLearner, sensors
 from scroll_tactile.blas import one_thread
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import Shift, quiet_noise, resting_level, shift_of, simulated_shift

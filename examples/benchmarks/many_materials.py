@@ -19,7 +19,7 @@ from examples.benchmarks.speed_bench import Bench, Sides, Sizes
 from examples.benchmarks.speed_touches import SKIN, name_of, skin_touch, skin_touches
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 
 __all__ = ["filled", "many", "run_many"]
 

@@ -28,7 +28,7 @@ from examples.benchmarks.vision_speed import BareResNet
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import one_torch_thread
 from scroll_tactile.signals.image import tactile_image, three_planes

@@ -28,7 +28,7 @@ from examples.paper.readers.biotac_slide import load
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
-from scroll_tactile.cli.terminal import percent, progress_bar, say
+from scroll_tactile.clients.cli.terminal import percent, progress_bar, say
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.runtimes import Precision, Run, RuntimeName, make_runtime, one_torch_thread
 from scroll_tactile.embeddings.vision import Vision, to_planes

@@ -24,7 +24,7 @@ from examples.paper.studies.table1 import table1
 from examples.paper.studies.unlearning import unlearning
 from examples.paper.transfer.sensors import sensors
 from examples.paper.transfer.tasks import tasks
-from scroll_tactile.cli.terminal import Commands
+from scroll_tactile.clients.cli.terminal import Commands
 
 __all__ = ["app"]
 

@@ -17,11 +17,11 @@ import time
 from typing import Any
 
 import roslibpy
+from scroll_tactile_store import StoreError
 
 from scroll_tactile import TactileLearner
+from scroll_tactile.clients.ros2 import Answer, Bridge
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.ros2 import Answer, Bridge
-from store import StoreError
 
 PORT = 9090
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+from scroll_tactile_store import StoreError
+
 from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.results import Health
 from scroll_tactile.signals.stream import Stream
-from store import StoreError
 
 __all__ = ["HealthNotes", "Noting"]
 

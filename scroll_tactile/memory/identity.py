@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
+from scroll_tactile_store import DamageError, Store
 
 from scroll_tactile.embeddings.protocol import (
     Capabilities,
@@ -29,7 +30,6 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.windows import COMPETING, ScaleKind
 from scroll_tactile.statistics.grid import BITS
-from store import DamageError, Store
 
 __all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identity", "absent_embedding"]
 LARGEST_DIMENSION = 2**14  # of an embedding: a second moment of more takes over a GiB a scale

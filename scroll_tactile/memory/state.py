@@ -10,6 +10,8 @@ from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Head, Record
+from scroll_tactile_store.records import LateArray
 
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
@@ -36,8 +38,6 @@ from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, tog
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
 from scroll_tactile.statistics.targets import TargetSums
-from store import Head, Record
-from store.records import LateArray
 
 __all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "Memory"]
 

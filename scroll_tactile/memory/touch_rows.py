@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Head
 
 from scroll_tactile.errors import MismatchError, StreamError
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Annotations, together
-from store import Head
 
 __all__ = [
     "ADAPT",

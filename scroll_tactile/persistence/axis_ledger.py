@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 
+from scroll_tactile_store import Checkpoint
+
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.signals.correction import Correction
-from store import Checkpoint
 
 __all__ = ["AxisLedger", "axis_name"]
 

@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Record, Store
 
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
 from scroll_tactile.memory.state import Memory
@@ -14,7 +15,6 @@ from scroll_tactile.memory.touch_rows import OBSERVE, only_readings
 from scroll_tactile.persistence.replaying import require_compaction
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
-from store import Record, Store
 
 __all__ = ["exemplar_candidates", "ranked_exemplars"]
 

@@ -10,11 +10,12 @@ import logging
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 
+from scroll_tactile_store import DamageError, Head, Store
+
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, annotation_of
 from scroll_tactile.signals.ranges import CURE
 from scroll_tactile.statistics.annotations import Annotation
-from store import DamageError, Head, Store
 
 __all__ = ["ListedContents", "StoredContents", "refusal"]
 

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from scroll_tactile_store import Head, Record, Store
+
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError, ObservationError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.memory.descriptions import Description, describe, require_units
@@ -50,7 +52,6 @@ from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.validation.gate import MemoryStore
-from store import Head, Record, Store
 
 __all__ = ["Ledger"]
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self, cast
 
 from pydantic import BaseModel
+from scroll_tactile_store import Checkpoint, Head, Record, Store
+from scroll_tactile_store.files import same_folder
 
 from scroll_tactile.errors import AnnotationError, DescriptionError, MismatchError, ObservationError
 from scroll_tactile.memory.descriptions import Description, require_units
@@ -37,8 +39,6 @@ from scroll_tactile.validation.gate import (
     wrong_retractions,
     wrong_values,
 )
-from store import Checkpoint, Head, Record, Store
-from store.files import same_folder
 
 __all__ = ["Choice", "MergePlan", "MergeRules"]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, cast
 
+from scroll_tactile_store import Head, Record, Store
+
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -19,7 +21,6 @@ from scroll_tactile.memory.touch_rows import (
     retracted_by,
 )
 from scroll_tactile.results import Adaptation, Observation, Receipt
-from store import Head, Record, Store
 
 __all__ = [
     "adaptation_of",

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
 
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.health.watched_rows import WatchedRows, WatchRules
@@ -19,7 +20,6 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.contents import ListedContents, StoredContents
 from scroll_tactile.persistence.replaying import apply_appended
-from store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
 
 __all__ = ["Derived", "OpenMemory", "give_back_scratch"]
 

@@ -9,6 +9,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, cast
 
+from scroll_tactile_store import Checkpoint, DamageError, Head, Store
+from scroll_tactile_store.archive import write_archive
+from scroll_tactile_store.exceptions import reported
+
 from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
@@ -27,9 +31,6 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.validation.gate import MemoryStore
-from store import Checkpoint, DamageError, Head, Store
-from store.archive import write_archive
-from store.exceptions import reported
 
 __all__ = ["pack_memory", "sums_without"]
 

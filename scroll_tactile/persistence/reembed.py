@@ -16,6 +16,11 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
+from scroll_tactile_store import Record, Store, StoreError
+from scroll_tactile_store.exceptions import reported
+from scroll_tactile_store.files import is_there, sync_folder
+from scroll_tactile_store.lock import WriterLock
+
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
@@ -35,10 +40,6 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.persistence.replaying import load, refill, replay
 from scroll_tactile.recipe import Recipe
 from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted, require_counted
-from store import Record, Store, StoreError
-from store.exceptions import reported
-from store.files import is_there, sync_folder
-from store.lock import WriterLock
 
 __all__ = ["Reembedding"]
 

@@ -8,6 +8,8 @@ from dataclasses import replace
 from itertools import takewhile
 from typing import cast
 
+from scroll_tactile_store import CompactedError, DamageError, Head, Record, Store
+
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description, describe
 from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
@@ -35,7 +37,6 @@ from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.statistics.annotations import Annotation, Annotations, together
 from scroll_tactile.validation.gate import misdeclared, wrong_values
-from store import CompactedError, DamageError, Head, Record, Store
 
 __all__ = [
     "apply_appended",

@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Head, Store, StoreError
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
@@ -33,7 +34,6 @@ from scroll_tactile.signals.correction import Correction, corrected_stream
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.validation.gate import WRONG
 from scroll_tactile.validation.stored_watch import NAME, watch_to_arrays, watched_from
-from store import Head, Store, StoreError
 
 __all__ = ["adapt_to", "health_of", "health_to_store", "known_touches"]
 

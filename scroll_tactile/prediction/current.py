@@ -24,6 +24,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from weakref import ReferenceType, ref
 
+from scroll_tactile_store import StoreError
+
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
@@ -37,7 +39,6 @@ from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, 
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.settings import Settings
 from scroll_tactile.validation.gate import WRONG
-from store import StoreError
 
 logger = logging.getLogger(__name__)
 

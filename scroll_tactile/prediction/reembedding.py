@@ -6,6 +6,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from scroll_tactile_store import Store
+
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.persistence.reembed import Reembedding
@@ -15,7 +17,6 @@ from scroll_tactile.recipe import Recipe, RecipeRequest, default_kept_touches
 from scroll_tactile.settings import Settings
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.validation.gate import MemoryStore, finish_interrupted
-from store import Store
 
 __all__ = ["embed_again", "reembed_memory"]
 

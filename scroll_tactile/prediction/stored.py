@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Checkpoint
 
 from scroll_tactile import __version__
 from scroll_tactile.embeddings.convolution.banks import MOST_CHANNELS, THRESHOLDS, bank_size
@@ -39,7 +40,6 @@ from scroll_tactile.signals.windows import Scale, measuring
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.validation.expected import KEY_BYTES, Unexpected, array, counts, expect, whole
 from scroll_tactile.validation.stored_readouts import ArrayReader, stored_readout
-from store import Checkpoint
 
 __all__ = ["NAME", "banks_to_arrays", "model_from", "model_to_arrays", "with_banks"]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store.records import LateArray
 
 from scroll_tactile.memory.state import MOST_CORRECTIONS
 from scroll_tactile.memory.touch_rows import Arrays
@@ -33,7 +34,6 @@ from scroll_tactile.validation.expected import (
     whole,
 )
 from scroll_tactile.validation.target_checks import check_targets
-from store.records import LateArray
 
 __all__ = ["CheckpointChecks"]
 

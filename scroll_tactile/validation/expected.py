@@ -10,6 +10,8 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Head, Record
+from scroll_tactile_store.records import LateArray
 
 from scroll_tactile.errors import DescriptionError, InputError, MismatchError
 from scroll_tactile.health.channel_numbers import from_text
@@ -49,8 +51,6 @@ from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import MOST_WINDOWS, WindowPlan
 from scroll_tactile.statistics.annotations import MOST_AXES
 from scroll_tactile.statistics.grid import BITS
-from store import Head, Record
-from store.records import LateArray
 
 __all__ = [
     "KEY_BYTES",

@@ -18,6 +18,10 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy.typing as npt
+from scroll_tactile_store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
+from scroll_tactile_store.exceptions import reported
+from scroll_tactile_store.files import file_size, is_there, sync_folder
+from scroll_tactile_store.layout import log_numbers, log_path
 
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.embeddings.registry import require_configuration
@@ -40,10 +44,6 @@ from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.validation.checkpoint_checks import CheckpointChecks
 from scroll_tactile.validation.expected import RowChecks, Unexpected
-from store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
-from store.exceptions import reported
-from store.files import file_size, is_there, sync_folder
-from store.layout import log_numbers, log_path
 
 __all__ = [
     "WRONG",

@@ -14,6 +14,7 @@ from typing import Any, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Checkpoint
 
 from scroll_tactile import __version__
 from scroll_tactile.health.betting import SCORES, STAKES
@@ -24,7 +25,6 @@ from scroll_tactile.health.watched_rows import WatchedRows, WatchRules
 from scroll_tactile.results import ChangeKind
 from scroll_tactile.validation.expected import array, counts, expect, name, whole
 from scroll_tactile.validation.stored_readouts import ArrayReader
-from store import Checkpoint
 
 __all__ = ["NAME", "watch_to_arrays", "watched_from"]
 

@@ -123,8 +123,9 @@ def _begins(place: Path, beginning: bytes) -> bool:
 def _import(chosen: argparse.Namespace, kind: Kind, memory: str | None, named: bool) -> int:
     """Write it; returns the exit code. An unsound memory or recording is an error; a recording of another sensor is
     not, nor is a file of a kind that anybody has, such as a table of names, unless it was opened by hand."""
+    from scroll_tactile_store import StoreError
+
     from scroll_tactile.errors import ChannelCountError, FieldError, RecordingError, ScrollTactileError
-    from store import StoreError
 
     try:
         if kind == "memory":

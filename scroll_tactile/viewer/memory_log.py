@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from scroll_tactile.clients.report.facts import MemoryFacts
 from scroll_tactile.errors import ScrollTactileError, printable
 from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.matching.likelihood import LEVELS
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.prediction.judging import HeldOutTouch
-from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.results import Health, Observation
 from scroll_tactile.viewer.streams import Colours, entity, layout, rerun
 

@@ -8,6 +8,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from commands import run
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.row_encoding import decode_row
 
 from examples.benchmarks import appending, health, health_peers, live_shift
 from examples.benchmarks.interleaved import AsIs
@@ -18,8 +20,6 @@ from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import Shift, Truth
 from scroll_tactile.testing import check_embedding
-from store.log import LogReader
-from store.row_encoding import decode_row
 
 
 def measured(tmp_path, *words):

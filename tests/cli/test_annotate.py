@@ -11,7 +11,7 @@ from robot_sets import robot_set
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.cli import terminal
+from scroll_tactile.clients.cli import terminal
 
 
 @pytest.fixture(scope="module")

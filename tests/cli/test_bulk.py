@@ -170,8 +170,8 @@ class TestLearn:
 
 SLOWLY = """
 import time
-from scroll_tactile.cli import main
-from scroll_tactile.pipelines import learning
+from scroll_tactile.clients.cli import main
+from scroll_tactile.clients.learning import learning
 learning.BATCH_TOUCHES, whole = 8, learning.source_touches
 def source_touches(*options):
     time.sleep(0.1)

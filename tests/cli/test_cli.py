@@ -155,7 +155,7 @@ class TestDemo:
 
     def test_the_plug_is_pulled_and_it_goes_on(self, tmp_path: Path) -> None:
         kept = tmp_path / "kept"
-        words = [sys.executable, "-m", "scroll_tactile.cli", "demo", "--memory", str(kept), *LONGER]
+        words = [sys.executable, "-m", "scroll_tactile.clients.cli", "demo", "--memory", str(kept), *LONGER]
         process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
         try:
             until = time.monotonic() + 60

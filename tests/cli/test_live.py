@@ -12,7 +12,7 @@ from rich.console import Console
 from touches import PAD, SMALL
 
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.cli import replay
+from scroll_tactile.clients.cli import replay
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.simulation.shift import simulated_shift
 

@@ -11,14 +11,14 @@ import time
 import numpy as np
 import pytest
 from commands import refused, run
+from scroll_tactile_store import Store
 from touches import PAD, SETTINGS, stream
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.cli.terminal import shown
+from scroll_tactile.clients.cli.terminal import shown
 from scroll_tactile.errors import InputError, UnknownMaterialError, printable
-from store import Store
 
-COMMAND = [sys.executable, "-m", "scroll_tactile.cli"]
+COMMAND = [sys.executable, "-m", "scroll_tactile.clients.cli"]
 HOSTILE = "\x1b]0;pwned\x07\x1b[2J\x9b31m\u202eevil\nline\x7f\u200b"
 
 
@@ -131,7 +131,7 @@ def test_a_working_directory_that_is_gone(path, tmp_path):
 
 def begun(code, *words):
     """A process that runs `code`, which says "ready", and the command."""
-    start = f"import sys, time\nfrom scroll_tactile.cli import main\n{code}\nmain()"
+    start = f"import sys, time\nfrom scroll_tactile.clients.cli import main\n{code}\nmain()"
     return subprocess.Popen(
         [sys.executable, "-c", start, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from commands import refused, run
 from forging import log_of
+from scroll_tactile_store import Store, StoreError
 from touches import PAD, SETTINGS, fed, require_same, stream
 
 from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
-from scroll_tactile.cli.terminal import opened_for_upkeep
+from scroll_tactile.clients.cli.terminal import opened_for_upkeep
+from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.prediction.reembedding import reembed_memory
-from store import Store, StoreError
 
 OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
 

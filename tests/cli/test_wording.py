@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile import sensors
-from scroll_tactile.cli.application import app
-from scroll_tactile.cli.wording import in_options, typed
+from scroll_tactile.clients.cli.application import app
+from scroll_tactile.clients.cli.wording import in_options, typed
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
 

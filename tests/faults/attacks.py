@@ -30,14 +30,14 @@ from forging import (
     set_identity,
     write_log,
 )
+from scroll_tactile_store.encoding import decode_payload, encode_payload
+from scroll_tactile_store.framing import FRAME_BYTES, read_frame
 
 from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
 from faults.places import Attack, Scene, leftover, strange_file
 from scroll_tactile.memory.touch_rows import pack_codes, unpack_readings
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
-from store.encoding import decode_payload, encode_payload
-from store.framing import FRAME_BYTES, read_frame
 
 KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "member", "x", "", "OBSERVE")
 

@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from forging import named_in
+from scroll_tactile_store import Record, VersionError
+from scroll_tactile_store.encoding import decode_payload, encode_payload
+from scroll_tactile_store.records import from_json
 from touches import stream
 
 from faults.attacks import CLASSES, FORGED, made_row
@@ -23,9 +26,6 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.memory.touch_rows import pack_codes
 from scroll_tactile.persistence.replaying import replay
 from scroll_tactile.validation.gate import MemoryStore
-from store import Record, VersionError
-from store.encoding import decode_payload, encode_payload
-from store.records import from_json
 
 SPARE = 256 * 2**20  # bytes beyond the memory's own
 KINDS = ("frames", "records", "rows", "bytes", "identities", "checkpoints", "currents", "files")

@@ -27,13 +27,13 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from forging import log_of, named_in
+from scroll_tactile_store import DamageError, StoreError, check_store
 
 from faults.common import fingerprint, folder, parser, run, warnings_told
 from faults.learners import expected, opened, perform, seen, warm
 from faults.model import Operation, State, after
 from faults.plans import prepare
 from faults.trials import NEVER, Trials, checkpoints_every
-from store import DamageError, StoreError, check_store
 
 SOME = 500  # bytes
 

@@ -127,7 +127,7 @@ class Warnings(logging.Handler):
 def warnings_told(hear: Callable[[str], object]) -> Iterator[None]:
     """While it lasts, `hear` gets each warning, and nothing of it is printed."""
     heard = Warnings(hear)
-    loggers = [logging.getLogger(name) for name in ("store", "scroll_tactile")]
+    loggers = [logging.getLogger(name) for name in ("scroll_tactile_store", "scroll_tactile")]
     for logger in loggers:
         logger.addHandler(heard)
         logger.propagate = False

@@ -13,8 +13,8 @@ from touches import stream
 
 from faults.learners import KIT
 from faults.model import Pairs, State
-from scroll_tactile.pipelines.fleet import learn
-from scroll_tactile.pipelines.sources import SourceOptions
+from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.learning.sources import SourceOptions
 
 
 class Here(Executor):

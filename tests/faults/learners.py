@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from scroll_tactile_store import check_store
 from touches import PAD, SETTINGS, SMALL, SmallSample, stream
 
 import scroll_tactile.memory.state
@@ -24,7 +25,6 @@ from faults.model import Operation, Pairs, State, Touch
 from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.persistence.merge import MergeRules
-from store import check_store
 
 FORCE = Quantity(name="force", unit="N", low=0, high=1, resolution=0.01)
 VALUED = 5  # the seed of the touches that have a value

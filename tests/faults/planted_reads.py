@@ -11,11 +11,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+from scroll_tactile_store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair, rows
+
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.persistence import ledger, merge, packing, replaying
-from store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair, rows
 
 
 @bug("a frame's payload is not verified", log.LogReader, "_payload")

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from scroll_tactile_store import backup, checkpoint_files, checkpoints, layout, log_writer
+from scroll_tactile_store.exceptions import reported
+from scroll_tactile_store.files import sync_file, sync_folder, sync_tree
+from scroll_tactile_store.layout import Current
+
 from faults.planting import bug, nothing
 from scroll_tactile.persistence import ledger
-from store import backup, checkpoint_files, checkpoints, layout, log_writer
-from store.exceptions import reported
-from store.files import sync_file, sync_folder, sync_tree
-from store.layout import Current
 
 
 @bug("CURRENT is not synced", layout, "replacing")

@@ -36,7 +36,7 @@ class Replacement:
         before, places = self.before(), [self.where]
         made = self.make(before)
         if self.everywhere:
-            modules = [module for key, module in sys.modules.items() if key.startswith(("store", "scroll_tactile"))]
+            modules = [module for key, module in sys.modules.items() if key.startswith("scroll_tactile")]
             places += [each for each in modules if each is not self.where and vars(each).get(self.name) is before]
         return [mock.patch.object(place, self.name, made) for place in places]
 

@@ -26,6 +26,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from scroll_tactile_store import CompactedError, LockedError
 from touches import stream
 
 from faults.common import folder, parser, progress, run, warnings_told
@@ -34,7 +35,6 @@ from faults.model import Operation, State, after
 from faults.plans import draw
 from faults.trials import checkpoints_every
 from faults.zygote import Zygote
-from store import CompactedError, LockedError
 
 KINDS = ("observe", "observe", "observe", "batch", "retract", "forget", "describe", "compact", "fine_tune")
 CHECKPOINT_EVERY = 6

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scroll_tactile_store import Store, StoreError, check_store, repair_store
 from touches import stream
 from typer.testing import CliRunner
 
@@ -24,11 +25,10 @@ from faults.common import fingerprint, warnings_told
 from faults.learners import opened, perform, samples
 from faults.model import Operation
 from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.cli.application import app
+from scroll_tactile.clients.cli.application import app
+from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.validation.gate import check_memory
-from store import Store, StoreError, check_store, repair_store
 
 OURS = (ScrollTactileError, StoreError)
 GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"

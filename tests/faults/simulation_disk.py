@@ -12,13 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import scroll_tactile_store.checkpoint_files
+import scroll_tactile_store.checkpoints
+import scroll_tactile_store.log_writer
+import scroll_tactile_store.open_log
+import scroll_tactile_store.rows
 from quick_checkpoints import write_zarr
 
-import store.checkpoint_files
-import store.checkpoints
-import store.log_writer
-import store.open_log
-import store.rows
 from faults import shim as watch
 from faults.disks import STYLES, Disk, Event, File, Folder, Style, events, rebuild
 from faults.shim import Shim
@@ -123,11 +123,11 @@ class Held:
 
 def prepare() -> None:
     """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
-    store.log_writer.AHEAD = AHEAD
-    store.rows.EVERY = store.open_log.EVERY = EVERY
-    store.checkpoint_files._write_zarr = partial(write_zarr, indent=None)  # numbers stand between commas
-    store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
-    store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
+    scroll_tactile_store.log_writer.AHEAD = AHEAD
+    scroll_tactile_store.rows.EVERY = scroll_tactile_store.open_log.EVERY = EVERY
+    scroll_tactile_store.checkpoint_files._write_zarr = partial(write_zarr, indent=None)  # numbers stand between commas
+    scroll_tactile_store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
+    scroll_tactile_store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
 
 
 def abandon(learner: Any) -> None:

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import store.backup
+import scroll_tactile_store.backup
+
 from faults.cases import Wrong
 from faults.learners import KIT, perform
 from faults.model import after
@@ -22,7 +23,7 @@ SMALL = ("observe",) * 4 + ("retract", "describe", "forget")
 @contextmanager
 def interleaved(place: int, between: Callable[[], None]) -> Iterator[None]:
     """While it lasts, do something just before the so many-th file is copied; 0: before the log is read."""
-    copy, reader = store.backup.copy_regular, store.backup.LogReader
+    copy, reader = scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.LogReader
     left = [place] if place >= 0 else []
 
     def due(now: bool) -> None:
@@ -39,11 +40,11 @@ def interleaved(place: int, between: Callable[[], None]) -> Iterator[None]:
         due(True)
         return reader(*given, **named)
 
-    store.backup.copy_regular, store.backup.LogReader = copied, read  # type: ignore[assignment,misc]
+    scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.LogReader = copied, read  # type: ignore[assignment,misc]
     try:
         yield
     finally:
-        store.backup.copy_regular, store.backup.LogReader = copy, reader  # type: ignore[misc]
+        scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.LogReader = copy, reader  # type: ignore[misc]
 
 
 class OneMemory(World):

@@ -8,14 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile_store import StoreError, repair_store
+from scroll_tactile_store.layout import DERIVED, read_current
+
 from faults.cases import Wrong
 from faults.learners import KIT, perform
 from faults.model import State
 from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
 from faults.simulation_events import OneMemory
 from faults.simulation_world import Machine
-from store import StoreError, repair_store
-from store.layout import DERIVED, read_current
 
 KEPT = ("kept", "pool", "exemplars")
 

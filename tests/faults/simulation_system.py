@@ -9,13 +9,14 @@ import random
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile_store import StoreError
+
 from faults.cases import Wrong
 from faults.learners import perform
 from faults.model import State, after
 from faults.simulation_disk import flip
 from faults.simulation_rot import Rotting
 from faults.simulation_world import Machine
-from store import StoreError
 
 MOST = 24  # touches of a memory that is merged
 

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile_store import StoreError, check_store
+
 from faults.cases import Wrong
 from faults.disks import Event
 from faults.learners import KIT, opened, perform
@@ -22,7 +24,6 @@ from faults.shim import Shim
 from faults.simulation_disk import Disks, Held, abandon
 from faults.simulation_kit import expected, seen
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
-from store import StoreError, check_store
 
 MACHINES = ("robot-1", "robot-2", "central")
 ERRORS = (errno.ENOSPC, errno.ENOSPC, errno.EIO)

@@ -23,10 +23,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from scroll_tactile_store import Store
+
 from faults.common import file_system, folder, parser, progress, run
 from faults.feeding import BIOTAC, TINY, endless, observe, touches
 from scroll_tactile import TactileLearner
-from store import Store
 
 BATCH = 10_000
 BAR = 2.0  # seconds to open

@@ -41,6 +41,7 @@ from unittest.mock import patch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from scroll_tactile_store import CompactedError
 
 import scroll_tactile.learner
 import scroll_tactile.memory.state
@@ -58,7 +59,6 @@ from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.sample import TouchSample
-from store import CompactedError
 
 SHORT = 12  # readings of the beginning of a touch
 PAUSE = 30  # readings between touches; two seconds before the first of a session that finds them itself

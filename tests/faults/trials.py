@@ -9,11 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from scroll_tactile_store import StoreError
+
 import scroll_tactile.persistence.open_memory
 from faults.common import progress
 from faults.learners import opened, perform, seen, settle, unsound_copies
 from faults.model import Operation, State
-from store import StoreError
 
 NEVER = 2**40  # rows between checkpoints
 SUCCESS = "success"

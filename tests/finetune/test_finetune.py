@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scroll_tactile_store import StoreError
 from touches import Windowed
 
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
@@ -18,7 +19,6 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.simulation.scene import Scene
-from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
 SCENE = Scene(sensor=PAD)

@@ -12,9 +12,9 @@ from live_touches import gel_learner
 
 from examples.benchmarks.chips.boards import BOARDS, missing_tools
 from scroll_tactile import Kernels, Scene, Sensor, TactileLearner, sensors
+from scroll_tactile.clients.firmware.c_files import flash_bytes, kept_levels, touches_to_check, write_firmware
+from scroll_tactile.clients.firmware.exported_judge import MISSING_LEVEL, MOST_MATERIALS
 from scroll_tactile.errors import InputError, UnknownMaterialError
-from scroll_tactile.firmware.c_files import flash_bytes, kept_levels, touches_to_check, write_firmware
-from scroll_tactile.firmware.exported_judge import MISSING_LEVEL, MOST_MATERIALS
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from commands import refused, run
 from forging import checkpoint_of, put_checkpoint, put_row
+from scroll_tactile_store import ReadOnlyError, StoreError
 from touches import spoil
 
 from scroll_tactile import Adaptation, Kernels, Scene, Sensor, TactileLearner, errors, sensors
+from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.report import memory_page
 from scroll_tactile.health import skin_fit
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text
-from scroll_tactile.pipelines.fleet import learn
-from scroll_tactile.report import memory_page
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.validation.gate import check_memory
-from store import ReadOnlyError, StoreError
 
 PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)

@@ -12,11 +12,11 @@ import pytest
 from commands import run
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors, sensors
+from scroll_tactile.clients.report import memory_page
 from scroll_tactile.health import betting
 from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text, to_text
 from scroll_tactile.health.watch import Watch
-from scroll_tactile.report import memory_page
 from scroll_tactile.results import ChangeKind
 from scroll_tactile.signals.stream import Stream, validate
 

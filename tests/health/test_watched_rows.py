@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scroll_tactile_store import Checkpoint, StoreError, StoreFullError
+from scroll_tactile_store.log_writer import LogWriter
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
 from scroll_tactile.health import watched_rows
@@ -16,8 +18,6 @@ from scroll_tactile.health.watch import Watch
 from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.validation import stored_watch
 from scroll_tactile.validation.expected import Unexpected
-from store import Checkpoint, StoreError, StoreFullError
-from store.log_writer import LogWriter
 
 PAD = Sensor(name="pad", channels=4, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)

@@ -17,9 +17,9 @@ from mcap.reader import NonSeekingReader, make_reader
 from touches import PAD, SMALL
 
 from scroll_tactile import AnswerLog, Quantity, TactileLearner
+from scroll_tactile.clients.learning.annotating import answer_log
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.answers import LiveState, LiveTouch
-from scroll_tactile.pipelines.annotating import answer_log
 from scroll_tactile.recordings import read
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import validate

@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scroll_tactile_store import StoreError
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.live.health_notes import HealthNotes
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream, validate
-from store import StoreError
 
 PAD = Sensor(name="pad", channels=6, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)

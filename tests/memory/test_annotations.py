@@ -4,13 +4,13 @@ import copy
 import math
 
 import pytest
+from scroll_tactile_store import Store
 from touches import OBSERVED, SETTINGS, filled, stream
 
 from scroll_tactile import Quantity, TactileLearner
 from scroll_tactile.errors import AnnotationError, InputError, MismatchError
 from scroll_tactile.memory.touch_rows import DECLARE
 from scroll_tactile.statistics.annotations import Annotation
-from store import Store
 
 FORCE = Quantity(name="force", unit="N", low=-1, high=10, resolution=0.01)
 SPEED = Quantity(name="speed", unit="m/s", low=0, high=1, resolution=0.001)

@@ -6,8 +6,8 @@ import pytest
 from touches import OBSERVED, SETTINGS, filled, require_same, spoil, stream
 
 from scroll_tactile import TactileLearner
+from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import DescriptionError, InputError, MismatchError
-from scroll_tactile.pipelines.plain_export import export_plain
 
 HARD = {"hardness": [62.0, "Shore A"]}
 SAID = {

@@ -13,15 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scroll_tactile_store.layout
+from scroll_tactile_store import Store, VersionError, check_store
+from scroll_tactile_store.layout import read_current, write_current
 
-import store.layout
 from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.validation.gate import check_memory
-from store import Store, VersionError, check_store
-from store.layout import read_current, write_current
 
 GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
 EXPECTED = GOLDEN.with_suffix(".json")
@@ -199,7 +199,7 @@ def test_it_is_what_this_version_writes(golden, tmp_path):
 
 
 def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
-    monkeypatch.setattr(store.layout, "FORMAT_VERSION", 2)
+    monkeypatch.setattr(scroll_tactile_store.layout, "FORMAT_VERSION", 2)
     write_current(golden, read_current(golden / "CURRENT"))
     monkeypatch.undo()
     before = {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()}

@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 from commands import refused, run
+from scroll_tactile_store import Store
 
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision
@@ -17,7 +18,6 @@ from scroll_tactile.embeddings.protocol import capabilities_of, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.recipe import Recipe
-from store import Store
 
 PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 EMBEDDINGS = {
@@ -123,7 +123,7 @@ class TestSnapshots:
             answer = repr(learner.predict(touch(9)))
             digest = learner.digest()
         code = (
-            "import pickle, sys, numpy as np; from scroll_tactile.cli.application import app\n"
+            "import pickle, sys, numpy as np; from scroll_tactile.clients.cli.application import app\n"
             "try: app(['inspect', sys.argv[1], '--json'])\n"
             "except SystemExit: pass\n"
             "print('torch' in sys.modules)\n"

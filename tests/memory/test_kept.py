@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scroll_tactile_store import Store
 from touches import OBSERVED, PAD, Windowed, fed, filled, held, kept_of, require_same, stream
 
 from scroll_tactile import Kernels, TactileLearner
@@ -13,7 +14,6 @@ from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.kept_touches import KeptTouches
 from scroll_tactile.recipe import default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
-from store import Store
 
 FEW = 5
 SPARE = [("d", (40 + i, 60)) for i in range(3)]

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
+from scroll_tactile_store.encoding import encode_payload
 
 from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import CapacityError, MismatchError
@@ -15,7 +16,6 @@ from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_code
 from scroll_tactile.signals.windows import Scale, WindowPlan, extent
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.statistics.sample import stage_rows
-from store.encoding import encode_payload
 
 DIMENSION, SCALES = 4, (6, 20)
 READING = WindowPlan(SCALES)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from commands import refused
+from scroll_tactile_store import VersionError
 from touches import PAD, SETTINGS, stream
 
 from scroll_tactile import Kernels, TactileLearner
-from store import VersionError
 
 SAID = "was made by a release 0.x, whose memories this one does not read"
 

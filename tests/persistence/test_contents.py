@@ -6,14 +6,14 @@ import pickle
 
 import pytest
 from forging import spoil_row
+from scroll_tactile_store import StoreClosedError, StoreError, StoreFullError
+from scroll_tactile_store.log_writer import LogWriter
 from touches import fed, filled, held, stream
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.annotations import NO_ANNOTATION
-from store import StoreClosedError, StoreError, StoreFullError
-from store.log_writer import LogWriter
 
 OBSERVED = [("abc"[i % 3], (i, 60)) for i in range(12)]  # a content each
 

@@ -9,13 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scroll_tactile_store import (
+    DamageError,
+    NotAStoreError,
+    ReadOnlyError,
+    Store,
+    StoreError,
+    VersionError,
+    archive,
+    check_store,
+)
+from scroll_tactile_store.framing import FRAME_BYTES
 from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.validation.gate import MemoryStore, check_memory
-from store import DamageError, NotAStoreError, ReadOnlyError, Store, StoreError, VersionError, archive, check_store
-from store.framing import FRAME_BYTES
 
 
 def packed(folder, observed, name="p", described=(), pack=None, **settings):
@@ -160,7 +169,7 @@ class TestDamage:
             require_refused(other, file, "fetch it again from where it was packed")
 
     def test_a_newer_version_is_refused_by_its_number(self, tmp_path, other, monkeypatch):
-        monkeypatch.setattr("store.layout.FORMAT_VERSION", 9)
+        monkeypatch.setattr("scroll_tactile_store.layout.FORMAT_VERSION", 9)
         file = packed(tmp_path, OBSERVED[:2])
         monkeypatch.undo()
         require_refused(other, file, "format 9; this release reads format 1: upgrade it")
@@ -186,7 +195,7 @@ class TestDamage:
             raise OSError(28, "No space left on device")
 
         with learner:
-            monkeypatch.setattr("store.archive.os.fsync", full)
+            monkeypatch.setattr("scroll_tactile_store.archive.os.fsync", full)
             with pytest.raises(StoreError, match="no space left"):
                 learner.pack(tmp_path / "p")
             monkeypatch.undo()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from commands import refused, run
 from forging import put_row
+from scroll_tactile_store import DamageError, LockedError, Store, StoreFullError
 from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, held, stream, without
 
 from examples.paper.transfer.maps import Maps
@@ -14,7 +15,6 @@ from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchEr
 from scroll_tactile.persistence import reembed
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.reembedding import reembed_memory
-from store import DamageError, LockedError, Store, StoreFullError
 
 OTHER = {
     "exact": lambda: Kernels(seed=3, dimension=128),

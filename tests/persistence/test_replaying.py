@@ -6,12 +6,12 @@ import shutil
 import pytest
 from commands import run
 from forging import spoil_row
+from scroll_tactile_store import DamageError, Store
 from touches import OBSERVED, PAD, fed, held, stream, without
 
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Augmented, Capabilities, Joined, Kernels, TactileLearner
 from scroll_tactile.persistence import open_memory
-from store import DamageError, Store
 
 
 class OwnKernels(Kernels):

@@ -2,12 +2,20 @@
 
 import pytest
 from forging import spoil_row
+from scroll_tactile_store import (
+    CompactedError,
+    DamageError,
+    ReadOnlyError,
+    Store,
+    StoreError,
+    StoreFullError,
+    repair_store,
+)
 from touches import OBSERVED, PAD, SETTINGS, SmallSample, fed, filled, require_same, spoil, stream, without
 
 from scroll_tactile import Capabilities, Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import FineTuneError, InputError, MismatchError, ObservationError, UnknownMaterialError
 from scroll_tactile.signals.stream import validate
-from store import CompactedError, DamageError, ReadOnlyError, Store, StoreError, StoreFullError, repair_store
 
 
 @pytest.fixture

@@ -1,11 +1,11 @@
 """Where a touch comes from is kept beside it, and changes nothing of what was learned; a wrong name is put right."""
 
 import pytest
+from scroll_tactile_store import Store, StoreFullError
 from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, stream, without
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MaterialError, ObservationError
-from store import Store, StoreFullError
 
 
 @pytest.fixture

@@ -4,8 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-
-from store import LockedError, Store, StoreError
+from scroll_tactile_store import LockedError, Store, StoreError
 
 
 def test_a_lock_whose_holder_could_not_be_noted_is_let_go(tmp_path, monkeypatch):

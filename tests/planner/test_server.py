@@ -1,5 +1,6 @@
 """`scroll-tactile mcp`, a real process, and the client of the protocol's own package."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -12,8 +13,8 @@ from robot_sets import FIELD, robot_set
 from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner
+from scroll_tactile.clients.planner import served, server
 from scroll_tactile.errors import InputError, ObservationError
-from scroll_tactile.planner import served, server
 
 pytest.importorskip("mcp", reason="the extra mcp is not installed")
 
@@ -41,8 +42,10 @@ def talk(folder, *options, calls=()):
     from mcp.client.client import Client
     from mcp.client.stdio import StdioServerParameters, stdio_client
 
-    words = ["-m", "scroll_tactile.cli", "mcp", str(folder / "memory"), *map(str, options)]
-    process = StdioServerParameters(command=sys.executable, args=words, env={"PYTHONPATH": str(ROOT)})
+    words = ["-m", "scroll_tactile.clients.cli", "mcp", str(folder / "memory"), *map(str, options)]
+    process = StdioServerParameters(
+        command=sys.executable, args=words, env={"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'store'}"}
+    )
 
     async def session():
         async with Client(stdio_client(process)) as client:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision, sensors
+from scroll_tactile.clients.learning.onnx_export import export_onnx
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.onnx_export import export_onnx
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.simulation.scene import Scene
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile.clients.report.growing import _without
 from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace
 from scroll_tactile.prediction.judging import held_out_touches, judged
 from scroll_tactile.readouts.calibration import FEWEST
-from scroll_tactile.report.growing import _without
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import one_thread
 

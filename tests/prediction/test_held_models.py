@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from live_touches import slide
+from scroll_tactile_store import StoreClosedError
 from touches import PAD, SMALL
 
 from scroll_tactile import Kernels, TactileLearner
@@ -17,7 +18,6 @@ from scroll_tactile.matching.likelihood import Likelihood, Noise
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.statistics.sample import TouchSample
-from store import StoreClosedError
 
 SETTINGS = {"sensor": PAD, "embedding": SMALL, "kept_touches": 8}  # with few kept ones a fit takes less
 TOUCHES = 5  # of each material: a model is followed for some touches, and fitted anew after more

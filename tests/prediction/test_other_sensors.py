@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error
+from scroll_tactile.clients.learning.metrics import accuracy, calibration_error
 from scroll_tactile.simulation.scene import EVENT_SKIN, LIGHT_PAD, MATERIALS, Scene
 
 TOUCHES, TESTS = 10, 4

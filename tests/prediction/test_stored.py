@@ -7,9 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scroll_tactile_store.derived
 from prediction.test_current import OBSERVED, PAD, SMALL, bits, stream
+from scroll_tactile_store import DamageError, check_store, repair_store
+from scroll_tactile_store.derived import read_derived, write_derived
+from scroll_tactile_store.layout import read_current
 
-import store.derived
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError
 from scroll_tactile.memory.identity import FingerprintCheck
@@ -17,9 +20,6 @@ from scroll_tactile.persistence.axis_ledger import axis_name
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.stored import MAPPED, NAME
 from scroll_tactile.statistics.sample import TouchSample
-from store import DamageError, check_store, repair_store
-from store.derived import read_derived, write_derived
-from store.layout import read_current
 
 OPENED = {"sensor": PAD, "embedding": SMALL}
 
@@ -247,7 +247,14 @@ def forge(path, change, name=NAME):
     about, arrays = read_derived(path, name, follows)
     about, arrays = change(dict(about), dict(arrays))
     arrays = {own: np.ascontiguousarray(array) for own, array in arrays.items()}
-    write_derived(path, name, follows, store.records.to_json("attributes", about), arrays, [*filter(mapped, arrays)])
+    write_derived(
+        path,
+        name,
+        follows,
+        scroll_tactile_store.records.to_json("attributes", about),
+        arrays,
+        [*filter(mapped, arrays)],
+    )
 
 
 def load(learner, change):
@@ -351,7 +358,7 @@ def test_a_failure_to_write_it_changes_nothing_else(made, path, monkeypatch, cap
         learner.observe("a", stream("a", 60))
         learner.settle()
         said = bits(learner)
-        monkeypatch.setattr(store.derived, failing, fail)
+        monkeypatch.setattr(scroll_tactile_store.derived, failing, fail)
         with caplog.at_level(logging.WARNING):
             learner.close()
     assert "will be made again" in caplog.text

@@ -9,9 +9,9 @@ from commands import refused, run
 from made import RNG, TIP, lerobot
 
 from scroll_tactile import Quantity, Sensor, TactileLearner
+from scroll_tactile.clients.learning.learning import learn_sources
+from scroll_tactile.clients.learning.sources import SourceOptions
 from scroll_tactile.errors import FieldError, InputError, RecordingError
-from scroll_tactile.pipelines.learning import learn_sources
-from scroll_tactile.pipelines.sources import SourceOptions
 from scroll_tactile.recordings import read, resampled
 from scroll_tactile.recordings.arrays.lerobot import LeRobot
 from scroll_tactile.recordings.arrays.rowgroups import row_groups

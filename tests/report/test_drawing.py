@@ -9,8 +9,8 @@ import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from scroll_tactile.clients.report.drawing import clipped_name, png, shown, steps, tinted
 from scroll_tactile.errors import printable
-from scroll_tactile.report.drawing import clipped_name, png, shown, steps, tinted
 
 
 def test_a_png_is_what_was_drawn():

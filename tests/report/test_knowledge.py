@@ -8,14 +8,14 @@ from touches import PAD, SMALL, fed
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
+from scroll_tactile.clients.learning.metrics import calibration_error
+from scroll_tactile.clients.report.channels import channels_of
+from scroll_tactile.clients.report.growing import chosen, growing, soon
+from scroll_tactile.clients.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.likelihood import levels_of
-from scroll_tactile.pipelines.metrics import calibration_error
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
-from scroll_tactile.report.channels import channels_of
-from scroll_tactile.report.growing import chosen, growing, soon
-from scroll_tactile.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
 from scroll_tactile.simulation.scene import Scene
 
 SENSOR = known.BIOTAC

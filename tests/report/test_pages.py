@@ -13,15 +13,15 @@ from commands import refused, run
 from robot_sets import FIELD, robot_set
 
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
+from scroll_tactile.clients.learning.learning import store_model
+from scroll_tactile.clients.report import memory_page, recording_page, save
+from scroll_tactile.clients.report.page import cards, table
+from scroll_tactile.clients.report.sensing import health_cards, health_section
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
-from scroll_tactile.pipelines.learning import store_model
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import held_out_touches
 from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.recordings import read_intervals
-from scroll_tactile.report import memory_page, recording_page, save
-from scroll_tactile.report.page import cards, table
-from scroll_tactile.report.sensing import health_cards, health_section
 from scroll_tactile.results import Health
 from scroll_tactile.simulation.scene import Scene
 

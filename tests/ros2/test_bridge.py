@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from live_touches import GEL, frames, gel_learner, learner, shift, slide
 from robot import Bare, stamped, taught
+from scroll_tactile_store import StoreFullError
 from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner, errors
-from scroll_tactile.ros2 import Bridge
-from scroll_tactile.ros2.bridge import RESTLESS
+from scroll_tactile.clients.ros2 import Bridge
+from scroll_tactile.clients.ros2.bridge import RESTLESS
 from scroll_tactile.signals.correction import Correction
-from store import StoreFullError
 
 ROWS, PLACES = shift("ab")
 

@@ -6,7 +6,7 @@ import pytest
 from commands import refused
 
 from scroll_tactile import errors
-from scroll_tactile.ros2.interfaces import interface, kind_of, require_rclpy
+from scroll_tactile.clients.ros2.interfaces import interface, kind_of, require_rclpy
 
 
 def test_a_package_that_is_missing_is_named_with_what_installs_it(monkeypatch):

@@ -9,13 +9,13 @@ from pathlib import Path
 import launching
 import pytest
 from robot import TOPIC, command, ended_by_ctrl_c, publishing
+from scroll_tactile_store import DamageError
 
 from scroll_tactile import TactileLearner, errors
+from scroll_tactile.clients.ros2.fingers import Finger, fingers_of, new_sensor
+from scroll_tactile.clients.ros2.parameters import DYNAMIC, refused, texts
+from scroll_tactile.clients.ros2.serving import _node, _Served, _start, serve
 from scroll_tactile.recordings import PRESETS
-from scroll_tactile.ros2.fingers import Finger, fingers_of, new_sensor
-from scroll_tactile.ros2.parameters import DYNAMIC, refused, texts
-from scroll_tactile.ros2.serving import _node, _Served, _start, serve
-from store import DamageError
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
@@ -28,7 +28,7 @@ from std_msgs.msg import String  # noqa: E402
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "ros2"
-PLAIN = "import sys; sys.modules['rclpy.lifecycle'] = None; from scroll_tactile.cli import main; main()"
+PLAIN = "import sys; sys.modules['rclpy.lifecycle'] = None; from scroll_tactile.clients.cli import main; main()"
 
 
 class Remote:
@@ -77,7 +77,7 @@ def own(memory, tmp_path):
 
 def node_command(memory, *words, **more):
     named = ("ros2", "--memory", memory, "--topic", TOPIC, "--field", "position")
-    return command("-m", "scroll_tactile.cli", *named, *words, stdout=subprocess.PIPE, **more)
+    return command("-m", "scroll_tactile.clients.cli", *named, *words, stdout=subprocess.PIPE, **more)
 
 
 def test_a_manager_takes_the_node_through_its_states_and_parameters_are_checked(spinning, own):
@@ -277,7 +277,7 @@ def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeyp
     file = EXAMPLES / "launch" / f"{name}.launch.py"
     words, transitions = launching.launched(file, tmp_path, memory=str(own), namespace="/left", **given)
     assert words.pop(0) == "scroll-tactile"
-    with command("-m", "scroll_tactile.cli", *words, stdout=subprocess.PIPE) as process:
+    with command("-m", "scroll_tactile.clients.cli", *words, stdout=subprocess.PIPE) as process:
         remote = Remote(spinning, "/left/scroll_tactile")
         if transitions:
             assert remote.state() == "unconfigured"

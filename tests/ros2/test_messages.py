@@ -18,8 +18,8 @@ from rosbags.typesys import get_types_from_msg
 from touches import SMALL
 
 from scroll_tactile import Sensor, TactileLearner, errors
+from scroll_tactile.clients.ros2 import Bridge
 from scroll_tactile.recordings import PRESETS
-from scroll_tactile.ros2 import Bridge
 
 MESSAGES = Path(__file__).parents[2] / "examples" / "ros2" / "scroll_tactile_msgs"
 ROS2 = bags.typestore(2)
@@ -89,7 +89,7 @@ def test_messages_of_drivers_are_answered_as_they_were_serialized(driver, counti
 @pytest.mark.parametrize("kind", ["Float32MultiArray", "Image", "CompressedImage"])
 def test_a_drivers_process_is_heard_in_each_type_that_there_are_wheels_of(kind, spinning):
     pytest.importorskip("rclpy")
-    from scroll_tactile.ros2 import TactileNode
+    from scroll_tactile.clients.ros2 import TactileNode
 
     answers = []
     source = gel_learner() if "Image" in kind else learner()
@@ -107,7 +107,7 @@ def test_fingers_of_one_message_have_answers_and_services_of_their_own(spinning)
     from diagnostic_msgs.msg import DiagnosticArray
     from sensor_msgs.msg import JointState
 
-    from scroll_tactile.ros2 import Listener, TactileNode
+    from scroll_tactile.clients.ros2 import Listener, TactileNode
 
     node, answers = spinning.node("hand"), {"thumb": [], "index": []}
     listener = Listener(node, TOPIC, "sensor_msgs/msg/JointState")
@@ -143,7 +143,7 @@ def test_fingers_of_one_message_have_answers_and_services_of_their_own(spinning)
 
 def test_messages_wait_for_who_takes_them_and_the_oldest_make_room(spinning, monkeypatch):
     pytest.importorskip("rclpy")
-    from scroll_tactile.ros2 import Listener, listening
+    from scroll_tactile.clients.ros2 import Listener, listening
 
     monkeypatch.setattr(listening, "WAITING", 5)
     listener, taken = Listener(spinning.node("hand"), TOPIC, "sensor_msgs/msg/JointState"), []
@@ -156,7 +156,7 @@ def test_messages_wait_for_who_takes_them_and_the_oldest_make_room(spinning, mon
 
 
 def test_all_fingers_of_a_topic_get_what_waited_and_nothing_waits_once_they_left(spinning, monkeypatch):
-    from scroll_tactile.ros2 import Listener, listening
+    from scroll_tactile.clients.ros2 import Listener, listening
 
     monkeypatch.setattr(listening, "WAITING", 3)
     listener, taken = Listener(spinning.node("hand"), TOPIC, "sensor_msgs/msg/JointState"), {"thumb": [], "index": []}
@@ -183,7 +183,7 @@ def test_all_fingers_of_a_topic_get_what_waited_and_nothing_waits_once_they_left
 def test_a_topic_that_comes_late_in_a_type_that_cannot_be_read_is_looked_for_on_and_said_once(spinning, monkeypatch):
     from sensor_msgs.msg import JointState
 
-    from scroll_tactile.ros2 import Listener, listening
+    from scroll_tactile.clients.ros2 import Listener, listening
 
     monkeypatch.setattr(listening, "LOOKED", 0.02)
     node, kinds, warned, looks = spinning.node("hand"), [], [], []
@@ -205,7 +205,7 @@ def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import JointState
 
-    from scroll_tactile.ros2 import Listener, Quality
+    from scroll_tactile.clients.ros2 import Listener, Quality
 
     node = spinning.node("hand")
     with pytest.raises(errors.InputError, match="reliability as best_effort or reliable"):
@@ -218,7 +218,7 @@ def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
 def test_answers_fill_the_message_package_of_the_examples(monkeypatch):
     """Of the package's text, by another's parser: each field is one that the node fills, with values of its type."""
     pytest.importorskip("rclpy")
-    from scroll_tactile.ros2 import publishing as said
+    from scroll_tactile.clients.ros2 import publishing as said
 
     store = bags.typestore(2)
     store.register(get_types_from_msg(definition("msg", "TactileAnswer"), "scroll_tactile_msgs/msg/TactileAnswer"))
@@ -311,7 +311,7 @@ def test_a_session_that_was_recorded_is_learned_from_again(spinning, memory, tmp
     pytest.importorskip("rclpy")
     from sensor_msgs.msg import JointState
 
-    from scroll_tactile.ros2 import Quality
+    from scroll_tactile.clients.ros2 import Quality
 
     with TactileLearner.open(memory, mode="read") as source:
         source.backup(tmp_path / "own")

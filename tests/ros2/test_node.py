@@ -20,7 +20,7 @@ from diagnostic_msgs.srv import AddDiagnostics  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float32MultiArray, String  # noqa: E402
 
-from scroll_tactile.ros2 import TactileNode  # noqa: E402
+from scroll_tactile.clients.ros2 import TactileNode  # noqa: E402
 
 # Of the parser that rosidl imports with the first message.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
@@ -215,7 +215,7 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
     arm = spinning.node("arm")
     arm.create_subscription(String, "/left/scroll_tactile/answer", lambda text: ended.append(json.loads(text.data)), 50)
     named = ("--ros-args", "-r", "__ns:=/left")
-    with command("-m", "scroll_tactile.cli", *words, *named, stdout=subprocess.PIPE) as process:
+    with command("-m", "scroll_tactile.clients.cli", *words, *named, stdout=subprocess.PIPE) as process:
         client = arm.create_client(AddDiagnostics, "/left/scroll_tactile/learn")
         spinning.until(client.service_is_ready, 60)
         assert f"is being written by process {process.pid}" in refused(*words)
@@ -232,7 +232,7 @@ def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
 def test_readmes_line_runs_as_it_stands(spinning, tmp_path):
     TactileLearner.open(tmp_path / "memory", sensor=PRESETS["biotac"].sensor).close()
     words = next(words for words in command_lines() if words[1] == "ros2")
-    with command("-m", "scroll_tactile.cli", *words[1:], cwd=tmp_path, stdout=subprocess.PIPE) as process:
+    with command("-m", "scroll_tactile.clients.cli", *words[1:], cwd=tmp_path, stdout=subprocess.PIPE) as process:
         client = spinning.node("arm").create_client(AddDiagnostics, "/scroll_tactile/learn")
         spinning.until(client.service_is_ready, 60)
         assert "memory: 0 materials" in ended_by_ctrl_c(process)

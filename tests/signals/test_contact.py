@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scroll_tactile_store import Store
 
 from scroll_tactile import Frames, Kernels, TactileLearner, sensors
 from scroll_tactile.embeddings.protocol import require_rest
@@ -12,7 +13,6 @@ from scroll_tactile.signals.contact import MOST_FRAMES, image_of, in_contact, pr
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.gel import SMALL, Gel
-from store import Store
 
 SHAPE = SMALL.shape
 REST = np.full(SHAPE, 100, np.float32)

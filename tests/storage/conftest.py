@@ -4,9 +4,8 @@ import shutil
 import subprocess
 
 import pytest
+from scroll_tactile_store import Store
 from store_builds import build
-
-from store import Store
 
 
 @pytest.fixture(scope="session")

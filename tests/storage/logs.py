@@ -1,8 +1,8 @@
 """Logs for the tests, and what is in them."""
 
-from store.framing import FRAME_BYTES
-from store.log import LogReader
-from store.log_writer import LogWriter, create_log
+from scroll_tactile_store.framing import FRAME_BYTES
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.log_writer import LogWriter, create_log
 
 HEADER = b'{"of":"a test"}'
 KIND = 2

@@ -6,9 +6,8 @@ from contextlib import contextmanager
 
 import numpy as np
 from forging import frames_of, get_current, group_of, log_of, read_log, spoil_row, write_log
-
-from store import Store, check_store
-from store.row_encoding import row_sequence
+from scroll_tactile_store import Store, check_store
+from scroll_tactile_store.row_encoding import row_sequence
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}

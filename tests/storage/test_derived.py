@@ -5,10 +5,9 @@ import mmap
 
 import numpy as np
 import pytest
-
-from store.derived import ALIGNED, HEADER, MARK, read_derived, write_derived
-from store.encoding import encode_payload
-from store.records import payload_digest
+from scroll_tactile_store.derived import ALIGNED, HEADER, MARK, read_derived, write_derived
+from scroll_tactile_store.encoding import encode_payload
+from scroll_tactile_store.records import payload_digest
 
 FOLLOWS = "ab" * 32
 ARRAYS = {

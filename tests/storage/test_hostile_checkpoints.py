@@ -10,13 +10,12 @@ from folder_attacks import CHECKPOINTS
 from forging import describe_again, get_current, put_row, set_current
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scroll_tactile_store import DamageError, RecordError, Store, VersionError, check_store
+from scroll_tactile_store import chunks as store_chunks
+from scroll_tactile_store import records as store_records
+from scroll_tactile_store.archive import Files
+from scroll_tactile_store.checkpoint_files import CheckpointReader
 from store_builds import flip, in_turns, newest, taking_at_most
-
-from store import DamageError, RecordError, Store, VersionError, check_store
-from store import chunks as store_chunks
-from store import records as store_records
-from store.archive import Files
-from store.checkpoint_files import CheckpointReader
 
 ARRAYS = {
     "rows": np.arange(4000.0).reshape(1000, 4),

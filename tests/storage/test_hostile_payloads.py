@@ -8,10 +8,9 @@ from forging import Packed, pack, put_row
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numcodecs import zstd
+from scroll_tactile_store import DamageError, RecordError, Store, VersionError, check_store, encoding
+from scroll_tactile_store.encoding import decode_payload, encode_payload
 from store_builds import taking_at_most
-
-from store import DamageError, RecordError, Store, VersionError, check_store, encoding
-from store.encoding import decode_payload, encode_payload
 
 
 def payload(arrays, version=1):

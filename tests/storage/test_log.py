@@ -6,16 +6,15 @@ import struct
 from pathlib import Path
 
 import pytest
+import scroll_tactile_store.log
+import scroll_tactile_store.log_writer
 from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest
-
-import store.log
-import store.log_writer
-from store import DamageError, RecordError, StoreClosedError
-from store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
-from store.log import LogPlace, LogReader
-from store.log_file import PART
-from store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
-from store.records import payload_digest
+from scroll_tactile_store import DamageError, RecordError, StoreClosedError
+from scroll_tactile_store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
+from scroll_tactile_store.log import LogPlace, LogReader
+from scroll_tactile_store.log_file import PART
+from scroll_tactile_store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
+from scroll_tactile_store.records import payload_digest
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +212,7 @@ def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):
 
 def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy, monkeypatch):
     with LogWriter(copy) as writer, LogReader(copy) as log:
-        frames = store.log.frames_behind
+        frames = scroll_tactile_store.log.frames_behind
 
         def later(file, offset, mark):
             if writer.place.number == 14:
@@ -221,7 +220,7 @@ def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy, mo
                 append(writer, [b"2"])
             return frames(file, offset, mark)
 
-        monkeypatch.setattr(store.log, "frames_behind", later)
+        monkeypatch.setattr(scroll_tactile_store.log, "frames_behind", later)
         assert rest(log) == [*BATCHES, [b"1"], [b"2"]]
 
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from forging import log_of
 from logs import ends as ends_of
+from scroll_tactile_store import DamageError, Store, check_store, repair_store
+from scroll_tactile_store.framing import FRAME_BYTES
+from scroll_tactile_store.layout import CURRENT_FILE, log_path, read_current, write_current
 from store_builds import as_after_a_crash, damage, flip, flip_row
-
-from store import DamageError, Store, check_store, repair_store
-from store.framing import FRAME_BYTES
-from store.layout import CURRENT_FILE, log_path, read_current, write_current
 
 
 def made(path, rows=4):

@@ -5,10 +5,9 @@ import os
 
 import pytest
 from logs import BATCHES, KIND, append, build, read, rest
-
-from store import StoreError, StoreFullError
-from store.log import LogReader
-from store.log_writer import AHEAD, LogWriter
+from scroll_tactile_store import StoreError, StoreFullError
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.log_writer import AHEAD, LogWriter
 
 
 class Failing:

@@ -9,9 +9,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from logs import KIND, names, rest
-
-from store.log import LogReader
-from store.log_writer import LogWriter, create_log
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.log_writer import LogWriter, create_log
 
 SECTOR = 512
 payloads = st.integers(0, 2000).flatmap(lambda size: st.integers(0, 255).map(lambda byte: bytes([byte]) * size))

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from quick_checkpoints import WRITTEN_BY_ZARR, write_zarr
-
-from store.checkpoint_files import CheckpointDraft, write_checkpoint
-from store.chunks import ArrayContent
-from store.encoding import array_digest
+from scroll_tactile_store.checkpoint_files import CheckpointDraft, write_checkpoint
+from scroll_tactile_store.chunks import ArrayContent
+from scroll_tactile_store.encoding import array_digest
 
 RNG = np.random.default_rng(0)
 ARRAYS = {

@@ -6,18 +6,17 @@ import struct
 
 import numpy as np
 import pytest
-
-import store.open_log
-import store.rows
-from store import Store, check_store
-from store.records import payload_digest
-from store.rows import HEADER
+import scroll_tactile_store.open_log
+import scroll_tactile_store.rows
+from scroll_tactile_store import Store, check_store
+from scroll_tactile_store.records import payload_digest
+from scroll_tactile_store.rows import HEADER
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small():
     with pytest.MonkeyPatch.context() as patch:
-        for module in (store.rows, store.open_log):
+        for module in (scroll_tactile_store.rows, scroll_tactile_store.open_log):
             patch.setattr(module, "EVERY", 8)
         yield
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import second_reader
 from logs import append, build
-
-from store import DamageError
-from store.encoding import decode_payload, encode_payload
-from store.log import LogReader
-from store.log_writer import LogWriter, create_log
-from store.records import payload_digest
-from store.row_encoding import ROW, Row, decode_row, encode_row
+from scroll_tactile_store import DamageError
+from scroll_tactile_store.encoding import decode_payload, encode_payload
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.log_writer import LogWriter, create_log
+from scroll_tactile_store.records import payload_digest
+from scroll_tactile_store.row_encoding import ROW, Row, decode_row, encode_row
 
 ARRAYS = {"codes": np.arange(700, dtype=np.int16), "none": np.zeros((0, 3), np.float32)}
 PAYLOAD = encode_payload(ARRAYS)
@@ -115,7 +114,7 @@ def test_it_is_a_command(path):
 def test_it_reads_nothing_of_the_store():
     lines = Path(second_reader.__file__).read_text().splitlines()
     imports = [line for line in lines if line.startswith(("import", "from"))]
-    assert not any("store" in line for line in imports) and len(lines) <= 175
+    assert not any("scroll_tactile" in line for line in imports) and len(lines) <= 175
 
 
 def changed(offset, part, *, digest=True):

@@ -3,12 +3,11 @@
 import shutil
 
 import pytest
+import scroll_tactile_store.backup
 from forging import log_of
+from scroll_tactile_store import DamageError, NotAStoreError, Store, StoreError, repair_store
+from scroll_tactile_store.layout import read_current
 from store_builds import add, as_after_a_crash, commit, contents, damage, flip_row, folders, newest, same_arrays, spoil
-
-import store.backup
-from store import DamageError, NotAStoreError, Store, StoreError, repair_store
-from store.layout import read_current
 
 
 def kept(folder):
@@ -79,7 +78,7 @@ def test_a_batch_that_is_not_over_is_not_in_it(opened, tmp_path):
 
 
 def test_a_checkpoint_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):
-    real, instants = store.backup._copy_tree, ["before", "after", "within"]
+    real, instants = scroll_tactile_store.backup._copy_tree, ["before", "after", "within"]
     with Store.open(plain) as writer:
         commit(writer.commit, 20)
 
@@ -96,7 +95,7 @@ def test_a_checkpoint_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_
                     return
             real(source, target)
 
-        monkeypatch.setattr(store.backup, "_copy_tree", replaced)
+        monkeypatch.setattr(scroll_tactile_store.backup, "_copy_tree", replaced)
         with Store.open(plain, mode="read") as reader:
             reader.backup(tmp_path / "copy")
         assert instants == []

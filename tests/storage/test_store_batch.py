@@ -6,8 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-
-from store import ReadOnlyError, RecordError, Store, StoreError, StoreFullError
+from scroll_tactile_store import ReadOnlyError, RecordError, Store, StoreError, StoreFullError
 
 
 @pytest.fixture

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 from forging import log_of, read_log, write_log
+from scroll_tactile_store import DamageError, NotAStoreError, Store, check_store, repair_store
+from scroll_tactile_store.framing import FRAME_BYTES
 from store_builds import IDENTITY, LAST, add, commit, compaction, contents, damage, flip, flip_row, newest
-
-from store import DamageError, NotAStoreError, Store, check_store, repair_store
-from store.framing import FRAME_BYTES
 
 
 @pytest.fixture

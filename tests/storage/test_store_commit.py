@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scroll_tactile_store.checkpoint_files
+import scroll_tactile_store.checkpoints
+from scroll_tactile_store import DamageError, Store, StoreError, check_store
+from scroll_tactile_store.chunks import ArrayFiles
 from store_builds import folders
-
-import store.checkpoint_files
-import store.checkpoints
-from store import DamageError, Store, StoreError, check_store
-from store.chunks import ArrayFiles
 
 ONE = {"x": np.arange(10)}
 
@@ -23,8 +22,8 @@ class Gate:
 
     def __init__(self, monkeypatch):
         self.open, self.reached, self.last_sequences = threading.Event(), threading.Event(), []
-        self.write = store.checkpoints.write_checkpoint
-        monkeypatch.setattr(store.checkpoints, "write_checkpoint", self)
+        self.write = scroll_tactile_store.checkpoints.write_checkpoint
+        monkeypatch.setattr(scroll_tactile_store.checkpoints, "write_checkpoint", self)
 
     def __call__(self, parent, number, draft, identity):
         self.last_sequences.append(draft.last_sequence)
@@ -75,7 +74,7 @@ atexit.register(lambda: opened.commit_later({"x": numpy.arange(3)}, last_sequenc
 opened.append("a", "b", b"")
 opened.commit_later({"x": numpy.arange(2)}, last_sequence=1)
 """
-    root = Path(store.__file__).parents[1]
+    root = Path(scroll_tactile_store.__file__).parents[1]
     subprocess.run([sys.executable, "-c", code, tmp_path / "s"], cwd=root, check=True, timeout=60, capture_output=True)
     with Store.open(tmp_path / "s") as again:
         assert again.last == 1
@@ -99,7 +98,7 @@ def fail(*_):
 )
 def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeypatch, caplog, surface):
     with monkeypatch.context() as broken:
-        broken.setattr(store.files, "sync_tree", fail)
+        broken.setattr(scroll_tactile_store.files, "sync_tree", fail)
         opened.commit_later(ONE, last_sequence=0)
         opened._checkpoints.wait()
     with pytest.raises(StoreError, match="the disk says no"):
@@ -112,7 +111,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
 
 
 def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
-    monkeypatch.setattr(store.checkpoints, "write_checkpoint", fail)
+    monkeypatch.setattr(scroll_tactile_store.checkpoints, "write_checkpoint", fail)
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
         opened.commit_later(ONE, last_sequence=0)
         raise KeyError
@@ -133,7 +132,7 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
 @pytest.mark.parametrize("instant", ["CheckpointReader", "read"])
 def test_a_reader_whose_checkpoint_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
     opened.commit(ONE, last_sequence=0)
-    owner = store.checkpoints if instant == "CheckpointReader" else ArrayFiles
+    owner = scroll_tactile_store.checkpoints if instant == "CheckpointReader" else ArrayFiles
     real = getattr(owner, instant)
     waiting = [2, 3, 4]
 

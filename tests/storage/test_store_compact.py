@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scroll_tactile_store.checkpoints
+import scroll_tactile_store.files
 from forging import log_of
+from scroll_tactile_store import CompactedError, DamageError, Store, StoreError, check_store
 from store_builds import as_after_a_crash, damage, flip, flip_row, folders
-
-import store.checkpoints
-import store.files
-from store import CompactedError, DamageError, Store, StoreError, check_store
 
 LAST = 12
 
@@ -114,7 +113,7 @@ def test_a_damaged_row_keeps_all_from_being_given_up(opened, row, arrays):
 
 @pytest.mark.parametrize("name", ["create_log", "write_checkpoint"])
 def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, name):
-    real = getattr(store.checkpoints, name)
+    real = getattr(scroll_tactile_store.checkpoints, name)
 
     def forgetful(path, number, *rest):
         done = real(path, number, *rest)
@@ -125,7 +124,7 @@ def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, nam
         return done
 
     with monkeypatch.context() as broken, pytest.raises(DamageError):
-        broken.setattr(store.checkpoints, name, forgetful)
+        broken.setattr(scroll_tactile_store.checkpoints, name, forgetful)
         compact(opened, 5)
     assert agrees(opened, 0)
     compact(opened, 5)
@@ -192,7 +191,7 @@ def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
         raise OSError(errno.EIO, "the disk says no")
 
     with monkeypatch.context() as broken:
-        broken.setattr(store.checkpoints, "remove_unnamed", stuck)
+        broken.setattr(scroll_tactile_store.checkpoints, "remove_unnamed", stuck)
         compact(opened, 5)
     assert "what was replaced could not be removed" in caplog.text
     assert agrees(opened, 5)

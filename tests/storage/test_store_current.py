@@ -6,6 +6,9 @@ import shutil
 import pytest
 from folder_attacks import CURRENTS, behind_all, newest_is
 from forging import frames_of, get_current, log_of, set_current, write_log
+from scroll_tactile_store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
+from scroll_tactile_store.layout import log_path
+from scroll_tactile_store.records import payload_digest
 from store_builds import (
     IDENTITY,
     LAST,
@@ -21,10 +24,6 @@ from store_builds import (
     state,
     torn,
 )
-
-from store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
-from store.layout import log_path
-from store.records import payload_digest
 
 
 def is_whole(path, compacted, latest=15):

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from forging import log_of
+from scroll_tactile_store import DamageError, Store, check_store, repair_store
 from store_builds import (
     LAST,
     change_rows,
@@ -19,8 +20,6 @@ from store_builds import (
     spoil,
     state,
 )
-
-from store import DamageError, Store, check_store, repair_store
 
 
 @pytest.mark.parametrize(("row", "covered"), [(1, "checkpoint 1 (up to row 15)"), (14, "checkpoint 1"), (17, "no")])

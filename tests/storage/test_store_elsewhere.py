@@ -11,10 +11,9 @@ import stat
 import pytest
 from folder_attacks import LINKS, as_link, no_file
 from forging import put_row
+from scroll_tactile_store import DamageError, LockedError, NotAStoreError, Store, StoreError, check_store, repair_store
+from scroll_tactile_store.files import read_regular, same_folder
 from store_builds import LAST, add, as_after_a_crash, build, commit, contents, newest
-
-from store import DamageError, LockedError, NotAStoreError, Store, StoreError, check_store, repair_store
-from store.files import read_regular, same_folder
 
 LOG = "log-00000001"
 

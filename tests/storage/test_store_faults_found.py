@@ -4,13 +4,12 @@ import errno
 import os
 
 import pytest
+import scroll_tactile_store.archive
+import scroll_tactile_store.backup
+import scroll_tactile_store.log_writer
 from forging import log_of
-
-import store.archive
-import store.backup
-import store.log_writer
-from store import DamageError, Store, check_store
-from store.layout import read_current
+from scroll_tactile_store import DamageError, Store, check_store
+from scroll_tactile_store.layout import read_current
 
 
 @pytest.fixture
@@ -22,14 +21,16 @@ def path(tmp_path):
     return tmp_path / "s"
 
 
-@pytest.mark.parametrize("module", [store.archive, store.backup], ids=["a reader", "a backup"])
+@pytest.mark.parametrize(
+    "module", [scroll_tactile_store.archive, scroll_tactile_store.backup], ids=["a reader", "a backup"]
+)
 def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(path, monkeypatch, module):
     before = [read_current(path / "CURRENT")]
     with Store.open(path) as writer:
         writer.compact({}, last_sequence=2)
     with Store.open(path, mode="read") as reader:
         monkeypatch.setattr(module, "read_current", lambda *given: before.pop() if before else read_current(*given))
-        if module is store.backup:
+        if module is scroll_tactile_store.backup:
             reader.backup(path.parent / "copy")
             path = path.parent / "copy"
         with Store.open(path, mode="read") as again:
@@ -45,16 +46,16 @@ def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(path):
 
 
 def test_a_compaction_that_is_committed_stands_though_its_log_cannot_be_opened_at_once(path, monkeypatch, caplog):
-    synced = store.log_writer.sync_open
+    synced = scroll_tactile_store.log_writer.sync_open
 
     def failing(descriptor, **how):
         if read_current(path / "CURRENT").log == 2:
-            monkeypatch.setattr(store.log_writer, "sync_open", synced)
+            monkeypatch.setattr(scroll_tactile_store.log_writer, "sync_open", synced)
             raise OSError(errno.EIO, "the disk")
         synced(descriptor, **how)
 
     with Store.open(path) as writer:
-        monkeypatch.setattr(store.log_writer, "sync_open", failing)
+        monkeypatch.setattr(scroll_tactile_store.log_writer, "sync_open", failing)
         writer.compact({}, last_sequence=2)
         assert "could not be opened yet" in caplog.text
         assert (writer.compacted, writer.append("kind", "label", b"3").sequence) == (2, 4)

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numcodecs import blosc
+from scroll_tactile_store.compression import compress, decompress, decompress_zstd
 
 from scroll_tactile.recordings.arrays.blosc import decompress_blosc
-from store.compression import compress, decompress, decompress_zstd
 
 ITEMS = st.sampled_from([1, 2, 4, 8])
 SHUFFLES = st.sampled_from([blosc.NOSHUFFLE, blosc.SHUFFLE, blosc.BITSHUFFLE])

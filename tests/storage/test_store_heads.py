@@ -5,9 +5,8 @@ import logging
 import numpy as np
 import pytest
 from forging import frames_of, log_of
+from scroll_tactile_store import DamageError, Record, RecordError, Store
 from store_builds import flip_row, lose_rows
-
-from store import DamageError, Record, RecordError, Store
 
 
 @pytest.fixture

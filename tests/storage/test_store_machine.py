@@ -8,9 +8,8 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from scroll_tactile_store import CompactedError, RecordError, Store, check_store, repair_store
 from store_builds import flip_row
-
-from store import CompactedError, RecordError, Store, check_store, repair_store
 
 labels = st.text("aé\U0001f9f6'\" ", max_size=4)
 arrays = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=5).map(lambda values: np.array(values, "<i8"))

@@ -5,11 +5,18 @@ import multiprocessing
 import os
 
 import pytest
+import scroll_tactile_store.layout
+import scroll_tactile_store.store
+from scroll_tactile_store import (
+    LockedError,
+    NotAStoreError,
+    ReadOnlyError,
+    RecordError,
+    Store,
+    StoreClosedError,
+    check_store,
+)
 from store_builds import contents
-
-import store.layout
-import store.store
-from store import LockedError, NotAStoreError, ReadOnlyError, RecordError, Store, StoreClosedError, check_store
 
 
 def test_a_new_store_keeps_its_identity_and_a_later_one_does_not_replace_it(tmp_path):
@@ -124,7 +131,7 @@ def test_where_there_is_no_store_nothing_is_made_without_an_identity(tmp_path, m
 
 def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_path, monkeypatch):
     Store.open(tmp_path / "s", identity={}).close()
-    real, looks = store.layout.read_current, []
+    real, looks = scroll_tactile_store.layout.read_current, []
 
     def not_yet(folder):
         looks.append(folder)
@@ -132,7 +139,7 @@ def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_pa
             raise FileNotFoundError
         return real(folder)
 
-    monkeypatch.setattr(store.layout, "read_current", not_yet)
+    monkeypatch.setattr(scroll_tactile_store.layout, "read_current", not_yet)
     with Store.open(tmp_path / "s", mode="read") as opened:
         assert opened.last == 0
 
@@ -142,7 +149,9 @@ def test_a_mode_is_read_or_write(tmp_path):
         Store.open(tmp_path, identity={}, mode="append")
 
 
-@pytest.mark.parametrize("died", ["os.replace", "store.lock.write_current", "store.files.sync_file"])
+@pytest.mark.parametrize(
+    "died", ["os.replace", "scroll_tactile_store.lock.write_current", "scroll_tactile_store.files.sync_file"]
+)
 def test_an_interrupted_creation_is_finished_by_the_next(tmp_path, monkeypatch, died):
     path = tmp_path / "s"
     with monkeypatch.context() as broken, pytest.raises(KeyboardInterrupt):

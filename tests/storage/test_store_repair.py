@@ -7,7 +7,23 @@ import shutil
 import subprocess
 
 import pytest
+import scroll_tactile_store.repair
 from forging import frames_of, log_of
+from scroll_tactile_store import (
+    CompactedError,
+    DamageError,
+    LockedError,
+    ReadOnlyError,
+    Repair,
+    Store,
+    StoreError,
+    StoreFullError,
+    check_store,
+    repair_store,
+)
+from scroll_tactile_store.framing import FRAME_BYTES
+from scroll_tactile_store.layout import log_path
+from scroll_tactile_store.row_encoding import decode_row, head_without_arrays
 from store_builds import (
     IDENTITY,
     LAST,
@@ -30,23 +46,6 @@ from store_builds import (
     state,
     values,
 )
-
-import store.repair
-from store import (
-    CompactedError,
-    DamageError,
-    LockedError,
-    ReadOnlyError,
-    Repair,
-    Store,
-    StoreError,
-    StoreFullError,
-    check_store,
-    repair_store,
-)
-from store.framing import FRAME_BYTES
-from store.layout import log_path
-from store.row_encoding import decode_row, head_without_arrays
 
 
 def agrees(path, *, kept, compacted=0, latest=None, lost=()):
@@ -394,7 +393,7 @@ def test_killed_at_any_step_it_can_be_begun_again(stores, tmp_path, monkeypatch,
 
 def test_a_disk_that_does_not_keep_what_is_written_is_told_of(plain, monkeypatch):
     flip_row(plain, 18)
-    real = store.repair.create_log
+    real = scroll_tactile_store.repair.create_log
 
     def forgetful(path, header, frames):
         real(path, header, frames)
@@ -402,7 +401,7 @@ def test_a_disk_that_does_not_keep_what_is_written_is_told_of(plain, monkeypatch
 
     before = log_of(plain).read_bytes()
     with monkeypatch.context() as broken, pytest.raises(StoreError):
-        broken.setattr(store.repair, "create_log", forgetful)
+        broken.setattr(scroll_tactile_store.repair, "create_log", forgetful)
         repair_store(plain)
     assert log_of(plain).read_bytes() == before
     assert repair_store(plain).kept == 17

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scroll_tactile_store
 from forging import describe_again
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-
-import store
-from store import Head, Record, RecordError, Store, VersionError, chunks
+from scroll_tactile_store import Head, Record, RecordError, Store, VersionError, chunks
 
 DTYPES = ["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U1", "<U7"]
 arrays = st.dictionaries(
@@ -167,19 +166,28 @@ def test_a_message_names_the_place_in_the_attributes(kept):
 
 def test_the_public_names_are_sorted_and_none_leaks():
     # As ruff sorts them: constants, classes, then the rest.
-    assert sorted(store.__all__, key=lambda name: (not name.isupper(), name.islower(), name)) == store.__all__
-    modules = {path.stem for path in Path(store.__file__).parent.glob("*.py")}
-    assert {name for name in vars(store) if not name.startswith("_")} - modules == set(store.__all__)
+    assert (
+        sorted(scroll_tactile_store.__all__, key=lambda name: (not name.isupper(), name.islower(), name))
+        == scroll_tactile_store.__all__
+    )
+    modules = {path.stem for path in Path(scroll_tactile_store.__file__).parent.glob("*.py")}
+    assert {name for name in vars(scroll_tactile_store) if not name.startswith("_")} - modules == set(
+        scroll_tactile_store.__all__
+    )
 
 
 def test_the_exception_tree_is_the_one_in_the_docstring():
-    lines = store.exceptions.__doc__.splitlines()
+    lines = scroll_tactile_store.exceptions.__doc__.splitlines()
     drawn = {line.split("── ")[1].split()[0] for line in lines if "── " in line}
-    assert drawn == {name for name in store.exceptions.__all__ if name.endswith("Error")}
+    assert drawn == {name for name in scroll_tactile_store.exceptions.__all__ if name.endswith("Error")}
     for name in drawn - {"StoreError"}:
-        bases = getattr(store, name).__bases__
-        assert bases == ((store.StoreError, ValueError) if name == "RecordError" else (store.StoreError,))
-    assert store.StoreError.__bases__ == (Exception,)
+        bases = getattr(scroll_tactile_store, name).__bases__
+        assert bases == (
+            (scroll_tactile_store.StoreError, ValueError)
+            if name == "RecordError"
+            else (scroll_tactile_store.StoreError,)
+        )
+    assert scroll_tactile_store.StoreError.__bases__ == (Exception,)
 
 
 def test_importing_is_light_and_a_checkpoint_is_read_without_zarr(tmp_path):
@@ -190,7 +198,7 @@ def test_importing_is_light_and_a_checkpoint_is_read_without_zarr(tmp_path):
         "with store.Store.open(sys.argv[1], mode='read') as opened: print(len(opened.latest().arrays))\n"
         "print({'zarr'} & set(sys.modules))"
     )
-    command, where = [sys.executable, "-c", code, str(tmp_path)], Path(store.__file__).parents[1]
+    command, where = [sys.executable, "-c", code, str(tmp_path)], Path(scroll_tactile_store.__file__).parents[1]
     found = subprocess.run(command, cwd=where, capture_output=True, text=True, check=True)
     assert found.stdout.splitlines() == ["set()", "2", "set()"]
 

@@ -2,13 +2,13 @@
 
 import pytest
 from forging import log_of
+from scroll_tactile_store import DamageError, check_store
+from scroll_tactile_store.framing import FRAME_BYTES
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.row_encoding import ROW
 from touches import OBSERVED, SETTINGS, filled, require_same, without
 
 from scroll_tactile import TactileLearner
-from store import DamageError, check_store
-from store.framing import FRAME_BYTES
-from store.log import LogReader
-from store.row_encoding import ROW
 
 DAMAGED = 5  # a row, of the second touch of "b"
 

@@ -10,15 +10,15 @@ from folder_attacks import CONSTITUENTS, QUANTITIES, QUANTITY, ROW, ROWS, descri
 from forging import checkpoint_of, copied, get_identity, put_arrays, put_checkpoint, put_row, row_of, seal, set_identity
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scroll_tactile_store import DamageError, StoreError
 from touches import PAD, SETTINGS, filled, held, stream
 
 from scroll_tactile import Augmented, Kernels, Quantity, TactileLearner
+from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.touch_rows import pack_readings
-from scroll_tactile.pipelines.plain_export import export_plain
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.validation.gate import check_memory
-from store import DamageError, StoreError
 
 TYPED = (ScrollTactileError, StoreError)
 OTHER = [("d", (9, 60)), ("e", (10, 60)), ("d", (11, 60))]

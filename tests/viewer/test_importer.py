@@ -15,13 +15,16 @@ from rrd import colours, rows, scalars, tensors, texts
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner
+from scroll_tactile.clients.report.facts import MemoryFacts
 from scroll_tactile.learner import TactileLearner as Learner
-from scroll_tactile.report.facts import MemoryFacts
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.viewer import importer
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from scroll_tactile.viewer.importer import main; main()"
+SCRIPT = (
+    f"import sys; sys.path[:0] = {[str(ROOT), str(ROOT / 'store')]!r}; "
+    "from scroll_tactile.viewer.importer import main; main()"
+)
 READINGS, PLACES = shift(["a", "c", "b"])
 
 

@@ -22,10 +22,10 @@ from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.runs.options import Data, Json, Seed, folds_of
 from examples.paper.runs.results import show, write
 from scroll_tactile import Stream, TactileLearner
-from scroll_tactile.cli.terminal import progress_bar
-from scroll_tactile.firmware.c_files import flash_bytes, touches_to_check, write_firmware
-from scroll_tactile.firmware.exported_judge import ExportedJudge, LevelRows
-from scroll_tactile.pipelines.metrics import accuracy, calibration_error, mean_and_spread
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.firmware.c_files import flash_bytes, touches_to_check, write_firmware
+from scroll_tactile.clients.firmware.exported_judge import ExportedJudge, LevelRows
+from scroll_tactile.clients.learning.metrics import accuracy, calibration_error, mean_and_spread
 
 __all__ = ["chips", "run_chips"]
 

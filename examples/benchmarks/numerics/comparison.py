@@ -23,7 +23,7 @@ from examples.benchmarks.numerics.regressions import Case, make_cases
 from examples.benchmarks.solvers.methods import SOLVERS
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
-from scroll_tactile.cli.terminal import progress_bar, say
+from scroll_tactile.clients.cli.terminal import progress_bar, say
 from scroll_tactile.errors import DatasetError
 
 __all__ = ["claims", "find_nist", "numerics", "run_numerics"]

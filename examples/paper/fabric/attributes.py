@@ -26,12 +26,12 @@ from examples.paper.runs.cells import Cell, Figures, learn, run_cells, silent
 from examples.paper.runs.options import Data, Json, Quick, Run, Seed, read
 from examples.paper.runs.results import show, write
 from scroll_tactile import Embedding, Kernels
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.learning.metrics import mean_and_spread
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
-from scroll_tactile.pipelines.metrics import mean_and_spread
 from scroll_tactile.results import Composition
 
 __all__ = ["FIGURES", "Attributes", "attributes", "summary"]

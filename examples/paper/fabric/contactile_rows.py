@@ -28,11 +28,11 @@ from examples.paper.systems.least_squares import LeastSquares
 from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile import Embedding, Joined, Kernels, Vision
+from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream

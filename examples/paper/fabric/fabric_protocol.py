@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.clients.learning.metrics import calibration_error
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.metrics import calibration_error
 
 __all__ = ["score"]
 

@@ -26,10 +26,10 @@ from examples.paper.runs.results import show, write
 from examples.paper.systems.constituents import estimates_of
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Embedding
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.metrics import accuracy
 
 __all__ = ["FIGURES", "Letters", "letters", "summary"]
 

@@ -27,13 +27,13 @@ from examples.paper.runs.options import Data, Folds, Json, Quick, Run, Seed, Wei
 from examples.paper.runs.results import show, write
 from examples.paper.runs.study import weights_digest
 from scroll_tactile import Embedding, Frames
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
-from scroll_tactile.pipelines.metrics import accuracy
 from scroll_tactile.results import Composition
 from scroll_tactile.signals.contact import image_of
 from scroll_tactile.signals.stream import Stream

@@ -22,7 +22,7 @@ from examples.paper.runs.cells import Cell, Figures, run_cells, silent
 from examples.paper.runs.options import Data, Json, Run, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import Kernels
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress

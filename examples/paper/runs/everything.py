@@ -18,10 +18,10 @@ from examples.paper.runs.pictures import available
 from examples.paper.runs.results import show
 from examples.paper.runs.study import weights_digest
 from examples.tables import duration, seconds_of
-from scroll_tactile.cli import INTERRUPTED
-from scroll_tactile.cli.terminal import say
+from scroll_tactile.clients.cli import INTERRUPTED
+from scroll_tactile.clients.cli.terminal import say
+from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.runfile import RunFile
 
 __all__ = ["everything"]
 

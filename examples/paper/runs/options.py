@@ -12,7 +12,7 @@ import typer
 from examples.paper.readers import fabric_slide, letter_spike, physiclear
 from examples.paper.readers.biotac_slide import load
 from examples.paper.readers.labelled import Recordings, thinned
-from scroll_tactile.cli.terminal import say
+from scroll_tactile.clients.cli.terminal import say
 from scroll_tactile.errors import DatasetError, InputError
 
 __all__ = ["OF_TOUCHES", "QUICK_EPOCHS", "SETS", "folds_of", "leave_out", "named", "numbers", "read"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from scroll_tactile.cli.terminal import say
+from scroll_tactile.clients.cli.terminal import say
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import missing
 

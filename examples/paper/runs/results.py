@@ -20,7 +20,7 @@ from rich.table import Table
 
 from examples.tables import Results
 from scroll_tactile import __version__
-from scroll_tactile.cli.terminal import console, say
+from scroll_tactile.clients.cli.terminal import console, say
 from scroll_tactile.errors import InputError
 
 __all__ = ["circumstances", "noted", "origin", "show", "write", "write_result"]

@@ -30,7 +30,7 @@ from examples.paper.systems.descent import Course
 from examples.paper.systems.own import code_digest, is_own, require_own
 from examples.paper.systems.system_protocol import System
 from examples.paper.systems.trained import require_device
-from scroll_tactile.cli.terminal import say
+from scroll_tactile.clients.cli.terminal import say
 from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress

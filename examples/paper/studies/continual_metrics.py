@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
+from scroll_tactile.clients.learning.metrics import mean_and_spread
 from scroll_tactile.errors import InputError
-from scroll_tactile.pipelines.metrics import mean_and_spread
 
 __all__ = [
     "METRICS",

@@ -39,11 +39,11 @@ from examples.paper.studies.random_convolution import random_convolution
 from examples.paper.studies.schedules import arrange, part_ends, si_blurry
 from examples.paper.systems.coming import Coming, code_of, require_systems
 from scroll_tactile import Embedding, Kernels
-from scroll_tactile.cli.terminal import progress_bar
+from scroll_tactile.clients.cli.terminal import progress_bar
+from scroll_tactile.clients.learning.classification import Labelled
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.pipelines.classification import Labelled
 
 __all__ = ["METHODS", "STREAMS", "ContinualMetrics", "metrics", "summary"]
 

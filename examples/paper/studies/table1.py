@@ -28,10 +28,10 @@ from examples.paper.runs.study import OwnEmbeddings, OwnSystems, Systems, System
 from examples.paper.systems.catalogue import SYSTEMS, name_of
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import TrainedNetwork
-from scroll_tactile.cli.terminal import progress_bar, say
+from scroll_tactile.clients.cli.terminal import progress_bar, say
+from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.pipelines.metrics import accuracy
 
 __all__ = ["PAPER", "Table1", "rows", "table1"]
 

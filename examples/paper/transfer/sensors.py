@@ -26,7 +26,7 @@ from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, Shar
 from examples.paper.transfer.few_touches import FewTouchLearner, candidate_maker, draw_touches, few_touches, points_of
 from examples.paper.transfer.shared_features import Features, SharedFeatures
 from scroll_tactile import Kernels
-from scroll_tactile.cli.terminal import percent, progress_bar, say
+from scroll_tactile.clients.cli.terminal import percent, progress_bar, say
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.signals.stream import Stream

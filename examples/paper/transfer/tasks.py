@@ -42,7 +42,7 @@ from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.trained import TrainedNetwork, require_device
 from examples.paper.transfer.few_touches import COUNTS, candidate_maker, few_touches, points_of
 from scroll_tactile import Embedding, Kernels, Vision
-from scroll_tactile.cli.terminal import percent, progress_bar, say
+from scroll_tactile.clients.cli.terminal import percent, progress_bar, say
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.finetune.training import Progress

@@ -10,8 +10,7 @@ import struct
 
 import numpy as np
 import numpy.typing as npt
-
-from store.compression import decompress_zstd, unshuffle_bits
+from scroll_tactile_store.compression import decompress_zstd, unshuffle_bits
 
 __all__ = ["decompress_blosc"]
 

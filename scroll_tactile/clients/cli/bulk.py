@@ -1,0 +1,343 @@
+"""`scroll-tactile learn`, `fleet` and `evaluate`: the touches of many files and folders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from scroll_tactile.clients.cli.everyday import ANSWER, answer_row
+from scroll_tactile.clients.cli.options import (
+    Annotate,
+    AsJson,
+    Axis,
+    Clock,
+    Columns,
+    CutBy,
+    Field,
+    Label,
+    LabelBy,
+    Labels,
+    LabelTopic,
+    MemoryFolder,
+    Preset,
+    Sources,
+    Topic,
+    sensor_for,
+    source_options,
+)
+from scroll_tactile.clients.cli.terminal import (
+    confusion_text,
+    opened,
+    percent,
+    progress_bar,
+    say,
+    say_csv,
+    say_json,
+    say_refused,
+    shown,
+    verdict,
+)
+from scroll_tactile.clients.cli.wording import counted
+from scroll_tactile.errors import InputError
+from scroll_tactile.libraries import optional
+
+if TYPE_CHECKING:
+    from scroll_tactile.clients.learning.fleet import FleetReport
+    from scroll_tactile.clients.learning.learning import Evaluation, Learned
+    from scroll_tactile.clients.learning.sources import Refused
+
+__all__ = ["evaluate", "fleet", "learn"]
+
+MOST_SHOWN = 20  # mistakes; JSON and CSV have all
+MOST_NAMES = 40  # of a table of confusions
+SECONDS = 20  # in which a scheduler answers
+
+
+def learn(
+    memory: MemoryFolder,
+    sources: Sources,
+    sensor: Annotated[
+        str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
+    ] = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    columns: Columns = None,
+    label: Label = None,
+    label_by: LabelBy = None,
+    labels: Labels = None,
+    label_topic: LabelTopic = None,
+    cut: CutBy = None,
+    annotate: Annotate = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
+
+    Episodes name themselves where a recording says what they are. The exit code is 1 where something was refused.
+    """
+    from scroll_tactile.clients.learning.learning import learn_sources, store_model
+    from scroll_tactile.clients.learning.sources import find_sources, has_touches
+    from scroll_tactile.learner import TactileLearner
+
+    found, missing = find_sources(sources)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(found, preset, *how)
+    chosen = sensor_for(memory, sensor, preset)
+    with progress_bar() as progress:
+        # What is refused makes no memory.
+        if chosen is None or memory.exists() or has_touches(chosen, found, options):
+            opening: AbstractContextManager[TactileLearner] = opened(memory, sensor=chosen)
+        else:
+            opening = nullcontext(TactileLearner(sensor=chosen))
+        with opening as learner:
+            done = learn_sources(learner, found, options, progress)
+            store_model(learner, progress)
+            held = sum(learner.materials.values())
+    done.refused[:0] = missing
+    _report_learned(done, held, as_json)
+    if done.refused:
+        raise typer.Exit(1)
+
+
+def _report_learned(done: Learned, held: int, as_json: bool) -> None:
+    count = done.learned.total()
+    if as_json:
+        found = {
+            "files": done.files,
+            "touches": count,
+            "learned": dict(sorted(done.learned.items())),
+            "skipped": done.skipped,
+            "refused": _refusals(done.refused),
+            "observations": held,
+        }
+        say_json(found)
+        return
+    of = f" of {counted(len(done.learned), 'material')}" if count else ""
+    say(
+        f"[bold]learned:[/] {counted(count, 'touch')}{of} from {counted(done.files, 'file')}; the memory has {held} now"
+    )
+    for name, touches in sorted(done.learned.items()):
+        say(f"  {touches:>6}  {shown(name)}")
+    if done.skipped:
+        say(f"[bold]skipped:[/] {counted(done.skipped, 'touch')} that it had already")
+    say_refused(done.refused)
+
+
+def fleet(
+    destination: MemoryFolder,
+    sources: Sources,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as there are cores.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
+    ] = None,
+    add: Annotated[bool, typer.Option("--add", help="Add to a memory that was made in another way.")] = False,
+    patience: Annotated[
+        float | None, typer.Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
+    ] = None,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    columns: Columns = None,
+    label: Label = None,
+    label_by: LabelBy = None,
+    labels: Labels = None,
+    label_topic: LabelTopic = None,
+    cut: CutBy = None,
+    annotate: Annotate = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn recordings and memories, in folders, files and buckets, by many workers into one memory.
+
+    The memory is, to the byte, that of one process which observed each touch once. Interrupt it, type it again, and it
+    goes on. The exit code is 1 where something was refused.
+    """
+    from scroll_tactile.clients.learning.fleet import learn
+
+    if workers is not None and scheduler is not None:
+        raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(sources, preset, *how)
+    chosen = sensor_for(destination, sensor, preset)
+    with ExitStack() as stack:
+        client = None if scheduler is None else stack.enter_context(_connected(scheduler))
+        progress = stack.enter_context(progress_bar())
+        done = learn(
+            destination,
+            sources,
+            options,
+            sensor=chosen,
+            workers=workers,
+            client=client,
+            add=add,
+            patience=patience,
+            progress=progress,
+        )
+    _report_fleet(done, as_json)
+    if done.refused:
+        raise typer.Exit(1)
+
+
+def _connected(scheduler: str) -> Any:
+    with optional("dask[distributed]", "fleet", "--scheduler"):
+        import distributed
+    connect: Any = distributed.Client
+    try:
+        return connect(scheduler, timeout=SECONDS)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(f"no scheduler answers at {scheduler}: {type(error).__name__}: {error!s:.200}") from error
+
+
+def _report_fleet(done: FleetReport, as_json: bool) -> None:
+    if as_json:
+        say_json(
+            {
+                "sources": done.sources,
+                "observations": done.observations,
+                "repeated": done.repeated,
+                "refused": _refusals(done.refused),
+                "deaths": done.deaths,
+                "seconds": done.seconds,
+                "held": done.held,
+                "digest": done.digest,
+            }
+        )
+        return
+    rate = done.observations / done.seconds if done.seconds else 0.0
+    say(
+        f"[bold]learned:[/] {counted(done.observations, 'touch')} from {counted(done.sources, 'source')} in "
+        f"{done.seconds:.1f} s, {rate:.0f} a second; the memory has {done.held} now"
+    )
+    if done.repeated:
+        say(f"[bold]skipped:[/] {counted(done.repeated, 'touch')} that came before")
+    if done.deaths:
+        say(f"[bold]begun again:[/] {counted(done.deaths, 'job')} whose worker ended")
+    say_refused(done.refused)
+    say(f"[bold]digest:[/] {done.digest}")
+
+
+def evaluate(
+    memory: MemoryFolder,
+    sources: Sources,
+    preset: Preset = None,
+    topic: Topic = None,
+    field: Field = None,
+    clock: Clock = None,
+    columns: Columns = None,
+    label: Label = None,
+    label_by: LabelBy = None,
+    labels: Labels = None,
+    label_topic: LabelTopic = None,
+    cut: CutBy = None,
+    annotate: Annotate = None,
+    of: Axis = None,
+    with_learned: Annotated[
+        bool, typer.Option("--with-learned", help="Answer also the touches that the memory has learned.")
+    ] = False,
+    as_json: AsJson = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
+) -> None:
+    """Answer all touches in files and folders, and compare with what they are: accuracy, confusions, calibration.
+
+    Of values that a table or a column gives, how many lie in their intervals, how wide these are, R² and mean error.
+    Touches that it has learned are left out. The memory stays as it is. The exit code is 1 where something was refused.
+    """
+    from scroll_tactile.clients.learning.learning import evaluate_sources
+    from scroll_tactile.clients.learning.sources import find_sources
+
+    found, missing = find_sources(sources)
+    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
+    options = source_options(found, preset, *how)
+    with opened(memory, mode="read") as learner, progress_bar() as progress:
+        done = evaluate_sources(learner, found, options, progress, of=of, with_learned=with_learned)
+    refused = [*missing, *done.refused]
+    if as_json:
+        say_json(_figures(done) | {"refused": _refusals(refused)})
+    elif as_csv:
+        say_csv(*ANSWER, of or "material", "right")
+        for each in done.answered:
+            say_csv(*answer_row(each), done.truth(each), each.prediction.material == done.truth(each))
+    else:
+        _report_evaluated(done, with_learned)
+    if not as_json:
+        say_refused(refused)
+    if refused:
+        raise typer.Exit(1)
+
+
+def _refusals(refused: Sequence[Refused]) -> list[dict[str, str]]:
+    return [{"source": each.source, "why": each.why} for each in refused]
+
+
+def _figures(done: Evaluation) -> dict[str, Any]:
+    learned, never_learned = done.of_learned, done.of_others
+    wrong = [dict(zip(ANSWER, answer_row(each), strict=True)) | {"material": done.truth(each)} for each in done.wrong]
+    return {
+        **({} if done.of is None else {"of": done.of, "unlabelled": done.unlabelled}),
+        "touches": len(learned),
+        "learned_before": done.seen,
+        "accuracy": done.answers.accuracy if learned else None,
+        "called_unknown": sum(each.prediction.known is False for each in learned),
+        "calibration_error": done.calibration_error,
+        "confusions": [list(confusion) for confusion in done.answers.confusions()],
+        "never_learned": len(never_learned),
+        "never_learned_called_unknown": sum(each.prediction.known is False for each in never_learned),
+        "wrong": wrong,
+        **({"measured": done.measured} if done.measured else {}),
+    }
+
+
+def _measured_text(figures: Mapping[str, Any]) -> str:
+    without = f"; {figures['without']} without a number: {shown(figures['missing'])}" if figures["without"] else ""
+    if not figures["touches"]:
+        return without.removeprefix("; ")
+    unit = shown(figures["unit"])
+    r2 = "" if figures["r2"] is None else f", R² {figures['r2']:.3f}"
+    return (
+        f"{percent(figures['covered'])} of {figures['touches']} in their interval, where "
+        f"{percent(1 - figures['risk'])} are asked; {figures['width']:.4g} {unit} wide; "
+        f"off by {figures['mean_error']:.4g} {unit}{r2}{without}"
+    )
+
+
+def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
+    from scroll_tactile.clients.learning.metrics import confusion_counts
+
+    found, answers = _figures(done), done.answers
+    if done.seen:
+        what = "answered all the same" if with_learned else "left out; --with-learned answers them, too"
+        say(f"[bold]touches that it has learned:[/] {done.seen}, {what}")
+    names = "materials" if done.of is None else f"labels on {shown(done.of)}"
+    if done.unlabelled:
+        say(f"[bold]touches without a label on {shown(str(done.of))}:[/] {done.unlabelled}, left out")
+    say(f"[bold]touches:[/] {found['touches']} of {len(set(answers.truth))} {names} that it learned")
+    if found["touches"]:
+        say(f"[bold]accuracy:[/] {percent(found['accuracy'])}")
+        say(f"[bold]calibration error:[/] {found['calibration_error']:.3f}")
+        say(f"[bold]called unknown:[/] {found['called_unknown']}")
+    if found["never_learned"]:
+        say(
+            f"[bold]touches of {names} that it never learned:[/] {found['never_learned']}, of which it calls "
+            f"{found['never_learned_called_unknown']} unknown"
+        )
+    for name, found_of in done.measured.items():
+        if not found_of:
+            say(f"[bold]{shown(name)}[/]: not declared in this memory, which estimates nothing of it")
+        for of, figures in found_of.items():
+            say(f"[bold]{shown(name)}[/], {of} materials: {_measured_text(figures)}")
+    rows = sorted({*answers.truth, *(name for name in answers.predicted if name)})
+    if answers.confusions() and len(rows) <= MOST_NAMES:
+        tested = [answers.truth.count(name) for name in rows]
+        say(escape(confusion_text(rows, confusion_counts(rows, tested, answers.confusions()))))
+    for each in done.wrong[:MOST_SHOWN]:
+        say(f"  {shown(each.touch.source)}, {shown(done.truth(each))}: {verdict(each.prediction)}")
+    if len(done.wrong) > MOST_SHOWN:
+        say(f"  … and {len(done.wrong) - MOST_SHOWN} more, which --json lists")

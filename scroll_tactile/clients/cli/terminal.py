@@ -1,0 +1,228 @@
+"""What the commands share: how they print, how errors end them, and how they show progress."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from scroll_tactile_store import NotAStoreError, StoreError
+from typer.core import TyperGroup
+
+from scroll_tactile.clients.cli import INTERRUPTED
+from scroll_tactile.clients.cli.wording import has_option, in_options, typed
+from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, plain_cell, printable
+from scroll_tactile.results import Estimate, Prediction
+
+if TYPE_CHECKING:
+    from scroll_tactile.clients.learning.sources import Refused
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.sensors import Sensor
+
+__all__ = [
+    "Commands",
+    "confusion_text",
+    "console",
+    "estimate_text",
+    "opened",
+    "opened_for_upkeep",
+    "percent",
+    "progress_bar",
+    "say",
+    "say_csv",
+    "say_json",
+    "say_refused",
+    "shown",
+    "verdict",
+]
+
+
+MOST_REFUSED = 20
+
+
+def console(*, error: bool = False) -> Console:
+    """A console on the standard output, or error, of this moment (tests exchange them)."""
+    return Console(stderr=error, highlight=False, soft_wrap=not error and not sys.stdout.isatty())
+
+
+def say(text: str) -> None:
+    """Print a line in rich's markup."""
+    console().print(text)
+
+
+def say_json(found: Mapping[str, Any]) -> None:
+    """Print JSON in ASCII, whatever the names in it."""
+    typer.echo(json.dumps(found).replace("\x7f", "\\u007f"))
+
+
+def say_csv(*cells: object) -> None:
+    """Print a line of CSV; what is None has an empty cell."""
+    line = io.StringIO()
+    written = [plain_cell(cell) if isinstance(cell, str) else "" if cell is None else cell for cell in cells]
+    csv.writer(line, lineterminator="").writerow(written)
+    typer.echo(line.getvalue())
+
+
+def say_refused(refused: Sequence[Refused]) -> None:
+    """Print on the standard error what could not be taken, and why; at most 20, and one list of what a file has."""
+    listed = False
+    for each in refused[:MOST_REFUSED]:
+        first, *others = in_options(each.why).splitlines() or [""]
+        _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(first)}")
+        for line in [] if listed else others:
+            _warn(f"  {shown(line)}")
+        listed = listed or bool(others)
+    if len(refused) > MOST_REFUSED:
+        _warn(f"[yellow]refused:[/] {len(refused) - MOST_REFUSED} more")
+
+
+def shown(text: object) -> str:
+    """A name, a path or a message in rich's markup, with what does not print escaped."""
+    return escape(printable(str(text)))
+
+
+class Commands(TyperGroup):
+    """Commands that end with one red line and exit code 1 on an expected error, and with 130 on ctrl-C.
+
+    Errors of the system are expected: files that cannot be read, a device that is full.
+    """
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that was typed, whose options errors name."""
+        found = super().resolve_command(ctx, args)
+        if found[1] is not None:
+            typed(found[1].params)
+        return found
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that was typed."""
+        try:
+            with _warnings_as_lines():
+                return super().invoke(ctx)
+        except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
+            if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
+                message = in_options(str(error)) or "no memory is left"
+                text = " ".join([*message.split(), *getattr(error, "__notes__", [])])
+                _warn(f"[bold red]Error:[/] [red]{shown(text)}[/]")
+            raise typer.Exit(1) from error
+        except KeyboardInterrupt:
+            _warn("[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on.")
+            raise typer.Exit(INTERRUPTED) from None
+
+
+@contextmanager
+def _warnings_as_lines() -> Iterator[None]:
+    """Show the warnings of this library as lines, and not where they came from."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RangeWarning)
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, RangeWarning):
+                _warn(f"[yellow]Warning:[/] {shown(in_options(str(message)))}")
+            else:
+                others(message, category, *where, **more)
+
+        warnings.showwarning = show
+        yield
+
+
+def _warn(text: str) -> None:
+    with suppress(OSError):  # nobody reads it
+        Console(stderr=True, highlight=False, soft_wrap=True).print(text)
+
+
+def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "read"] = "write") -> TactileLearner:
+    """A memory, or a new one where there is nothing and a sensor is given. Raises what `TactileLearner.open` raises."""
+    from scroll_tactile.learner import TactileLearner
+
+    try:
+        return TactileLearner.open(path, sensor=sensor, mode=mode)
+    except (InputError, NotAStoreError) as error:
+        if path.is_file() or sensor is not None or (mode == "read" and path.exists()):
+            raise
+        raise _no_memory(path) from error
+
+
+def _no_memory(path: Path) -> InputError:
+    """The error of a command whose memory is not there, with how this or another command makes one."""
+    how = "scroll-tactile observe or learn makes one"
+    if has_option("sensor"):
+        how = "to make one, say which sensor it is for: sensor=" + " or preset=" * has_option("preset")
+    return InputError(f"there is no memory in {path}; {how}")
+
+
+def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:
+    """A memory of any embedding, for all that needs none: showing, retracting, merging, compacting, exporting."""
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.memory.identity import absent_embedding
+
+    if not path.exists():
+        raise _no_memory(path)
+    return TactileLearner.open(path, embedding=absent_embedding(path), mode=mode)
+
+
+def percent(share: float) -> str:
+    """A share as a percentage."""
+    return f"{100 * share:.1f} %"
+
+
+def verdict(prediction: Prediction) -> str:
+    """A prediction in words."""
+    if prediction.material is None:
+        return "never felt anything yet"
+    name = shown(prediction.material)
+    felt = f" ({', '.join((f'novelty {prediction.novelty:.1f}', *prediction.unusual))})"
+    if prediction.known is False:
+        return f"[bold yellow]never felt this[/]; nearest is {name}{felt}"
+    doubt = "" if prediction.known else ", if it was ever felt: nothing learned so far can tell"
+    return f"[bold green]{name}[/] with {percent(prediction.probability)}{felt}{doubt}"
+
+
+def estimate_text(estimate: Estimate) -> str:
+    """An estimate in words."""
+    if estimate.value is None:
+        return f"[yellow]no number[/]: {shown(estimate.missing)}"
+    ends = f"{estimate.low:.4g} to {estimate.high:.4g}"
+    whose = "a learned material" if estimate.known else "a new material"
+    more = f"; {shown(estimate.missing)}" if estimate.missing else f" with {percent(1 - estimate.risk)}, of {whose}"
+    doubt = "" if estimate.inside else ", [yellow]unlike what was learned[/]"
+    return f"[bold]{estimate.value:.4g}[/] {shown(estimate.unit)} ({ends}{more}){doubt}"
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on the standard error; yields its update: (what is being done, steps done, steps in all)."""
+    columns = (
+        TextColumn("{task.description}", markup=False),  # names of files, which may have brackets
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    screen = console(error=True)
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
+        task = progress.add_task("starting", total=None)
+        yield lambda what, done, of: progress.update(task, description=what, completed=done, total=of)
+
+
+def confusion_text(names: Sequence[str], counts: np.ndarray) -> str:
+    """Counts of (truth, predicted), shape (C, C), as text: column 3 is the material of row 3, a dot a count of 0."""
+    wide = max(map(len, names)) + 3
+    head = " " * wide + "".join(f"{i:>3}" for i in range(1, len(names) + 1))
+    rows = [
+        f"{i:>2} {name:<{wide - 3}}" + "".join(f"{count or '·':>3}" for count in row)
+        for i, (name, row) in enumerate(zip(names, counts.tolist(), strict=True), start=1)
+    ]
+    return "\n".join([head, *rows])

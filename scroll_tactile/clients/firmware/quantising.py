@@ -1,0 +1,185 @@
+"""How the exported judge is made: readouts and calibration of a scene's windows, rounded to whole numbers once.
+
+A weight keeps 15 bits and a sign: of each scale the largest decides the unit. Everything else (offsets, the background
+matrix, calibration) keeps 30 bits or more, so the weights are what the rounding costs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile.clients.firmware.exported_judge import (
+    MOST_MATERIALS,
+    ONE,
+    ExportedJudge,
+    ExportedScale,
+    ExportedStage,
+)
+from scroll_tactile.embeddings.kernels import SHORTEST, Kernels
+from scroll_tactile.errors import InputError
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.readouts.calibration import Calibration, calibrate_stage
+from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
+from scroll_tactile.readouts.readout import Readout
+from scroll_tactile.readouts.task import Task
+from scroll_tactile.recipe import Recipe
+from scroll_tactile.settings import candidates_of
+from scroll_tactile.signals.windows import ENOUGH, Scale
+from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.moments import one_thread
+
+__all__ = ["exported_judge"]
+
+FloatArray = npt.NDArray[np.float64]
+
+SCORE_BITS = 8  # of a logit's fraction, where the weights leave so many
+LOGIT_BITS = 24
+SPREAD_BITS = 16
+FACTOR_BITS = 30
+MOST_SHIFT = 62
+MOST_THRESHOLD = 2**61
+MOST_SCALES = 2  # as judge.h has it
+LEAST_BITS = -SCORE_BITS  # of a score: at 2⁸ logits a unit, materials lie so far apart that nothing can be told
+
+
+def exported_judge(recipe: Recipe, memory: Memory, scene: Sequence[str] | None) -> ExportedJudge:
+    """The exported judge of a scene, by a memory as it is now; see `TactileLearner.exported`."""
+    names = candidates_of(scene, sorted(memory.statistics.materials), memory.statistics.materials.keys())
+    _require_exportable(recipe, names)
+    embedding = recipe.embedding
+    assert isinstance(embedding, Kernels)
+    with one_thread():
+        readouts = _readouts(memory, names)
+        stages = _calibrations(memory, readouts)
+    scales = [_Quantised(readout) for readout in readouts]
+    return ExportedJudge(
+        sensor=recipe.sensor,
+        embedding=embedding,
+        plan=recipe.plan,
+        materials=tuple(names),
+        capacity=memory.statistics.longest,
+        scales=tuple(scale.exported() for scale in scales),
+        stages=tuple(
+            _stage(least, calibration, scales, recipe.settings.false_alarms, several=len(names) > 1)
+            for least, calibration in stages
+        ),
+    )
+
+
+def _require_exportable(recipe: Recipe, names: Sequence[str]) -> None:
+    if not isinstance(recipe.embedding, Kernels) or recipe.sensor.camera or len(recipe.plan.widths) > MOST_SCALES:
+        raise InputError(
+            f"only memories of the default embedding, Kernels, can be exported as C; this one's is "
+            f"{recipe.embedding!r} for {recipe.sensor.name}. Carry it over with reembed(Kernels()), or export ONNX"
+        )
+    if not 0 < len(names) <= MOST_MATERIALS:
+        raise InputError(
+            f"expected a scene of 1 to {MOST_MATERIALS} materials; came {len(names)}. Name those that can be there"
+        )
+
+
+def _readouts(memory: Memory, names: Sequence[str]) -> list[Readout]:
+    """Of each width of windows that all of the materials have, ascending; touches are compared with the scene alone."""
+    statistics = memory.statistics
+    widths = [scale for scale in memory.plan.windows if not set(names) - set(statistics.names(scale))]
+    if not widths:
+        raise InputError(f"expected materials with a touch of {memory.plan.widths[0]} readings; {names} have none")
+    return [Task.of(statistics, scale, names, memory.plan.shrinkage).solve(statistics) for scale in widths]
+
+
+def _calibrations(memory: Memory, readouts: Sequence[Readout]) -> list[tuple[int, Calibration]]:
+    """The least readings of each stage that these windows judge, and its calibration by the scene's sampled touches."""
+    plan, names = memory.plan, {readouts[0].names[place] for place in readouts[0].reference}
+    sample = [touch for touch in memory.sample if touch[0] in names]
+    judging = [plan.judging(length) for length in plan.milestones()]
+    stages = [[*scales, *plan.views] for scales in judging]  # a sampled touch's rows are numbered so
+    held_out = [held_out_scores(readout, sample, stages, "lda") for readout in readouts]
+    found = []
+    begins = [_least(plan.widths[0]), *plan.milestones()[1:]]
+    for number, (least, scales) in enumerate(zip(begins, judging, strict=True)):
+        if len(scales) <= len(readouts):
+            scores = StageScores(number, sample, held_out[: len(scales)])
+            found.append((least, calibrate_stage(scores, readouts[: len(scales)], "lda")))
+    return found
+
+
+def _least(width: int) -> int:
+    """The readings from which a touch has a window of the shortest width that needs no mirror image."""
+    return max(SHORTEST, math.ceil(ENOUGH * width))
+
+
+class _Quantised:
+    """A readout of one width in whole numbers.
+
+    bits: of a score's fraction, at most SCORE_BITS: a unit is 2^-bits logits.
+    """
+
+    def __init__(self, readout: Readout) -> None:
+        self._readout = readout
+        solved, shares = readout.means_solved()[1], readout.shares
+        # z about the mean of the scene's materials, for features in 0 … 1.
+        self._weights = readout.gamma * (solved - shares @ solved) * 2.0**BITS
+        self._offsets = -(self._weights @ readout.origin) / 2.0**BITS - readout.derived().towards
+        largest = float(np.abs(self._weights).max())
+        self._unit = 30 if largest == 0 else min(30, math.floor(math.log2((ONE - 1) / largest)))
+        self.bits = min(SCORE_BITS, self._unit + 15)
+        if self.bits < LEAST_BITS:
+            raise InputError(
+                f"materials whose touches are all alike cannot be weighed in 16 bits: a feature of "
+                f"{readout.scale.width} readings weighs {largest:.0e} logits. Observe touches that differ as those to "
+                "come will"
+            )
+
+    def exported(self) -> ExportedScale:
+        derived, width = self._readout.derived(), self._readout.scale.width
+        top = float(np.abs(derived.background).max())
+        # u in 2⁻¹⁶: H counts in 2^-shift of a unit of scores.
+        fine = FACTOR_BITS - (math.frexp(top)[1] if top else 0)
+        shift = fine + self.bits - SPREAD_BITS
+        fine, shift = fine - max(0, shift - MOST_SHIFT), min(shift, MOST_SHIFT)
+        return ExportedScale(
+            scale=Scale("window", width),
+            weights=np.rint(self._weights.T * 2.0**self._unit).astype(np.int16),
+            shift=15 + self._unit - self.bits,
+            offsets=np.rint(self._offsets * 2.0**self.bits).astype(np.int64),
+            halves=np.rint(np.diagonal(derived.gram) / 2 * 2.0**self.bits).astype(np.int64),
+            background=np.rint(derived.background * 2.0**fine).astype(np.int32),
+            background_shift=shift,
+        )
+
+
+def _stage(
+    least: int, calibration: Calibration, scales: Sequence[_Quantised], false_alarms: float, *, several: bool
+) -> ExportedStage:
+    among = scales[: len(calibration.weights)]
+    mean, spread = calibration.scale_novelty.T
+    weights = [
+        min(round(float(weight) * 2.0 ** (LOGIT_BITS - scale.bits)), 2**31 - 1)
+        for weight, scale in zip(calibration.weights, among, strict=True)
+    ]
+    factors = [
+        _factor(2.0 ** (SPREAD_BITS - scale.bits) / (float(one) * len(among)))
+        for one, scale in zip(spread, among, strict=True)
+    ]
+    threshold = 2.0**SPREAD_BITS * (calibration.threshold(false_alarms) + float((mean / spread).mean()))
+    return ExportedStage(
+        least=least,
+        detects=several and calibration.measures(false_alarms) and calibration.detects(false_alarms),
+        weights=tuple(weights),
+        distance_weights=tuple(factor for factor, _ in factors),
+        distance_shifts=tuple(shift for _, shift in factors),
+        threshold=round(max(-MOST_THRESHOLD, min(MOST_THRESHOLD, threshold))),
+    )
+
+
+def _factor(value: float) -> tuple[int, int]:
+    """A factor as a whole number below 2³⁰ and the shift that follows it."""
+    mantissa, exponent = math.frexp(value)
+    shift = FACTOR_BITS - exponent
+    if shift < 0:
+        return 2**FACTOR_BITS - 1, 0
+    return (min(round(mantissa * 2.0**FACTOR_BITS), 2**FACTOR_BITS - 1), shift) if shift <= MOST_SHIFT else (0, 0)

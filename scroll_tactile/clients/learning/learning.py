@@ -1,0 +1,316 @@
+"""Many sources, one memory: the touches in files and folders are learned, or answered; what cannot be is listed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from scroll_tactile.clients.learning.classification import Answers
+from scroll_tactile.clients.learning.metrics import calibration_error, interval_figures
+from scroll_tactile.clients.learning.sources import Refused, SourceOptions, SourceTouch, source_touches
+from scroll_tactile.errors import InputError, printable
+from scroll_tactile.learner import TactileLearner
+from scroll_tactile.persistence.contents import refusal
+from scroll_tactile.results import Estimate, Prediction, Receipt
+from scroll_tactile.signals.ranges import all_clipped, range_problem
+
+__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources", "store_model"]
+
+BATCH_TOUCHES = 256  # become durable together: what a kill can cost …
+BATCH_BYTES = 1 << 25  # … unless their readings would be more than this, or the first was read so long ago:
+BATCH_SECONDS = 5.0
+
+Progress = Callable[[str, int, int], object]
+
+
+@dataclass
+class Learned:
+    """What a pass over sources did.
+
+    files: how many were read. learned: material → touches. skipped: touches that the memory had already under this
+    name, by the hash of their content. refused: what was not learned; failed: the sources of that. rows: source →
+    touches, whose rows follow each other. clipped: the contents of touches all of whose values lay outside the sensor's
+    range. range_problem: of the first touch that does not fit it.
+    """
+
+    files: int = 0
+    learned: Counter[str] = field(default_factory=Counter)
+    skipped: int = 0
+    refused: list[Refused] = field(default_factory=list)
+    failed: set[str] = field(default_factory=set)
+    rows: Counter[str] = field(default_factory=Counter)
+    clipped: set[bytes] = field(default_factory=set)
+    range_problem: str | None = None
+
+
+def learn_sources(
+    learner: TactileLearner,
+    sources: Sequence[str],
+    options: SourceOptions,
+    progress: Progress = lambda what, done, of: None,
+    *,
+    every: bool = False,
+) -> Learned:
+    """Observe the touches in sources, each once: a pass that was cut short is continued by the same call.
+
+    At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
+    has under another name is refused. every: learn also what came before, under any name: whoever merges it decides.
+    progress: called with (what is being done, files done, files in all).
+
+    Raises AnnotationError for a quantity that the memory has with another unit or range (nothing was learned);
+    StoreError and CapacityError; what was learned until then is kept.
+    """
+    done, batch = Learned(), _Batch(learner, every, progress, len(sources))
+    for quantity in options.declared:
+        learner.declare(quantity)
+    for number, address in enumerate(sources):
+        batch.show(done, address, number)
+        for touch in source_touches(learner, address, options):
+            if isinstance(touch, Refused):
+                done.refused.append(touch)
+                done.failed.add(address)
+            else:
+                batch.add(touch, address, number, done)
+        done.files += 1
+    batch.observe(done)
+    progress(f"{done.learned.total()} touches", len(sources), len(sources))
+    return done
+
+
+def store_model(learner: TactileLearner, progress: Progress) -> None:
+    """Fit a model that the learner stores when it is closed, so that the processes that open the memory fit none.
+
+    progress: called with (what is being done, 0, 1). Without a path, and without a touch, nothing is fitted.
+    """
+    if learner.path is not None and learner.materials:
+        progress("fitting the model", 0, 1)
+        learner._predictor.prepare_to_store()
+
+
+class _Batch:
+    """Touches that are about to become durable together. of: how many sources there are, for the progress."""
+
+    def __init__(self, learner: TactileLearner, every: bool, progress: Progress, of: int) -> None:
+        self._learner, self._every = learner, every
+        self._progress, self._of = progress, of
+        self._touches: list[tuple[SourceTouch, str, int]] = []  # each with its source, and the number of that
+        self._bytes = 0
+        self._since = 0.0
+
+    def show(self, done: Learned, address: str, number: int) -> None:
+        """Report how far it is, before a source is read, or a touch of it observed: what waits is not done."""
+        first = min(number, self._touches[0][2]) if self._touches else number
+        self._progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", first, self._of)
+
+    def add(self, touch: SourceTouch, address: str, number: int, done: Learned) -> None:
+        if not self._touches:
+            self._since = monotonic()
+        self._touches.append((touch, address, number))
+        self._bytes += touch.stream.readings.nbytes
+        late = monotonic() - self._since >= BATCH_SECONDS
+        if late or len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
+            self.observe(done)
+
+    def observe(self, done: Learned) -> None:
+        touches, self._touches, self._bytes = self._touches, [], 0
+        with self._learner.batch():
+            for touch, address, number in touches:
+                self.show(done, address, number)
+                material, clipped = str(touch.material), all_clipped(touch.stream)
+                names = [] if self._every else self._learner.names_of(touch.stream)
+                if material in names and not (touch.values or touch.labels):
+                    done.skipped += 1
+                    continue
+                found = refusal(names, material, clipped) or self._observed(material, touch)
+                if isinstance(found, str):
+                    done.refused.append(Refused(touch.source, found))
+                    done.failed.add(address)
+                    continue
+                if found.repeated:
+                    done.skipped += 1
+                    continue
+                done.learned[material] += 1
+                done.rows[address] += 1
+                done.clipped |= {touch.stream.key} if clipped else set()
+                done.range_problem = done.range_problem or range_problem(touch.stream)
+
+    def _observed(self, material: str, touch: SourceTouch) -> Receipt | str:
+        """The receipt of a touch; or why it cannot be observed, such as one that is too long."""
+        noted: dict[str, Any] = {"values": touch.values, "labels": touch.labels}
+        try:
+            return self._learner.observe(material, touch.stream, **noted, source=touch.source, again=self._every)
+        except InputError as error:
+            return str(error)
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A touch out of a source, what it feels like, and the estimates of its quantities, if any was declared."""
+
+    touch: SourceTouch
+    prediction: Prediction
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+
+
+def answers(
+    learner: TactileLearner,
+    sources: Sequence[str],
+    options: SourceOptions,
+    *,
+    scene: Sequence[str] | None = None,
+    of: str | None = None,
+    named: bool = False,
+    progress: Progress = lambda what, done, of: None,
+) -> Iterator[Answered | Refused]:
+    """What each touch in sources feels like; the memory stays as it is.
+
+    scene, of: as of `TactileLearner.predict`. named: as of `source_touches`.
+    """
+    for touch in _touches(learner, sources, options, progress, named=named):
+        yield touch if isinstance(touch, Refused) else _answered(learner, touch, scene, of)
+
+
+def _answered(
+    learner: TactileLearner, touch: SourceTouch, scene: Sequence[str] | None = None, of: str | None = None
+) -> Answered:
+    if not learner.quantities:
+        return Answered(touch, learner.predict(touch.stream, of=of, scene=scene))
+    return Answered(touch, *learner._predictor.estimate(touch.stream, scene=scene, axis=of))
+
+
+def _touches(
+    learner: TactileLearner, sources: Sequence[str], options: SourceOptions, progress: Progress, *, named: bool
+) -> Iterator[SourceTouch | Refused]:
+    for number, address in enumerate(sources):
+        progress(printable(Path(address).name), number, len(sources))
+        yield from source_touches(learner, address, options, named=named)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Answers to touches whose material is known, or whose label on an axis is: their name.
+
+    answered: in the order of the sources. refused: what was not answered. learned: the materials of the memory, or its
+    labels. seen: touches that the memory had learned, under any name; left out, or answered with `with_learned`.
+    of: the axis; None for materials. unlabelled: touches without a label on it, which are left out.
+    """
+
+    answered: tuple[Answered, ...]
+    refused: tuple[Refused, ...]
+    learned: frozenset[str]
+    seen: int = 0
+    of: str | None = None
+    unlabelled: int = 0
+
+    def truth(self, answered: Answered) -> str:
+        """The name of a touch."""
+        return str(_name_of(answered.touch, self.of))
+
+    @property
+    def of_learned(self) -> list[Answered]:
+        """Touches whose name the memory has: accuracy, confusions and calibration are theirs."""
+        return [each for each in self.answered if self.truth(each) in self.learned]
+
+    @property
+    def of_others(self) -> list[Answered]:
+        """Touches whose name it never learned, which it should call unknown."""
+        return [each for each in self.answered if self.truth(each) not in self.learned]
+
+    @property
+    def answers(self) -> Answers:
+        """Those to touches whose name the memory has."""
+        return Answers([self.truth(each) for each in self.of_learned], [each.prediction for each in self.of_learned])
+
+    @property
+    def wrong(self) -> list[Answered]:
+        """Touches taken for another: of names that the memory has, and of others that it called known."""
+        mistaken = (each for each in self.answered if each.prediction.material != self.truth(each))
+        return [each for each in mistaken if self.truth(each) in self.learned or each.prediction.known is not False]
+
+    @property
+    def calibration_error(self) -> float | None:
+        """Expected calibration error of touches whose name the memory has, see `metrics`; None without any."""
+        learned, truth = self.of_learned, self.answers
+        right = [name == predicted for name, predicted in zip(truth.truth, truth.predicted, strict=True)]
+        return calibration_error([each.prediction.probability for each in learned], right) if learned else None
+
+    @property
+    def measured(self) -> dict[str, dict[str, Any]]:
+        """Quantity → figures of its estimates of touches whose value is known, see `interval_figures`.
+
+        For those of learned materials by name, and for "new" materials behind it, with the number of touches; what no
+        number was given for is left out of them and counted as "without", "missing" says why. Empty of a quantity that
+        was not declared. By an axis nothing is estimated.
+        """
+        if self.of is not None:
+            return {}
+        names = sorted({name for each in self.answered for name in each.touch.values})
+        return {
+            name: {
+                of: figures
+                for of, among in (("learned", self.of_learned), ("new", self.of_others))
+                if (figures := _measured(name, among)) is not None
+            }
+            for name in names
+        }
+
+
+def _measured(name: str, answered: Sequence[Answered]) -> dict[str, Any] | None:
+    """The figures of a quantity over touches with a value of it; None where there are none."""
+    pairs = [
+        (each.touch.values[name], each.estimates[name])
+        for each in answered
+        if name in each.touch.values and name in each.estimates
+    ]
+    estimated = [(true, own.value, own.low, own.high) for true, own in pairs if own.value is not None]
+    if not pairs:
+        return None
+    figures = interval_figures(*np.array(estimated, dtype=np.float64).T) if estimated else {}
+    first, missing = pairs[0][1], next((own.missing for _, own in pairs if own.value is None), "")
+    counted = {"touches": len(estimated), "without": len(pairs) - len(estimated), "missing": missing}
+    return counted | {"risk": first.risk, "unit": first.unit} | figures
+
+
+def evaluate_sources(
+    learner: TactileLearner,
+    sources: Sequence[str],
+    options: SourceOptions,
+    progress: Progress = lambda what, done, of: None,
+    *,
+    of: str | None = None,
+    with_learned: bool = False,
+) -> Evaluation:
+    """Answer every touch in sources with what the memory knows, settled, and keep the right answers.
+
+    of: an axis of labels, to be answered by in place of materials. with_learned: also those that the memory learned, of
+    which it knows the answer. Raises AnnotationError for an axis that no touch of the memory has a label on.
+    """
+    learner._by(of)  # it is settled, too
+    learner.settle()
+    answered: list[Answered] = []
+    refused: list[Refused] = []
+    seen = unlabelled = 0
+    for touch in _touches(learner, sources, options, progress, named=of is None):
+        if isinstance(touch, Refused):
+            refused.append(touch)
+        elif _name_of(touch, of) is None:
+            unlabelled += 1
+        else:
+            known = bool(learner.names_of(touch.stream))
+            seen += known
+            if with_learned or not known:
+                own = _answered(learner, touch) if of is None else Answered(touch, learner.predict(touch.stream, of=of))
+                answered.append(own)
+    learned = frozenset(learner.materials if of is None else learner.axes[of])
+    return Evaluation(tuple(answered), tuple(refused), learned, seen, of, unlabelled)
+
+
+def _name_of(touch: SourceTouch, of: str | None) -> str | None:
+    """A touch's material, or its label on an axis; None where it has none."""
+    return touch.material if of is None else touch.labels.get(of)

@@ -1,0 +1,294 @@
+"""The page of a recording: what a file has, how steady its clock is, and whether its channels are well."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from os import PathLike, fspath
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scroll_tactile import __version__
+from scroll_tactile.clients.report.channels import DEAD, DRIFTING, SATURATED, ChannelSummary, channels_of
+from scroll_tactile.clients.report.charts import FIRST_DATE, MOST_TRACES, counted_from, dated, histogram, trace
+from scroll_tactile.clients.report.cutting import Cutting, Whose, cut_of, learning, whose_readings
+from scroll_tactile.clients.report.drawing import shown
+from scroll_tactile.clients.report.page import Card, State, cards, figure, note, page, side_by_side, table
+from scroll_tactile.clients.report.sensing import card_of, level_picture, state_rows
+from scroll_tactile.errors import FieldError, InputError
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.recordings import Contents, Interval, Recording, describe, read
+from scroll_tactile.sensors import Sensor
+
+__all__ = ["recording_page"]
+
+FloatArray = npt.NDArray[np.float64]
+
+STRETCHES = 40  # that a recording is cut into, to see in which of them a channel is still
+MOST_ROWS = 60
+MOST_TOUCHES = 1000
+MARGIN = 0.1  # of the range that was seen, beyond it at both ends
+LARGEST = 1e30  # of readings in which contacts are looked for
+LOST = 0.001  # of the readings: more is worth a look
+
+
+def recording_page(
+    path: str | PathLike[str],
+    *,
+    sensor: Sensor | None = None,
+    intervals: Sequence[Interval] | None = None,
+    given: Mapping[str, str] | None = None,
+    **chosen: Any,
+) -> str:
+    """One HTML page that shows what a recording holds; it needs no network and no script.
+
+    sensor: whose readings they are, which gives channels their range; unless given that of the preset, or of the one
+    that the messages' type is of. chosen: topic, field, preset and the others of `read`; where a file has several
+    fields and none is named, the first is shown. intervals: of touches in it; unless given its episodes, or contacts.
+    given: for the line that learns it, the name or file of the "sensor", and the file of the intervals, "labels".
+
+    Raises what `describe` and `read` raise, ChannelCountError for a sensor of other channels, and InputError for both a
+    sensor and a preset.
+    """
+    if sensor is not None and chosen.get("preset") is not None:
+        raise InputError("give sensor= or preset=: both say whose readings they are")
+    contents = describe(path)
+    recording, chosen, why = _read(contents, fspath(path), chosen)
+    whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
+    seen = _Seen.of(recording, whose.sensor)
+    cut = cut_of(recording, intervals, whose.sensor or (None if seen is None else seen.sensor(recording)))
+    spans = [(touch.begin, touch.end) for touch in cut.touches]
+    words = learning(recording, fspath(path), whose, cut, chosen, given or {})
+    sections = [
+        ("signal", "Signal", side_by_side(_signal(recording, spans), f"<div>{_touches(recording, cut)}{words}</div>")),
+        ("channels", "Channels", _channels(seen, whose)),
+        ("time", "Time", _time(recording)),
+        ("holds", "What the file has", _holds(contents)),
+    ]
+    where = f"topic <code>{shown(recording.topic)}</code>, " if recording.topic else ""
+    under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {_shape(recording)}.{why}"
+    summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen, whose)])
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    foot = f"Made {now} by scroll-tactile {shown(__version__)} of <code>{shown(recording.source)}</code>."
+    return page(PurePosixPath(recording.source).name, under, summary, sections, foot)
+
+
+def _signal(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
+    channels = 1 if recording.readings.ndim > 2 else int(np.prod(recording.readings.shape[1:]))
+    which = f"The {MOST_TRACES} of {channels} channels that move most" if channels > MOST_TRACES else "All channels"
+    of = "The mean of each picture" if recording.readings.ndim > 2 else which
+    words = f"{of}, each from its least to its most."
+    if spans:
+        words += " Blue bands are touches."
+    if recording.report.gaps:
+        words += " Red bands are gaps, in which nothing was read."
+    if counted_from(recording)[1] != "s":
+        words += " Across: the number of the reading, for it has no clock that goes on."
+    return figure(trace(recording, spans), words)
+
+
+def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, dict[str, Any], str]:
+    """The recording, of the requested field or of the first there is; how it was read; and a sentence on that."""
+    try:
+        return read(path, **chosen), chosen, ""
+    except FieldError:
+        if any(chosen.get(name) for name in ("topic", "field", "preset")) or not contents.entries:
+            raise
+    first = contents.entries[0]
+    chosen = chosen | {"topic": first.topic, "field": first.field}
+    return (
+        read(path, **chosen),
+        chosen,
+        f" It is the first of {len(contents.entries)} below; --topic and --field choose another.",
+    )
+
+
+def _shape(recording: Recording) -> str:
+    shape = recording.readings.shape[1:]
+    return f"{shape[0]} channels" if len(shape) == 1 else f"pictures of {' × '.join(map(str, shape))}"
+
+
+def _seconds(recording: Recording) -> float | None:
+    steps = np.diff(recording.times)
+    steps = steps[np.isfinite(steps)]
+    return float(steps[steps > 0].sum()) if len(steps) else None  # of an episode each, where they begin anew
+
+
+def _length(recording: Recording) -> Card:
+    lasts = _seconds(recording)
+    count = len(recording)
+    cut = (
+        "The file ends before its end: what was whole was read."
+        if recording.report.cut_off
+        else "It was read to its end."
+    )
+    answer = f"{count} readings" + ("" if lasts is None else f", {lasts:.4g} s")
+    return "bad" if not count else "look" if recording.report.cut_off else "good", "How much", answer, cut
+
+
+def _clock(recording: Recording) -> Card:
+    report = recording.report
+    if report.rate is None:
+        return "none", "How steady", "no clock", "Its readings have no times: give --clock or --rate."
+    share = (report.jitter or 0.0) * report.rate
+    state: State = "bad" if report.backward else "look" if report.gaps or share > 0.2 else "good"
+    gaps = "no gaps"
+    if report.gaps:
+        longest = max(gap.seconds for gap in report.gaps)
+        gaps = f"{len(report.gaps)} gap{'s' * (len(report.gaps) > 1)}, the longest {longest:.3g} s"
+    back = f"; time goes back {report.backward} times" if report.backward else ""
+    answer = f"{report.rate:.4g} Hz ± {max(1e3 * (report.jitter or 0), 0.001):.2g} ms"
+    return state, "How steady", answer, f"By the clock {report.clock!r}: {gaps}{back}."
+
+
+def _losses(recording: Recording) -> Card:
+    report = recording.report
+    counted = (
+        "No counter shows whether readings were lost." if report.lost is None else "By the counter in its messages."
+    )
+    if report.lost is None and not report.repeated and not report.unset:
+        return "none", "What was lost", "not counted", counted
+    parts = {"lost": report.lost or 0, "repeated": report.repeated, "without a stamp": report.unset}
+    bad = sum(parts.values())
+    answer = ", ".join(f"{count} {what}" for what, count in parts.items() if count) or "none lost"
+    return "look" if bad > LOST * len(recording) else "good", "What was lost", answer, counted
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The readings as levels (C, T), the range of each channel, (C,), and the channels."""
+
+    levels: LevelArray
+    low: FloatArray
+    high: FloatArray
+    channels: list[ChannelSummary]
+
+    @classmethod
+    def of(cls, recording: Recording, sensor: Sensor | None) -> _Seen | None:
+        """None of pictures, and of a single reading. Without a sensor the range is what was seen, and a tenth more at
+        both ends: nothing that lies there can be called saturated."""
+        if recording.readings.ndim != 2 or len(recording) < 2:
+            return None
+        readings = np.asarray(recording.readings, dtype=np.float64)
+        readings = np.where(np.isfinite(readings), readings, np.nan)
+        if sensor is not None:
+            low, high = (np.broadcast_to(limit, readings.shape[1:]).astype(np.float64) for limit in sensor.limits)
+        else:
+            low, high = _range(readings)
+        shares = (readings / 2 - low / 2) / np.maximum(high / 2 - low / 2, np.finfo(np.float64).tiny)
+        levels = np.rint(np.clip(np.nan_to_num(shares), 0, 1) * (LEVELS - 1)).astype(np.uint8)
+        levels[np.isnan(readings)] = MISSING
+        levels = np.ascontiguousarray(levels.T)
+        parts = np.array_split(levels, max(1, min(STRETCHES, len(readings) // 2)), axis=1)
+        signed = (low < 0) & (high > 0) & (sensor is not None)
+        return cls(levels, low, high, channels_of(parts, signed, ordered=True))
+
+    def sensor(self, recording: Recording) -> Sensor | None:
+        """One that the readings could be of, for contacts; None where they have no rate, or numbers beyond reason."""
+        low, high = float(self.low.min()), float(self.high.max())
+        if recording.report.rate is None or max(-low, high) > LARGEST or not 1e-3 <= recording.report.rate <= 1e5:
+            return None
+        about: dict[str, Any] = {
+            "rate": float(f"{recording.report.rate:.4g}"),
+            "low": low,
+            "high": high,
+            "unit": "",
+            "duration": 4.0,
+        }
+        return Sensor(name="own-sensor", channels=len(self.levels), **about)
+
+
+def _range(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least and the most of each channel, and a tenth of what lies between beyond them; ±1 where nothing is."""
+    read = np.isfinite(readings)
+    low, high = np.where(read, readings, np.inf).min(axis=0), np.where(read, readings, -np.inf).max(axis=0)
+    low, high = np.where(read.any(axis=0), low, 0.0), np.where(read.any(axis=0), high, 0.0)
+    margin = np.where(high > low, MARGIN * high - MARGIN * low, 1.0)
+    limit = np.finfo(np.float64).max / 2
+    return np.clip(low - margin, -limit, limit), np.clip(high + margin, -limit, limit)
+
+
+def _state(recording: Recording, seen: _Seen | None, whose: Whose) -> Card:
+    if seen is None:
+        return "none", "Channels", "not looked at", "Only rows of numbers have channels that can be dead."
+    state, heading, answer, more = card_of(seen.channels, f"{len(recording)} readings")
+    unranged = "" if whose.sensor is not None else " Their range is not known: whether one is saturated is not told."
+    return state, heading, answer, more + unranged
+
+
+def _channels(seen: _Seen | None, whose: Whose) -> str:
+    if seen is None:
+        return note("Not shown: these are pictures, or too few readings.")
+    caption = (
+        "Each row is a channel, 0 at the top; time runs to the right. Dark is the least mean level that the channel "
+        "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
+    )
+    words = (
+        f"Dead: it never changes in {DEAD:.0%} of {STRETCHES} equal stretches of the recording. Drifting: its level "
+        f"moves by {DRIFTING:.0%} of the range from begin to end. "
+    )
+    if whose.sensor is None:
+        words += (
+            "The range of a channel is taken as what was seen of it and a tenth more, so that none can be called "
+            "saturated: --sensor or --preset gives the true one."
+        )
+    else:
+        words += f"Saturated: {SATURATED:.0%} of the readings lie at the end of the range, {whose.how}."
+    drawn = level_picture(seen.levels, "level of each channel over time", caption)
+    return drawn + note(words) + state_rows(seen.channels, seen.low, seen.high, "")
+
+
+def _time(recording: Recording) -> str:
+    steps = np.diff(recording.times)
+    steps = steps[np.isfinite(steps)]
+    if not len(steps):
+        return note("Not shown: its readings have no times. Give --clock, or --rate to count them.")
+    longest = float(np.quantile(steps, 0.999)) * 1e3
+    regular = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
+    high = float(regular.max()) * 1.1 if len(regular) and regular.max() > 0 else 1.0
+    counts, _ = np.histogram(regular, bins=60, range=(0, high))
+    drawn = histogram(counts.tolist(), 0, high, "ms from a reading to the next", "readings")
+    caption = (
+        "How long it takes from one reading to the next: one narrow peak is a steady clock, two are lost readings."
+    )
+    longest_first = sorted(recording.report.gaps, key=lambda gap: -gap.seconds)
+    begin = float(recording.times[0])
+    rows = [[gap.index, f"{recording.times[gap.index - 1] - begin:.3f}", gap.seconds] for gap in longest_first]
+    gaps = table(["before reading", "after (s)", "lasts (s)"], rows[:MOST_ROWS], "gaps") if rows else ""
+    more = note(f"{len(rows) - MOST_ROWS} shorter gaps are left out.") if len(rows) > MOST_ROWS else ""
+    first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > FIRST_DATE else ""
+    notes = "".join(note(text) for text in recording.report.notes)
+    return (
+        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + notes
+    )
+
+
+def _touches(recording: Recording, cut: Cutting) -> str:
+    """The touches in it, and where each begins."""
+    if not cut.touches:
+        return f"<h3>Touches</h3>{note(cut.why)}"
+    at, unit = counted_from(recording)
+    rows = []
+    for touch in cut.touches:
+        begins, lasts = float(at[touch.begin]), float(at[touch.end - 1] - at[touch.begin])
+        times = [begins, lasts] if unit == "s" else [None, None]
+        name = [touch.material or "no name"] if cut.named else []
+        rows.append([*name, touch.begin, touch.end - touch.begin, *times])
+    header = [*(["material"] if cut.named else []), "from reading", "readings", "begins (s)", "lasts (s)"]
+    names = len({str(touch.material or "no name") for touch in cut.touches})
+    listed = table(header, rows[:MOST_TOUCHES], "touches")
+    counted = f"{len(rows)} touches of {names} names" if cut.named else f"{len(rows)} touches, {cut.why}"
+    return f"<h3>Touches</h3>{note(f'{counted}.')}{listed}"
+
+
+def _holds(contents: Contents) -> str:
+    rows = [
+        [entry.topic, entry.field, " × ".join(map(str, entry.shape)) or "1", entry.count, entry.rate, entry.kind]
+        for entry in contents.entries
+    ]
+    looked = f"Rates and counts {contents.looked}." if contents.looked else "All numbers in the file."
+    return note(looked) + table(["topic", "field", "shape", "readings", "Hz", "type"], rows, "contents")

@@ -1,0 +1,108 @@
+"""A copy of a store that is in use: whole, verified and durable when it appears, or not there at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import mkdtemp
+
+from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
+from scroll_tactile_store.files import copy_regular, is_real_folder, remove_tree, replacing, same_folder
+from scroll_tactile_store.found_log import Progress
+from scroll_tactile_store.layout import (
+    CURRENT_FILE,
+    PARTIAL,
+    Current,
+    checkpoint_path,
+    log_path,
+    read_current,
+    write_current,
+)
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.row_encoding import HEAD_BYTES, ROW, row_sequence
+from scroll_tactile_store.survey import check_store
+
+__all__ = ["back_up"]
+
+LARGEST_FILE = 2**30  # of a checkpoint
+PART = 2**20  # bytes that are copied at once
+ATTEMPTS = 100  # while a writer commits one checkpoint after another
+
+
+def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
+    """Copy the store in folder `source` to the new folder `destination`, as `Store.backup`."""
+    if os.path.lexists(destination):
+        raise NotAStoreError(f"{destination} is there already; nothing was written: give the name of a new folder")
+    if any(same_folder(source, above) for above in destination.resolve().parents if above.is_dir()):
+        raise NotAStoreError(f"{destination} lies inside {source}; nothing was written: give a folder outside of it")
+    with reported(destination, "backing up a store"):
+        destination.parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(mkdtemp(prefix=f"{destination.name}.", suffix=PARTIAL, dir=destination.parent))
+        with replacing(destination, draft):
+            shutil.copymode(source, draft)
+            _copy(source, draft)
+            _verify(source, draft, progress)
+
+
+def _copy(source: Path, draft: Path) -> None:
+    """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
+    for _ in range(ATTEMPTS):
+        current, last = read_current(source / CURRENT_FILE), 0
+        try:
+            last = _copy_named(source, draft, current)
+            failure: Exception | None = None
+        except (OSError, StoreError) as error:
+            if not isinstance(error, DamageError) and not is_missing(error):
+                raise
+            failure = error
+        # A writer removes what it replaces only after `CURRENT` has ceased to name it.
+        if read_current(source / CURRENT_FILE) == current:
+            if failure is not None:
+                raise failure
+            write_current(draft, replace(current, last=max(last, current.last)))
+            return
+        for entry in draft.iterdir():
+            remove_tree(entry)
+    raise StoreError(f"{source} changed {ATTEMPTS} times while it was copied: back it up when less is written")
+
+
+def _copy_named(source: Path, draft: Path, current: Current) -> int:
+    """Copy what `current` names; return the last row of the log, or 0."""
+    last = 0
+    for named in current.checkpoints:
+        _copy_tree(checkpoint_path(source, named.number), checkpoint_path(draft, named.number))
+    # The log last: it has every row that the checkpoints contain.
+    with LogReader(log_path(source, current.log), payloads=False) as log:
+        for batch in log.refresh():
+            rows = [frame for frame in batch if frame.kind == ROW]
+            with suppress(ValueError):  # damage, which verifying the copy names
+                last = row_sequence(log.peek(rows[-1].offset, HEAD_BYTES)) if rows else last
+        with log_path(draft, current.log).open("xb") as copy:
+            for offset in range(0, log.place.offset, PART):
+                copy.write(log.bytes_at(offset, min(PART, log.place.offset - offset)))
+    return last
+
+
+def _copy_tree(source: Path, target: Path) -> None:
+    target.mkdir(parents=True)
+    if source.is_symlink():
+        raise DamageError(f"{source} is a symbolic link, where a store has a folder of its own", path=source)
+    for entry in source.iterdir():
+        if is_real_folder(entry):
+            _copy_tree(entry, target / entry.name)
+        else:
+            copy_regular(entry, target / entry.name, LARGEST_FILE)
+
+
+def _verify(source: Path, draft: Path, progress: Progress | None) -> None:
+    damaged = [problem for problem in check_store(draft, progress=progress) if problem.kind != "leftover"]
+    if damaged:
+        what = damaged[0].what.replace(str(draft), str(source))
+        raise DamageError(
+            f"a copy of {source} does not verify: {what}; no copy was kept. Check the store (check_store): it is "
+            "damaged, or else the disk of the copy cannot be trusted",
+            path=source,
+        )

@@ -1,0 +1,268 @@
+"""A checkpoint on disk: a zarr group, written whole and durable, read back whole or in part, and verified."""
+
+from __future__ import annotations
+
+import errno
+import weakref
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scroll_tactile_store.archive import Files
+from scroll_tactile_store.chunks import (
+    GROUP_VERSION,
+    LARGEST_DESCRIPTION,
+    ArrayContent,
+    ArrayFiles,
+    file_digests,
+    most_bytes,
+    read_content,
+)
+from scroll_tactile_store.encoding import array_digest
+from scroll_tactile_store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
+from scroll_tactile_store.files import remove_tree, replacing, sync_folder
+from scroll_tactile_store.layout import PARTIAL, checkpoint_path
+from scroll_tactile_store.log_file import LogFile
+from scroll_tactile_store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, LateArray, from_json, json_digest
+
+if TYPE_CHECKING:
+    import zarr
+
+__all__ = ["QUICK", "THOROUGH", "CheckpointDraft", "CheckpointReader", "write_checkpoint"]
+
+# The arrays of 800 BioTac touches, 28.5 MB, become 17.2 MB at level 3, 16.9 at level 6 in thrice the time: that is for
+# checkpoints that somebody waits for, and that stay.
+QUICK, THOROUGH = 3, 6
+
+# What a reader meets where a file is missing or is not a file; other failures of the system
+# (no permission, too many open files) say nothing against the checkpoint.
+GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
+
+
+@dataclass(frozen=True, eq=False)
+class CheckpointDraft:
+    """Checked arrays that are to become a checkpoint; `attributes` is JSON, `level` how hard to compress."""
+
+    arrays: Mapping[str, np.ndarray]
+    last_sequence: int
+    attributes: str
+    level: int
+
+
+def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity: Mapping[str, JSON]) -> str:
+    """Write a draft as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
+
+    That is its number, `last_sequence`, attributes, the store's identity, the format and, for each array, dtype, shape
+    and sha256. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError or StoreError.
+    """
+    described = {
+        name: ArrayContent(array.dtype, array.shape, array_digest(array)) for name, array in draft.arrays.items()
+    }
+    known: dict[str, Any] = {
+        "number": number,
+        "last_sequence": draft.last_sequence,
+        "attributes": from_json(draft.attributes),
+        "identity": identity,
+    }
+    final = checkpoint_path(folder, number)
+    partial = final.with_name(final.name + PARTIAL)
+    try:
+        with reported(partial, f"writing checkpoint {number}"):
+            if not final.parent.is_dir():
+                final.parent.mkdir()
+                sync_folder(folder)
+            remove_tree(partial)
+            with replacing(final, partial):
+                group = _write_zarr(partial, draft, described, draft.level)
+                if sum(content.size for content in described.values()) > most_bytes(Files(folder).sizes(partial)):
+                    # Readers make no room for so much that so little stands for: anybody could claim it.
+                    remove_tree(partial)
+                    group = _write_zarr(partial, draft, described, None)
+                known |= {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
+                digest = json_digest(known)
+                group.update_attributes(known | {"sha256": digest})
+                try:
+                    _read_attributes(partial / "zarr.json", Files(folder))
+                except (ValueError, DamageError) as error:
+                    raise RecordError(
+                        f"checkpoint {number} has more attributes than could be read again: {error}"
+                    ) from error
+    except BaseException:
+        remove_tree(final)
+        raise
+    return digest
+
+
+def _as_json(path: Path, described: Mapping[str, ArrayContent]) -> dict[str, JSON]:
+    return {
+        name: {
+            "dtype": content.dtype.str,
+            "shape": list(content.shape),
+            "sha256": content.sha256,
+            "files": file_digests(path / name, content),
+        }
+        for name, content in described.items()
+    }
+
+
+def _write_zarr(
+    path: Path, draft: CheckpointDraft, described: Mapping[str, ArrayContent], level: int | None
+) -> zarr.Group:
+    # Imported late: 300 ms that a process which reads, or only appends, need not spend.
+    import zarr
+    from zarr.codecs import ZstdCodec
+    from zarr.storage import LocalStore
+
+    group = zarr.create_group(store=LocalStore(path), zarr_format=3)
+    for name, array in draft.arrays.items():
+        content = described[name]
+        target = group.create_array(
+            name,
+            shape=content.plain_shape,
+            dtype=content.plain,
+            chunks=content.chunk,
+            compressors=None if level is None else ZstdCodec(level=level),
+            fill_value=0,
+            attributes={"dtype": array.dtype.str},
+            # A chunk that equals the fill value would have no file, nor would a lost one.
+            config={"write_empty_chunks": True},
+        )
+        target[...] = content.to_plain(array)
+    return group
+
+
+class CheckpointReader:
+    """A checkpoint of a store: how it describes itself, and its arrays, verified. path: its folder.
+
+    Every method raises DamageError that names the file or folder, the array and the checkpoint, VersionError
+    for a newer format, and StoreError for a file that cannot be read for a reason that says nothing against it.
+    """
+
+    def __init__(self, path: Path, files: Files) -> None:
+        self._path, self._files = path, files
+        known, self._described = _read_description(path, files)
+        self.number: int = known["number"]
+        self.last_sequence: int = known["last_sequence"]
+        self.sha256: str = known["sha256"]
+        self.attributes: Mapping[str, JSON] = known["attributes"]
+        self.identity: Mapping[str, JSON] = known["identity"]
+        try:
+            room = most_bytes(files.sizes(path))
+        except OSError as error:
+            raise _unreadable(error, f"checkpoint {self.number} in {path}", path) from error
+        if (size := sum(array.size for array in self._described.values())) > room:
+            raise DamageError(
+                f"checkpoint {self.number} in {path} claims arrays of {size} bytes; its files can stand for {room} at "
+                "most",
+                path=path,
+            )
+
+    def arrays(self, names: Collection[str] | None = None, but: Collection[str] = ()) -> dict[str, np.ndarray]:
+        """Return those of these arrays that it has, or all but some, verified, writable and the caller's own."""
+        chosen = self._described if names is None else [name for name in self._described if name in names]
+        return {name: self._array(name) for name in chosen if name not in but}
+
+    def late(self, names: Collection[str]) -> dict[str, LateArray]:
+        """Return those of these arrays that it has; their files are verified, and stay open until they are read."""
+        return {name: self._late(name) for name in self._described if name in names}
+
+    def _late(self, name: str) -> LateArray:
+        content, held = self._described[name], dict[Path, LogFile]()
+        with self._naming(name), ExitStack() as opened:
+            for _, path, _ in ArrayFiles(self._path, name, content, self._files.read).verified():
+                held[path] = self._files.open_log(path)
+                opened.callback(held[path].close)
+            text = self._files.read(self._path / name / "zarr.json", LARGEST_DESCRIPTION)
+
+            def read(path: Path, limit: int) -> bytes:
+                return text if path.name == "zarr.json" else held[path].read_whole(limit)
+
+            late = LateArray(content.dtype, content.shape, lambda: self._array(name, read=read))
+            weakref.finalize(late, opened.pop_all().close)
+        return late
+
+    def damage(self) -> Iterator[DamageError]:
+        """Yield what is wrong with the arrays, array by array; nothing where all verifies."""
+        for name in self._described:
+            try:
+                self._array(name, thorough=True)
+            except DamageError as damage:
+                yield damage
+
+    def _array(
+        self, name: str, *, thorough: bool = False, read: Callable[[Path, int], bytes] | None = None
+    ) -> np.ndarray:
+        content = self._described[name]
+        with self._naming(name) as (what, folder):
+            array = ArrayFiles(self._path, name, content, read or self._files.read).read()
+        # Its files were verified; what they stand for is looked at where damage is looked for.
+        if thorough and array_digest(array) != content.sha256:
+            raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
+        return array
+
+    @contextmanager
+    def _naming(self, name: str) -> Iterator[tuple[str, Path]]:
+        """Name the array in what is raised."""
+        folder = self._path / name
+        what = f"array {name!r} of checkpoint {self.number} in {folder}"
+        try:
+            yield what, folder
+        except Exception as error:
+            raise _unreadable(error, what, folder) from error
+
+
+def _read_attributes(header: Path, files: Files) -> dict[str, Any]:
+    """Return the attributes of a group; raise DamageError, ValueError where it is none, and OSError."""
+    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
+    attributes = group.get("attributes")
+    if not isinstance(attributes, dict) or (group.get("node_type"), group.get("zarr_format")) != ("group", 3):
+        raise ValueError("it describes no group of zarr's format 3")
+    return attributes
+
+
+def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
+    if isinstance(error, DamageError):
+        return DamageError(f"{what} cannot be read: {error}", path=error.path)
+    other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
+    if other or isinstance(error, MemoryError):
+        return StoreError(f"{what} could not be read: {error}")
+    return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
+
+
+def _read_description(path: Path, files: Files) -> tuple[dict[str, Any], dict[str, ArrayContent]]:
+    header = path / "zarr.json"
+    try:
+        known = _read_attributes(header, files)
+        stored = known.pop("sha256", None)
+        sound = json_digest(known) == stored
+    except Exception as error:
+        raise _unreadable(error, f"a checkpoint in {header}", header) from error
+    # Before the version, which a flipped bit can make a newer one.
+    if not sound:
+        raise DamageError(
+            f"what {header} says of its checkpoint is not what was written: its sha256 differs", path=header
+        )
+    try:
+        described = read_content(known)
+        if known["format"] > GROUP_VERSION:
+            raise VersionError(
+                f"{path} is written in format {known['format']}; this release reads checkpoints up to format "
+                f"{GROUP_VERSION}: upgrade it; nothing was changed"
+            )
+        _require_described(known)
+    except ValueError as error:
+        raise _unreadable(error, f"a checkpoint in {header}", header) from error
+    return known | {"sha256": stored}, described
+
+
+def _require_described(known: Mapping[str, Any]) -> None:
+    """Raise ValueError where a group of a known format does not say whose it is."""
+    for name, kind in {"number": int, "last_sequence": int, "attributes": dict, "identity": dict}.items():
+        if type(known.get(name)) is not kind:
+            raise ValueError(f"its {name} is {str(known.get(name))[:80]!r}")
+    if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["last_sequence"] <= LARGEST_NUMBER):
+        raise ValueError(f"its number is {known['number']}, its last_sequence {known['last_sequence']}")

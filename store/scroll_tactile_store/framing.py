@@ -1,0 +1,92 @@
+"""The frames of a log: their bytes, and whether they are as they were written (FORMAT.md describes them)."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+from scroll_tactile_store.records import payload_digest
+
+__all__ = [
+    "COMMIT",
+    "FRAME_BYTES",
+    "HEADER",
+    "IDENTITY_BYTES",
+    "LARGEST_PAYLOAD",
+    "MARK",
+    "NO_CHECKSUM",
+    "VERSION",
+    "Frame",
+    "pack_frame",
+    "read_frame",
+]
+
+# As PNG's: not text, and changed by whatever changes the ends of lines.
+MAGIC, VERSION = b"\x89ARLOG", 1
+MARK = MAGIC + bytes([VERSION]) + b"\n"
+IDENTITY_BYTES = 8
+
+# mark, the log's identity, number, number of the batch's first frame, kind, size of the payload, checksum of the frame
+# before, digest of the payload; behind them the checksum of all these.
+FIELDS = struct.Struct("<8s8sQQII16s16s")
+CHECKSUM_BYTES = 16
+FRAME_BYTES = FIELDS.size + CHECKSUM_BYTES
+NO_CHECKSUM = bytes(CHECKSUM_BYTES)  # of the frame before the first
+
+HEADER, COMMIT = 0, 1
+
+# A row's arrays, 256 MiB and their descriptions, and 64 Mi characters of attributes fit.
+LARGEST_PAYLOAD = 2**28 + 2**27
+
+
+class Frame(NamedTuple):
+    """A frame as its own first bytes describe it, and the offset in the file at which it was found.
+
+    `batch` is the number of the first frame of its batch, `size` that of its payload in bytes.
+    """
+
+    offset: int
+    version: int
+    identity: bytes
+    number: int
+    batch: int
+    kind: int
+    size: int
+    previous: bytes
+    digest: bytes
+    checksum: bytes
+
+    @property
+    def payload_offset(self) -> int:
+        """Where its payload begins."""
+        return self.offset + FRAME_BYTES
+
+    @property
+    def end(self) -> int:
+        """Where the next frame begins."""
+        return self.offset + FRAME_BYTES + self.size
+
+
+def pack_frame(
+    identity: bytes, offset: int, number: int, batch: int, kind: int, payload: bytes, previous: bytes
+) -> tuple[bytes, Frame]:
+    """Return the bytes of a frame for this offset, and the frame; `previous` is the checksum of the one before it."""
+    digest = payload_digest(payload)
+    fields = FIELDS.pack(MARK, identity, number, batch, kind, len(payload), previous, digest)
+    checksum = payload_digest(fields)
+    frame = Frame(offset, VERSION, identity, number, batch, kind, len(payload), previous, digest, checksum)
+    return b"".join((fields, checksum, payload)), frame
+
+
+def read_frame(data: bytes, offset: int) -> Frame | None:
+    """Return the frame that `data`, found at `offset` of a file, begins with; None where its checksum fails.
+
+    The payload is not looked at, and may be of any size. A later version keeps these bytes in the first frame.
+    """
+    if len(data) < FRAME_BYTES or not data.startswith(MAGIC):
+        return None
+    mark, identity, number, batch, kind, size, previous, digest = FIELDS.unpack_from(data)
+    checksum = data[FIELDS.size : FRAME_BYTES]
+    if payload_digest(data[: FIELDS.size]) != checksum or mark[-1:] != b"\n":
+        return None
+    return Frame(offset, mark[-2], identity, number, batch, kind, size, previous, digest, checksum)

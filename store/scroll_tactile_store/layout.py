@@ -1,0 +1,341 @@
+"""What a store's folder holds, by name, and `CURRENT`: the one file whose rename commits a log and its checkpoints."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import stat
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
+from scroll_tactile_store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
+from scroll_tactile_store.framing import IDENTITY_BYTES
+from scroll_tactile_store.log import LogPlace, LogReader
+from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
+
+__all__ = [
+    "CHECKPOINTS",
+    "CURRENT_FILE",
+    "DAMAGED",
+    "DERIVED",
+    "HOLDER_FILE",
+    "LOCK_FILE",
+    "LOG",
+    "PARTIAL",
+    "Current",
+    "NamedCheckpoint",
+    "checkpoint_path",
+    "holds_store",
+    "is_number",
+    "log_numbers",
+    "log_path",
+    "numbers",
+    "read_current",
+    "remove_unnamed",
+    "require_unshared",
+    "unsafe_entries",
+    "write_current",
+]
+
+FORMAT_VERSION = 1
+CURRENT_FILE = "CURRENT"
+LOG = "log-"
+CHECKPOINTS = "checkpoints"
+DERIVED = "derived"  # what follows from the rest, and can be deleted
+PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
+LOCK_FILE, HOLDER_FILE = "lock", "holder.json"
+LEGACY_FILE = "journal.sqlite"  # of releases 0.x
+OURS = (LOG, CURRENT_FILE, HOLDER_FILE)  # how the names of files begin
+
+LARGEST_CURRENT = 2**16  # bytes, of which it has some hundreds
+MOST_DIGITS = 18  # of a number in a name, so that there is room for those after it
+
+HEX = re.compile(r"[0-9a-f]*")
+
+
+@dataclass(frozen=True)
+class NamedCheckpoint:
+    """A checkpoint as `CURRENT` names it.
+
+    last_sequence: the last row that it contains. sha256: what its own description has, so that no other can take its
+    place. place: in the log, behind all rows up to `last_sequence`, so that reading can go on from there.
+    """
+
+    number: int
+    last_sequence: int
+    sha256: str
+    place: LogPlace
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what is written."""
+        place = [self.place.offset, self.place.number, self.place.previous.hex()]
+        return {"number": self.number, "last_sequence": self.last_sequence, "sha256": self.sha256, "place": place}
+
+    @classmethod
+    def from_json(cls, found: Any) -> Self:
+        """Return what `to_json` wrote; raise ValueError, TypeError or KeyError for anything else."""
+        offset, number, previous = found["place"]
+        place = LogPlace(_count(offset), _count(number), _count(number), _hex(previous, 16))
+        return cls(_count(found["number"]), _count(found["last_sequence"]), _hex(found["sha256"], 32).hex(), place)
+
+
+@dataclass(frozen=True)
+class Current:
+    """What makes up a store at one moment.
+
+    log: the number of the log, and log_identity what all frames of it carry. newest: the checkpoint to begin with.
+    compaction: the one that stands for rows that gave up their arrays; it may be the same. None where there is none.
+    last: a row that the log has had; one that ends before it was cut off. 0 where nothing is known.
+    """
+
+    log: int
+    log_identity: bytes
+    newest: NamedCheckpoint | None = None
+    compaction: NamedCheckpoint | None = None
+    last: int = 0
+
+    @property
+    def checkpoints(self) -> list[NamedCheckpoint]:
+        """The newest and the compaction checkpoint, each once."""
+        named = [named for named in (self.newest, self.compaction) if named is not None]
+        return named[:1] if len(named) > 1 and named[0].number == named[1].number else named
+
+    @property
+    def compacted(self) -> int:
+        """The last row that gave up its arrays for the compaction checkpoint, 0 without one."""
+        return 0 if self.compaction is None else self.compaction.last_sequence
+
+    def to_bytes(self) -> bytes:
+        """Return the bytes of the file."""
+        known: dict[str, Any] = {
+            "format": FORMAT_VERSION,
+            "log": [self.log, self.log_identity.hex()],
+            "newest": None if self.newest is None else self.newest.to_json(),
+            "compaction": None if self.compaction is None else self.compaction.to_json(),
+            "last": self.last,
+        }
+        return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
+
+    @classmethod
+    def from_bytes(cls, data: bytes, path: Path) -> Self:
+        """Return what `to_bytes` wrote. Raises VersionError for a newer format, DamageError for anything else."""
+        try:
+            known: dict[str, Any] = dict(from_json(data.decode("ascii")))
+            if known.pop("sha256", None) != json_digest(known):
+                raise ValueError("its sha256 differs")
+            if _count(known["format"]) > FORMAT_VERSION:
+                raise VersionError(
+                    f"{path} is written in format {known['format']}; this release reads format {FORMAT_VERSION}: "
+                    "upgrade it, or open the store with the release that wrote it; nothing was changed"
+                )
+            if "base" in known:
+                raise VersionError(
+                    f"{path} was written by a release from 0.8 to 0.10, which this one does not read: learn it again, "
+                    "or open it with that release; nothing was changed"
+                )
+            number, identity = known["log"]
+            newest, compaction = (
+                None if known[name] is None else NamedCheckpoint.from_json(known[name])
+                for name in ("newest", "compaction")
+            )
+            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
+                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
+            last = _count(known.get("last", 0))
+            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, last)
+        except (KeyError, TypeError, ValueError) as error:
+            raise _not_as_written(path, error) from error
+
+
+def _not_as_written(path: Path, error: Exception) -> DamageError:
+    return DamageError(
+        f"{path} is not as it was written ({error}): repair the store (repair_store), which finds the log and the "
+        "checkpoints by themselves",
+        path=path,
+    )
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int or not 0 <= value <= LARGEST_NUMBER:
+        raise ValueError(f"{str(value)[:80]!r} is no number")
+    return value
+
+
+def _hex(text: Any, size: int) -> bytes:
+    if not isinstance(text, str) or len(text) != 2 * size or not HEX.fullmatch(text):
+        raise ValueError(f"{str(text)[:80]!r} is not {size} bytes in hexadecimal")
+    return bytes.fromhex(text)
+
+
+def read_current(path: Path, read: Callable[[Path, int], bytes] = read_regular) -> Current:
+    """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
+    try:
+        data = read(path, LARGEST_CURRENT)
+    except DamageError as error:
+        raise _not_as_written(path, error) from error
+    return Current.from_bytes(data, path)
+
+
+def write_current(folder: Path, current: Current) -> None:
+    """Commit: put `CURRENT` in the place of the one before, durably. Raises OSError; it may then be there all the same.
+
+    Everything that it names has to be durable.
+    """
+    draft = folder / (CURRENT_FILE + NEW)
+    with replacing(folder / CURRENT_FILE, draft), new_file(draft) as file:
+        file.write(current.to_bytes())
+
+
+def log_path(folder: Path, number: int) -> Path:
+    """Return where the log of this number lies."""
+    return folder / f"{LOG}{number:08d}"
+
+
+def checkpoint_path(folder: Path, number: int) -> Path:
+    """Return the folder of the checkpoint of this number: eight digits, or more when it needs them."""
+    return folder / CHECKPOINTS / f"{number:08d}"
+
+
+def is_number(stem: str) -> bool:
+    """Return whether part of a name is a number that leaves room for those after it."""
+    return stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS
+
+
+def log_numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
+    """Return the numbers of the logs in a store's folder, ascending; finished ones unless told otherwise."""
+    stems = (entry.name.removeprefix(LOG) for entry in folder.iterdir() if entry.name.startswith(LOG))
+    return _numbers(stems, NEW if unfinished else "")
+
+
+def numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
+    """Return the numbers of the checkpoints in a store's folder, ascending; finished ones unless told otherwise."""
+    parent = folder / CHECKPOINTS
+    entries = parent.iterdir() if is_real_folder(parent) else ()
+    return _numbers((entry.name for entry in entries), PARTIAL if unfinished else "")
+
+
+def _numbers(names: Iterable[str], suffix: str) -> list[int]:
+    stems = {name.removesuffix(suffix) for name in names}
+    return sorted({int(stem) for stem in stems if is_number(stem)})
+
+
+def holds_store(folder: Path) -> bool:
+    """Return whether `folder` holds a store that this release reads; False when one may be made there.
+
+    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for a newer
+    format or one of 0.x, and DamageError where `CURRENT` is damaged, or gone while what it named is still there.
+    """
+    with reported(folder, "looking for a store"):
+        if not folder.exists():
+            return False
+        if not folder.is_dir():
+            raise NotAStoreError(f"{folder} is a file; a store is a folder")
+        for error in unsafe_entries(folder):
+            raise error
+        try:
+            read_current(folder / CURRENT_FILE)
+            return True
+        except FileNotFoundError:
+            return _was_made_since(folder)
+
+
+def _was_made_since(folder: Path) -> bool:
+    """Return whether another process made the store meanwhile; raise where something else is in the folder."""
+    if (folder / LEGACY_FILE).exists():
+        raise VersionError(
+            f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
+            "recordings, or keep that release to read it"
+        )
+    traces = [CHECKPOINTS] if numbers(folder) else []
+    # The first log is made before `CURRENT`: a writer may have died in between.
+    traces += [log_path(folder, number).name for number in log_numbers(folder) if number > 1 or _has_batches(folder)]
+    traces += [entry.name for entry in folder.iterdir() if DAMAGED in entry.name]
+    if os.path.lexists(folder / CURRENT_FILE):
+        return True
+    if traces:
+        raise DamageError(
+            f"{folder} has {' and '.join(sorted(traces))} but no {CURRENT_FILE}: put it back from a copy, or repair "
+            "the store (repair_store), which finds what it named",
+            path=folder / CURRENT_FILE,
+        )
+    ours = (LOCK_FILE, CHECKPOINTS, DERIVED)
+    names = sorted(entry.name for entry in folder.iterdir())
+    if foreign := [name for name in names if not name.startswith(OURS) and name not in ours]:
+        raise NotAStoreError(
+            f"{folder} holds no store but other things ({', '.join(foreign[:3])}"
+            f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
+        )
+    return os.path.lexists(folder / CURRENT_FILE)
+
+
+def _has_batches(folder: Path) -> bool:
+    """Whether more than its first frame was ever written to the first log."""
+    try:
+        with LogReader(log_path(folder, 1)) as log:
+            return any(True for _ in log.refresh())
+    except DamageError:
+        return True
+
+
+def unsafe_entries(folder: Path) -> Iterator[DamageError]:
+    """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
+
+    A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never
+    end. Raises OSError.
+    """
+    for path, is_ours in _named_as_ours(folder):
+        if not is_ours and os.path.lexists(path):
+            what = "a symbolic link" if path.is_symlink() else "no regular file or folder"
+            yield DamageError(
+                f"{path} is {what}, where a store has a file or folder of its own: nothing was read through it. Put "
+                "what belongs there in its place; in a folder that comes from elsewhere trust nothing",
+                path=path,
+            )
+
+
+def require_unshared(folder: Path) -> None:
+    """Raise DamageError where a file that is written in place has another name: writing would change that too."""
+    with reported(folder, "looking for what may be written"):
+        for path, is_ours in _named_as_ours(folder) if folder.is_dir() else ():
+            try:
+                status = path.lstat()
+            except FileNotFoundError:  # another process may have written it and moved it
+                continue
+            if is_ours and path.parent == folder and stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
+                raise DamageError(
+                    f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
+                    'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
+                    path=path,
+                )
+
+
+def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name in (CHECKPOINTS, DERIVED):
+                yield Path(entry.path), entry.is_dir(follow_symlinks=False)
+            elif entry.name.startswith(OURS) or entry.name == LOCK_FILE:
+                yield Path(entry.path), entry.is_file(follow_symlinks=False)
+    if is_real_folder(folder / CHECKPOINTS):
+        with os.scandir(folder / CHECKPOINTS) as entries:
+            for entry in entries:
+                if is_number(entry.name.removesuffix(PARTIAL)):
+                    yield Path(entry.path), entry.is_dir(follow_symlinks=False)
+
+
+def remove_unnamed(folder: Path, current: Current) -> None:
+    """Remove logs and checkpoints, finished or not, that `current` does not name; what cannot be removed stays.
+
+    What does not carry a name of ours is left alone.
+    """
+    kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
+    found = [(log_path(folder, number), NEW) for number in log_numbers(folder, unfinished=True)]
+    found += [(checkpoint_path(folder, number), PARTIAL) for number in numbers(folder, unfinished=True)]
+    remove_tree(folder / (CURRENT_FILE + NEW))
+    for path, suffix in found:
+        if path not in kept:
+            remove_tree(path)
+        remove_tree(path.with_name(path.name + suffix))

@@ -1,0 +1,158 @@
+"""A touch under two names, in fleets: the first name counts, by the order of the sources and not of the workers."""
+
+import itertools
+import random
+
+import numpy as np
+import pytest
+from scroll_tactile_store import StoreFullError
+from test_fleet import BY_FOLDER, TOUCHES, full, memory_of, run, touch_files
+from touches import SETTINGS, SmallSample, require_same, stream
+
+import scroll_tactile.memory.state
+from examples.benchmarks.fleet import DyingExecutor
+from scroll_tactile import TactileLearner
+from scroll_tactile.clients.learning import learning
+from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.learning.sources import find_sources
+from scroll_tactile.clients.learning.workers import steps
+
+__all__ = ["full"]  # a fixture
+
+# Of the first touches twelve come once more, half of them under another name.
+TWICE = [*TOUCHES, *((name, touch) for name, touch in TOUCHES[:6]), *(("z", touch) for _, touch in TOUCHES[3:9])]
+
+
+class Shuffled(DyingExecutor):
+    """Answers in another order than it was asked."""
+
+    def __init__(self, seed):
+        super().__init__(0.3, seed)
+        self._max_workers = 4
+
+
+def seen(learner):
+    rows = [row for row in learner.observations() if row.state != "retracted"]
+    return [(row.material, row.key, row.source) for row in rows]
+
+
+def by_one_process(path, sources):
+    """What `learn` makes of sources: rows in order, digest, what was skipped and what was refused."""
+    with TactileLearner.open(path, **SETTINGS) as learner:
+        done = learning.learn_sources(learner, find_sources(list(map(str, sources)))[0], BY_FOLDER)
+        refused = [(each.source, each.why) for each in done.refused]
+        return seen(learner), learner.digest(), done.skipped, refused
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path, seed, monkeypatch):
+    monkeypatch.setattr(scroll_tactile.memory.state, "TouchSample", SmallSample)
+    draw = random.Random(seed)
+    touches = draw.sample(TWICE, len(TWICE))
+    paths = touch_files(tmp_path / "in", touches)
+    draw.shuffle(paths)
+    monkeypatch.setattr(steps, "MOST_SOURCES", draw.randrange(1, 5))
+    monkeypatch.setattr(steps, "MOST_TRIES", 50)
+    if seed < 3:
+        done = run(tmp_path / "m", paths, client=Shuffled(seed))
+    else:
+        done = learn(tmp_path / "m", paths, BY_FOLDER, workers=1, **SETTINGS)
+    rows, digest, skipped, refused = by_one_process(tmp_path / "one", paths)
+    assert done.digest == digest and done.repeated == skipped
+    assert [(each.source, each.why) for each in done.refused] == refused and len(refused) > 2
+    with TactileLearner.open(tmp_path / "m") as learner, TactileLearner.open(tmp_path / "one") as one:
+        assert seen(learner) == rows
+        held = [(name, key, t.rows.tobytes(), t.copies) for name, key, t in learner.memory.sample]
+        assert held == [(name, key, t.rows.tobytes(), t.copies) for name, key, t in one.memory.sample]
+        assert learner.exemplars == one.exemplars
+
+
+def test_the_first_source_counts_also_where_its_worker_is_last(tmp_path, monkeypatch):
+    a, b = touch_files(tmp_path / "in", [("a", (0, 60)), ("b", (0, 60))])
+    monkeypatch.setattr(steps, "MOST_SOURCES", 1)
+    for number, sources in enumerate(itertools.permutations([a, b])):
+        for late in (a, b):
+
+            class Late(DyingExecutor):
+                """Gives up one source the first times: it comes last."""
+
+                tries = 0
+
+                def submit(self, what, job, late=late):
+                    if str(late) in getattr(job, "sources", ()) and self.tries < 3:
+                        self.tries += 1
+                        job = None
+                    return super().submit(what, job)
+
+            done = run(tmp_path / f"m {number} {late.name}", sources, client=Late())
+            (refused,) = done.refused
+            first, second = (path.parent.name for path in sources)
+            assert refused.source == str(sources[1])
+            assert f"has this touch already, as {first!r} and not as {second!r}" in refused.why
+            assert (done.observations, done.repeated) == (1, 0)
+
+
+def test_a_destination_that_has_it_under_another_name_comes_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(steps, "JOBS_A_WORKER", 1)  # several sources a job
+    before = [("x", TOUCHES[4][1]), TOUCHES[5]]
+    paths = touch_files(tmp_path / "in", TOUCHES)
+    memory_of(tmp_path / "m", before)
+    for _ in range(2):  # and says so again
+        done = run(tmp_path / "m", [tmp_path / "in"], add=True)
+        (refused,) = done.refused
+        assert refused.source == str(paths[4]) and "as 'x' and not as 'b'" in refused.why
+    assert done.observations == 0
+    with TactileLearner.open(tmp_path / "m") as learner:
+        require_same(learner, [pair for pair in TOUCHES if pair != TOUCHES[4]] + before[:1])
+        (row,) = (row for row in learner.observations() if row.material == "x")
+        learner.relabel(row.sequence, "b")
+    assert run(tmp_path / "m", [tmp_path / "in"]).refused == []
+
+
+def test_a_run_that_was_cut_short_and_goes_on_with_other_sources_takes_the_same(tmp_path, monkeypatch, full):
+    paths = touch_files(tmp_path / "in", TWICE)
+    monkeypatch.setattr(steps, "MOST_SOURCES", 3)
+    full(0)
+    for some in (paths[3:14:2], paths[::-1]):
+        with pytest.raises(StoreFullError):
+            run(tmp_path / "m", some)
+    full(None)
+    done = run(tmp_path / "m", paths)
+    rows, digest, skipped, refused = by_one_process(tmp_path / "one", paths)
+    assert (done.digest, done.repeated, len(done.refused)) == (digest, skipped, len(refused))
+    with TactileLearner.open(tmp_path / "m") as learner:
+        assert seen(learner) == rows
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_run_that_was_cut_short_goes_on_with_its_sources_in_another_order(tmp_path, seed, monkeypatch, full):
+    # Each of the two jobs has both copies of a touch; the one that its partial has no row of may come first now.
+    x, y, z = TOUCHES[:3]
+    paths = touch_files(tmp_path / "in", [x, y, x, z, ("d", x[1]), TOUCHES[3], x, TOUCHES[3]])
+    monkeypatch.setattr(steps, "MOST_SOURCES", 4)
+    monkeypatch.setattr(steps, "JOBS_A_WORKER", 1)
+    full(0)
+    with pytest.raises(StoreFullError):
+        run(tmp_path / "m", paths, workers=1)
+    full(None)
+    order = paths[::-1] if seed == 0 else random.Random(seed).sample(paths, len(paths))
+    done = run(tmp_path / "m", order, workers=1)
+    _, digest, skipped, refused = by_one_process(tmp_path / "one", order)
+    assert (done.digest, done.held + done.repeated + len(done.refused), done.repeated) == (digest, 8, skipped)
+    assert [(each.source, each.why) for each in done.refused] == refused
+
+
+def test_memories_are_refused_touch_by_touch_where_they_have_rows_and_whole_where_not(tmp_path):
+    touch_files(tmp_path / "in", TOUCHES[:4])
+    for name, rows in (("rows", True), ("sums", False)):
+        with TactileLearner.open(tmp_path / f"{name}.memory", **SETTINGS) as learner:
+            learner.observe("z", stream(TOUCHES[3][1]).astype(np.float32), source="robot 7")
+            learner.observe("z", stream((90 + rows, 60)).astype(np.float32))
+            learner.pack(tmp_path / name, rows=rows)
+    for _ in range(2):  # and says so again
+        done = run(tmp_path / "m", [tmp_path / "in", tmp_path / "rows", tmp_path / "sums"])
+        assert [each.source for each in done.refused] == ["robot 7", str(tmp_path / "sums")]
+    assert all("as 'a' and not as 'z'" in each.why for each in done.refused)
+    assert "none of them can be left out" in done.refused[1].why
+    with TactileLearner.open(tmp_path / "m") as learner:
+        assert learner.materials == {"a": 2, "b": 1, "c": 1, "z": 1}

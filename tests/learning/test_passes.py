@@ -1,0 +1,125 @@
+"""Metrics, passes, notes of runs and the demonstration, on simulated touches."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from scroll_tactile import sensors
+from scroll_tactile.clients.learning.classification import missing
+from scroll_tactile.clients.learning.demo import Demo, pull_the_plug
+from scroll_tactile.clients.learning.metrics import accuracy, calibration_error, confusion_counts, mean_and_spread
+from scroll_tactile.clients.learning.runfile import RunFile
+from scroll_tactile.errors import InputError
+from scroll_tactile.simulation.scene import Scene
+
+
+class TestMetrics:
+    def test_accuracy_is_the_share_of_right_answers(self) -> None:
+        assert accuracy(["a", "b", "c", "d"], ["a", "b", "c", None]) == 0.75
+
+    def test_calibration_error_of_a_case_worked_by_hand(self) -> None:
+        # Two bins, half right each: 0.25 and 0.5 in (0, ½], |0.5 − 0.375|; 0.75 and 1 in (½, 1], |0.5 − 0.875|.
+        error = calibration_error([0.25, 0.5, 0.75, 1.0], [1, 0, 1, 0], bins=2)
+        assert error == pytest.approx((2 * 0.125 + 2 * 0.375) / 4)
+
+    def test_certain_and_right_is_calibrated_and_zero_has_a_bin(self) -> None:
+        assert calibration_error([1.0, 1.0], [1, 1]) == 0.0
+        assert calibration_error([0.0], [0]) == 0.0
+
+    def test_confusions_are_counted_beside_the_right_answers(self) -> None:
+        counts = confusion_counts(["a", "b", "c"], [4, 3, 1], [("a", "b", 1), ("b", "c", 2)])
+        assert counts.tolist() == [[3, 1, 0], [0, 1, 2], [0, 0, 1]]
+
+    def test_mean_and_spread(self) -> None:
+        assert mean_and_spread([1.0, 3.0]) == (2.0, pytest.approx(math.sqrt(2)))
+        assert mean_and_spread([0.5]) == (0.5, 0.0)
+
+    def test_nothing_to_measure_is_refused(self) -> None:
+        for call in (lambda: accuracy([], []), lambda: calibration_error([0.5], [])):
+            with pytest.raises(InputError):
+                call()
+        with pytest.raises(InputError, match="probabilities"):
+            calibration_error([1.5], [1])
+
+
+TOUCHES = [(name, Scene(sensors.BIOTAC).touch(name, i)) for name in ("silk", "wool") for i in range(3)]
+
+
+class TestMissing:
+    def test_the_first_few_of_every_material_are_there(self) -> None:
+        assert missing(TOUCHES, {"silk": 3, "wool": 1}) == TOUCHES[4:]
+        assert missing(TOUCHES, {}) == TOUCHES
+
+    def test_a_memory_of_something_else_is_refused(self) -> None:
+        with pytest.raises(InputError, match="'oak': 1"):
+            missing(TOUCHES, {"oak": 1})
+        with pytest.raises(InputError, match="'silk': 4"):
+            missing(TOUCHES, {"silk": 4})
+
+
+class TestRunFile:
+    def test_notes_come_back(self, tmp_path: Path) -> None:
+        RunFile(tmp_path / "run" / "notes.json", {"seed": 0}).note("a", [1, 2])
+        again = RunFile(tmp_path / "run" / "notes.json", {"seed": 0})
+        assert again.notes == {"a": [1, 2]}
+
+    def test_a_link_in_the_place_of_the_draft_is_not_followed(self, tmp_path):
+        record, others = tmp_path / "run" / "notes.json", tmp_path / "others"
+        others.write_text("theirs")
+        RunFile(record, {"seed": 0})
+        record.with_name("notes.json.new").symlink_to(others)
+        RunFile(record, {"seed": 0}).note("a", 1)
+        assert others.read_text() == "theirs" and RunFile(record, {"seed": 0}).notes["a"] == 1
+
+    def test_another_run_is_refused_by_what_differs(self, tmp_path: Path) -> None:
+        RunFile(tmp_path / "notes.json", {"seed": 0, "kind": "x"})
+        with pytest.raises(InputError, match="seed 0 there, 1 here"):
+            RunFile(tmp_path / "notes.json", {"seed": 1, "kind": "x"})
+
+    def test_other_things_in_the_folder_are_left_alone(self, tmp_path: Path) -> None:
+        (tmp_path / "thesis.txt").write_text("mine")
+        with pytest.raises(InputError, match="empty folder"):
+            RunFile(tmp_path / "notes.json", {})
+        assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+    @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 9, "plan": {}, "notes": {}}', "\x00"])
+    def test_damaged_notes_are_refused(self, tmp_path: Path, text: str) -> None:
+        (tmp_path / "notes.json").write_text(text)
+        with pytest.raises(InputError, match="notes"):
+            RunFile(tmp_path / "notes.json", {})
+
+
+SMALL = {"materials": 4, "touches": 3, "held_out": 2, "features": 64}
+
+
+class TestDemo:
+    def test_an_interrupted_demo_goes_on_to_the_same_memory(self, tmp_path: Path) -> None:
+        whole = Demo(sensors.BIOTAC, **SMALL).run()
+        assert whole.observed == 12
+        seen = []
+
+        def stop(step: object) -> None:
+            seen.append(step)
+            if len(seen) == 2:
+                raise KeyboardInterrupt
+
+        task = Demo(sensors.BIOTAC, **SMALL, folder=tmp_path / "kept")
+        with pytest.raises(KeyboardInterrupt):
+            task.run(stop)
+        resumed = task.run()
+        assert (resumed.observed, resumed.digest, resumed.half) == (6, whole.digest, whole.half)
+        assert resumed.answers == whole.answers
+        again = task.run()
+        assert (again.observed, again.digest, again.answers, again.half) == (0, whole.digest, whole.answers, whole.half)
+
+    def test_what_is_new_is_shown(self) -> None:
+        outcome = Demo(sensors.BIOTAC, materials=8, touches=5, held_out=2, features=64).run()
+        assert (outcome.half.tested, outcome.first) == (8, 8)
+        assert outcome.half.unknown >= 6 and outcome.half.right == 1.0 and outcome.still_right == 1.0
+        outcome.answers.predictions[:2] = outcome.answers.predictions[-2:]  # what was said to the last, to the first
+        assert outcome.still_right == 0.75  # forgetting would be seen
+
+    def test_a_process_that_is_killed_loses_nothing_that_it_acknowledged(self) -> None:
+        found = pull_the_plug(sensors.ROBOSKIN, 3)
+        assert found.acknowledged == 5 <= found.found and found.same

@@ -12,8 +12,6 @@ if typing.TYPE_CHECKING:
     from scroll_tactile import errors, recordings, sensors
     from scroll_tactile.clients.firmware.c_files import write_firmware
     from scroll_tactile.clients.firmware.exported_judge import ExportedAnswer, ExportedJudge
-    from scroll_tactile.clients.learning.annotating.annotation_run import Annotated, annotate
-    from scroll_tactile.clients.learning.annotating.answer_log import AnswerLog
     from scroll_tactile.clients.learning.fleet import FleetReport, learn
     from scroll_tactile.clients.learning.sources import SourceOptions
     from scroll_tactile.embeddings.frames import Frames
@@ -49,8 +47,6 @@ if typing.TYPE_CHECKING:
 
 __all__ = [
     "Adaptation",
-    "Annotated",
-    "AnswerLog",
     "Augmented",
     "Candidates",
     "Capabilities",
@@ -84,7 +80,6 @@ __all__ = [
     "TactileLearner",
     "Vision",
     "__version__",
-    "annotate",
     "check_embedding",
     "check_learner",
     "errors",
@@ -99,8 +94,6 @@ __version__ = "0.15.0"
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
     "Adaptation": "results",
-    "Annotated": "clients.learning.annotating.annotation_run",
-    "AnswerLog": "clients.learning.annotating.answer_log",
     "Augmented": "signals.copies",
     "Candidates": "results",
     "Capabilities": "embeddings.protocol",
@@ -133,7 +126,6 @@ _MODULES = {
     "Stream": "signals.stream",
     "TactileLearner": "learner",
     "Vision": "embeddings.vision",
-    "annotate": "clients.learning.annotating.annotation_run",
     "check_embedding": "testing.embedding_checks",
     "check_learner": "testing.learner_checks",
     "learn": "clients.learning.fleet",

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.answers import LiveReport
 
-__all__ = ["GAP", "Clock", "ClockPart"]
+__all__ = ["Clock", "ClockPart"]
 
 Rows = npt.NDArray[Any]
 

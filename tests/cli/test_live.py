@@ -108,18 +108,6 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
         list(replay._rows(replay.Path("-")))
 
 
-@pytest.mark.parametrize("option", ["--mcap", "--rerun"])
-def test_what_cannot_be_replayed_leaves_no_file(memory, tmp_path, option):
-    written = tmp_path / {"--mcap": "out.mcap", "--rerun": "out.rrd"}[option]
-    np.save(tmp_path / "narrow.npy", np.zeros((5, 3)))
-    for words in (("nothing.npy",), ("narrow.npy",), (memory / "silk.npy", "--columns", "58:70")):
-        refused("live", memory / "memory", tmp_path / words[0], *words[1:], option, written)
-        assert not written.exists()
-    assert run("live", memory / "memory", memory / "silk.npy", "--touch", option, written).exit_code == 0
-    assert written.stat().st_size
-    assert "already" in refused("live", memory / "memory", memory / "silk.npy", "--touch", option, written)
-
-
 @pytest.mark.parametrize("option", ["--topic", "--field", "--preset", "--clock"])
 def test_lines_have_no_topics_fields_or_clocks(memory, option):
     line = refused("live", memory / "memory", "-", option, "biotac")

@@ -11,11 +11,8 @@ from made import RNG, TIP, lerobot
 from scroll_tactile import Quantity, Sensor, TactileLearner
 from scroll_tactile.clients.learning.learning import learn_sources
 from scroll_tactile.clients.learning.sources import SourceOptions
-from scroll_tactile.errors import FieldError, InputError, RecordingError
+from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.recordings import read, resampled
-from scroll_tactile.recordings.arrays.lerobot import LeRobot
-from scroll_tactile.recordings.arrays.rowgroups import row_groups
-from scroll_tactile.recordings.blocks import Request
 from scroll_tactile.recordings.headings import Heading
 
 EPISODE = np.repeat([0, 1, 2], 10)
@@ -114,23 +111,6 @@ def test_other_recordings_have_no_such_columns_and_none_is_resampled(data, tmp_p
         read(tmp_path / "a.npy", annotate=[SLIP])
     with pytest.raises(InputError, match="take resample=, or annotate="):
         resampled(read(data, field="tip", annotate=[SLIP]), 50)
-
-
-@pytest.mark.parametrize(
-    ("kind", "value", "said"),
-    [
-        (pa.map_(pa.string(), pa.string()), [("a", "b")], r"holds texts as map<string, string"),
-        (pa.list_(pa.map_(pa.string(), pa.int64())), [[("a", 1)]], r"holds texts as map<string, int64"),
-        (pa.string_view(), "a", "holds texts as string_view"),
-        (pa.list_(pa.binary_view()), [b"a"], "holds texts as binary_view"),
-    ],
-)
-def test_texts_that_cannot_be_written_again_are_refused_in_words(tmp_path, kind, value, said):
-    path = lerobot(tmp_path / "s", notes=("string", pa.array([value] * 30, kind)))
-    source = LeRobot(path, str(path), Request(field="observation.tactile.tip"))
-    with pytest.raises(RecordingError, match=rf"column 'observation\.notes.* {said}.*leave it out, or write it as"):
-        next(row_groups(source, source.files()[0]))
-    assert read(path, field="observation.tactile.tip").readings.shape == TIP.shape
 
 
 @pytest.mark.parametrize("kind", [pa.list_(pa.string()), pa.list_(pa.string(), 1), pa.map_(pa.string(), pa.string())])

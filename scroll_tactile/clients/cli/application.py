@@ -8,7 +8,6 @@ import typer
 
 from scroll_tactile import __version__, native
 from scroll_tactile.clients.cli.adapting import adapt
-from scroll_tactile.clients.cli.annotating import annotate
 from scroll_tactile.clients.cli.bulk import evaluate, fleet, learn
 from scroll_tactile.clients.cli.everyday import compose, describe, inspect, observe, predict
 from scroll_tactile.clients.cli.replay import live
@@ -44,7 +43,7 @@ def main(
     """Take the options that belong to no command."""
 
 
-COMMANDS = (demo, observe, learn, fleet, predict, evaluate, annotate, live, inspect, describe, compose, report, mcp)
+COMMANDS = (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report, mcp)
 for command in COMMANDS:
     app.command()(command)
 app.command(context_settings=PASSED_ON)(ros2)

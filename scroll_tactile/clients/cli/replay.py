@@ -1,4 +1,4 @@
-"""`scroll-tactile live`: answers as they grow, shown, or written beside what a robot recorded."""
+"""`scroll-tactile live`: answers as they grow."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import io
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from itertools import chain, islice
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,12 +31,9 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from scroll_tactile.clients.learning.annotating.answer_log import AnswerLog
     from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
     from scroll_tactile.live.session import LiveSession
     from scroll_tactile.results import Estimate
-    from scroll_tactile.sensors import Sensor
-    from scroll_tactile.viewer.touch_log import TouchLog
 
 __all__ = ["live"]
 
@@ -68,21 +64,6 @@ def live(
     topic: Topic = None,
     field: Field = None,
     clock: Clock = None,
-    mcap: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write answers, contacts and states into a new .mcap, at the recording's times: to be opened beside a "
-            "bag. Those lie by its own log where you give --clock log."
-        ),
-    ] = None,
-    rerun: Annotated[
-        str | None,
-        typer.Option(
-            help="Show it in Rerun, too: 'viewer', the one that runs here; the address of another, such as "
-            "rerun+http://robot:9876/proxy; or a new file that ends with .rrd.",
-            metavar="VIEWER|ADDRESS|FILE",
-        ),
-    ] = None,
 ) -> None:
     """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
     from scroll_tactile.recordings.recording import places
@@ -96,61 +77,25 @@ def live(
         opened(memory, mode="read") as learner,
         learner.live(risk=risk, contact="manual" if touch else "auto", of=of) as session,
     ):
-        states = _states(session, rows, touch)
-        first = list(islice(states, 1))  # what cannot be read, or does not fit, leaves no file behind
-        terminal = growing if screen.is_terminal and not as_json else nullcontext()
-        with _in_rerun(rerun, learner.sensor) as shown_there, _log(mcap) as log, terminal:
-            for reading, now, at in chain(first, states):
+        with growing if screen.is_terminal and not as_json else nullcontext():
+            for now, at in _states(session, rows, touch):
                 before = _shown(before, now, at, as_json, growing)
-                if log is not None:
-                    log.note(now, at)
-                if shown_there is not None:
-                    if reading is not None:
-                        shown_there.take(reading, at)
-                    shown_there.show(now, at)
     _summed_up(session.report, as_json, whole=touch)
-    if mcap is not None and not as_json:
-        say(f"written: {shown(mcap)}")
 
 
 def _states(
     session: LiveSession, rows: Iterator[tuple[float | None, npt.NDArray[np.float64]]], touch: bool
-) -> Iterator[tuple[npt.NDArray[np.float64] | None, LiveState, float]]:
-    """Each reading, the state after it, and when; None and the state at the end, where all of them are one touch."""
+) -> Iterator[tuple[LiveState, float]]:
+    """The state after each reading, and when; also the state at the end, where all of them are one touch."""
     sensor, at = session.sensor, 0.0
     if touch:
         session.begin()
     for count, (time, reading) in enumerate(rows, start=1):
         at = count / sensor.rate if time is None else time
         shaped = reading.reshape(sensor.shape) if reading.size == sensor.channels else reading
-        yield shaped, session.push(shaped, time), at
+        yield session.push(shaped, time), at
     if touch:
-        yield None, session.end(), at
-
-
-def _log(path: Path | None) -> AbstractContextManager[AnswerLog | None]:
-    if path is None:
-        return nullcontext()
-    from scroll_tactile.clients.learning.annotating.answer_log import AnswerLog
-
-    return AnswerLog(path)
-
-
-@contextmanager
-def _in_rerun(target: str | None, sensor: Sensor) -> Iterator[TouchLog | None]:
-    """What writes to Rerun; None without a target."""
-    if target is None:
-        yield None
-        return
-    from scroll_tactile.viewer.streams import stream_to
-    from scroll_tactile.viewer.touch_log import TouchLog
-
-    with stream_to(target) as stream:
-        log = TouchLog(stream, sensor)
-        try:
-            yield log
-        finally:
-            log.close()
+        yield session.end(), at
 
 
 def _rows(

@@ -15,7 +15,6 @@ __all__ = ["counted", "has_option", "in_options", "typed"]
 _ARGUMENTS = (
     *("topic", "field", "clock", "columns", "preset", "rate", "labels", "decimal", "definitions"),  # of `read`
     *("annotate", "again", "material", "by", "intervals", "cut", "sensor", "add", "source", "scene", "risk"),
-    *("output", "in_place", "replace", "forms"),  # of `annotate`
 )
 _RENAMED = {"material": "label", "by": "label_by", "intervals": "labels", "labels": "label_topic"}
 _TEXT = r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\""""  # as repr writes one

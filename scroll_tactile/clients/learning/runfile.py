@@ -21,7 +21,7 @@ except ImportError:  # Windows has none
 else:
     flock = fcntl.flock
 
-__all__ = ["RunFile", "alone_in", "differing"]
+__all__ = ["RunFile", "alone_in"]
 
 _FORMAT = 1
 BEGIN = "Move its folder away to begin anew"
@@ -69,10 +69,15 @@ class RunFile:
             raise InputError(f"expected the notes of a run in {path}; its plan is a {type(plan).__name__}. {BEGIN}")
         if version != _FORMAT:
             raise InputError(f"{path} was written in format {version}; this version reads {_FORMAT}")
-        if differs := differing(plan, self.plan):
+        differing = [
+            f"{name} {plan.get(name)!r} there, {self.plan.get(name)!r} here"
+            for name in sorted({*plan, *self.plan})
+            if plan.get(name) != self.plan.get(name)
+        ]
+        if differing:
             raise InputError(
-                f"{path.parent} belongs to another run ({differs}). Ask for the same, take another folder, or move "
-                "this one away to begin anew"
+                f"{path.parent} belongs to another run ({'; '.join(differing)}). Ask for the same, take another folder, or "
+                "move this one away to begin anew"
             )
         if not isinstance(notes, dict):
             raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}. {BEGIN}")
@@ -99,15 +104,6 @@ class RunFile:
                 f"{self.path} cannot be written: {error.strerror}. What was noted before is kept: make room, or take "
                 "another folder, and start again"
             ) from error
-
-
-def differing(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """What differs between the plan of a run that is there and another, in words; empty where nothing does."""
-    return "; ".join(
-        f"{name} {there.get(name)!r} there, {here.get(name)!r} here"
-        for name in sorted({*there, *here})
-        if there.get(name) != here.get(name)
-    )
 
 
 @contextmanager

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import AnnotationError, InputError, RecordingError, SensorMismatchError, printable
@@ -31,7 +30,6 @@ __all__ = [
     "SourceTouch",
     "find_sources",
     "has_touches",
-    "readings_of",
     "source_touches",
     "stored_source",
 ]
@@ -116,21 +114,17 @@ def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, 
     """Begin and end of each contact in a recording; raises InputError for none, and for another sensor's readings."""
     sensor, rest = learner.sensor, capabilities_of(learner.embedding).rest
     gaps = [gap.index for gap in recording.report.gaps]
-    spans = contact_spans(sensor, rest, readings_of(sensor, recording), gaps)
+    if recording.readings[:1].size != sensor.channels:
+        recording.stream(sensor)
+    kind = np.float32 if sensor.camera else np.float64
+    readings = recording.readings.reshape(len(recording), *sensor.shape).astype(kind, copy=False)
+    spans = contact_spans(sensor, rest, readings, gaps)
     if not spans:
         raise InputError(
             f"no contact was found in {recording.source}: it has to begin at rest, for two seconds or more, from which "
             "the sensor's noise is learned. For a file of one touch take cut='none'"
         )
     return spans
-
-
-def readings_of(sensor: Sensor, recording: Recording) -> npt.NDArray[Any]:
-    """The readings as this sensor's. Raises ChannelCountError for another's."""
-    if recording.readings[:1].size != sensor.channels:
-        recording.stream(sensor)
-    kind = np.float32 if sensor.camera else np.float64
-    return recording.readings.reshape(len(recording), *sensor.shape).astype(kind, copy=False)
 
 
 @dataclass(frozen=True)

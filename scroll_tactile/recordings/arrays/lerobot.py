@@ -6,7 +6,6 @@ import json
 import math
 import re
 from collections.abc import Iterator
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,24 +89,19 @@ class LeRobot(Source):
     def blocks(self) -> Iterator[Block]:
         """The readings of the column, file after file."""
         self.budget = Budget(self.address)
-        for path in self.files():
-            yield from self.blocks_of(path)
+        paths, reading = self._files(), self._reading()
+        for path in paths:
+            with self._opened(path, reading.columns, reading.labels) as file:
+                there = [name for name in reading.columns if name in file.schema_arrow.names]
+                for name in reading.required:
+                    if name not in there:
+                        raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
+                for name in there:
+                    self._require_numbers(file.schema_arrow.field(name).type, name, texts=name in reading.labels)
+                for batch in file.iter_batches(batch_size=rows_of(self._width(reading.key)), columns=there):
+                    if batch.num_rows:
+                        yield self._block(batch, reading)
 
-    def blocks_of(self, path: Path) -> Iterator[Block]:
-        """The readings of the column in one of the files; they count towards the budget."""
-        reading = self._reading
-        with self.opened(path, reading.columns, reading.labels) as file:
-            there = [name for name in reading.columns if name in file.schema_arrow.names]
-            for name in reading.required:
-                if name not in there:
-                    raise FieldError(f"{path.name} of {self.address} has no column {name!r}")
-            for name in there:
-                self._require_numbers(file.schema_arrow.field(name).type, name, texts=name in reading.labels)
-            for batch in file.iter_batches(batch_size=rows_of(self._width(reading.key)), columns=there):
-                if batch.num_rows:
-                    yield self._block(batch, reading)
-
-    @cached_property
     def _reading(self) -> _Reading:
         key, rest = self._column()
         clock = self.request.clock or "timestamp"
@@ -164,7 +158,7 @@ class LeRobot(Source):
         names = ["" if math.isnan(number) else str(number) for number in rows[:, 0].tolist()]
         return np.array([name.removesuffix(".0") for name in names], object)
 
-    def opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
+    def _opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
 
         texts: the columns of which each text is to be in memory once, and not once for every row that has it; raises
@@ -212,8 +206,10 @@ class LeRobot(Source):
         numbers = {}
         for name in ("episode_index", "frame_index", "task_index"):
             if name in batch.schema.names:
-                if name == "episode_index":
-                    self.require_all(batch.column(name), name)
+                if name == "episode_index" and batch.column(name).null_count:
+                    raise FieldError(
+                        f"column {name!r} of {self.address} has rows without a number; expected one in each"
+                    )
                 numbers[name] = self._rows(batch.column(name), name).astype(np.int64).reshape(-1)
         for episode, task in zip(
             numbers.get("episode_index", np.empty(0)), numbers.get("task_index", np.empty(0)), strict=False
@@ -223,10 +219,6 @@ class LeRobot(Source):
         counters = {"message": numbers["frame_index"]} if "frame_index" in numbers else {}
         annotations = {text: self._column_of(batch, *own) for text, own in reading.annotating.items()}
         return Block(values, {clock: times}, counters, numbers.get("episode_index"), annotations)
-
-    def column(self) -> str:
-        """The column that the field names. Raises FieldError where there is none, listing what there is."""
-        return self._column()[0]
 
     def _column(self) -> tuple[str, str]:
         if self.request.field is None:
@@ -270,20 +262,15 @@ class LeRobot(Source):
         if not (self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)):
             raise FieldError(f"column {name!r} of {self.address} holds {kind}; expected numbers")
 
-    def require_all(self, column: Any, name: str) -> None:
-        """Raises FieldError where rows of a column have no value."""
-        if column.null_count:
-            raise FieldError(f"column {name!r} of {self.address} has rows without a number; expected one in each")
-
     def _ragged(self, name: str) -> None:
         raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
 
-    def files(self) -> list[Path]:
+    def _files(self) -> list[Path]:
         """The parquet files that the episodes are in; raises RecordingError where one is missing."""
         listed: dict[tuple[int, int], None] = {}
         columns = ["data/chunk_index", "data/file_index"]
         for path in sorted((self.path / "meta" / "episodes").glob("**/*.parquet")):
-            with self.opened(path, columns) as file:
+            with self._opened(path, columns) as file:
                 table = self._table(file, columns)
             listed |= dict.fromkeys(zip(table["data/chunk_index"], table["data/file_index"], strict=True))
         pattern = str(self.info["data_path"])
@@ -307,7 +294,7 @@ class LeRobot(Source):
         if not path.is_file():
             self.notes.append("the tasks are missing, meta/tasks.parquet: episodes have no name")
             return {}
-        with self.opened(path, None) as file:
+        with self._opened(path, None) as file:
             # pandas writes an index without a name under one of its own
             name = next((name for name in file.schema_arrow.names if name != "task_index"), None)
             table = self._table(file, ["task_index"], name)

@@ -16,11 +16,8 @@ def flat(values):
     return {name: each.tolist() for name, each in found.items()} | {"count": [len(values)]}
 
 
-def robot_set(folder: Path, episodes, *, files=(0,), rate=50.0, more=None, statistics=True) -> Path:
-    """A LeRobotDataset v3. episodes: (task, readings); files: the file of each, the last for the rest.
-
-    more: further columns, name → (what info.json says of it, a value for each frame).
-    """
+def robot_set(folder: Path, episodes, *, files=(0,), rate=50.0) -> Path:
+    """A LeRobotDataset v3. episodes: (task, readings); files: the file of each, the last for the rest."""
     tasks = sorted({task for task, _ in episodes})
     places = [files[min(i, len(files) - 1)] for i in range(len(episodes))]
     width, at, rows, tables = episodes[0][1].shape[1], 0, [], {}
@@ -35,12 +32,10 @@ def robot_set(folder: Path, episodes, *, files=(0,), rate=50.0, more=None, stati
             "task_index": pa.array(np.full(count, tasks.index(task))),
             "note": pa.array([f"{task} {i}" if i % 3 else None for i in range(count)]),
         }
-        for name, (_, column) in (more or {}).items():
-            columns[name] = column[at : at + count]
         tables.setdefault(place, []).append(pa.table(columns))
         row = {"episode_index": number, "tasks": [task], "length": count}
         row |= {"data/chunk_index": 0, "data/file_index": place}
-        rows.append(row | {f"stats/{FIELD}/{name}": each for name, each in flat(values).items() if statistics})
+        rows.append(row | {f"stats/{FIELD}/{name}": each for name, each in flat(values).items()})
         at += count
     for name in ("data/chunk-000", "meta/episodes/chunk-000", "videos/observation.image/chunk-000"):
         (folder / name).mkdir(parents=True)
@@ -59,15 +54,13 @@ def robot_set(folder: Path, episodes, *, files=(0,), rate=50.0, more=None, stati
     features["observation.image"] = {"dtype": "video", "shape": [4, 4, 3], "names": None}
     for name in ("timestamp", "frame_index", "episode_index", "index", "task_index", "note"):
         features[name] = {"dtype": kinds.get(name, "int64"), "shape": [1], "names": None}
-    features |= {name: about for name, (about, _) in (more or {}).items()}
     info = {"codebase_version": "v3.0", "robot_type": None, "fps": rate, "features": features}
     info |= {"total_episodes": len(episodes), "total_frames": at, "total_tasks": len(tasks)}
     info["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
     (folder / "meta/info.json").write_text(json.dumps(info, indent=4))
-    if statistics:
-        whole = np.concatenate([readings for _, readings in episodes]).astype(np.float32)
-        (folder / "meta/stats.json").write_text(json.dumps({FIELD: flat(whole)}, indent=4))
+    frames = np.concatenate([readings for _, readings in episodes]).astype(np.float32)
+    (folder / "meta/stats.json").write_text(json.dumps({FIELD: flat(frames)}, indent=4))
     return folder
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 CEILINGS = Path(__file__).with_name("ceilings.toml")
 HOUSES = {"scroll_tactile": 1, "scroll_tactile/clients": 1, "store": 0, "tests": 1, "examples": 1}
-HEAD = "# The most that each room may weigh: lines, statements. Lowered by `python .ci/weigh.py --lower` when an issue ends.\n"
+HEAD = "# The most that each room may weigh: lines, statements. `weigh.py --lower` lowers them when an issue ends.\n"
 
 
 def room_of(file: Path) -> str:

@@ -139,11 +139,9 @@ def learned_by(model: Any) -> Learned:
     found = {}
     for scale, readout in model.readouts.items():
         sums = np.empty((len(readout.names), len(readout.origin)))
-        for place, name in enumerate(readout.names):
-            if (held := readout.held_means.rows.get(place)) is not None:
-                sums[place] = (readout.held_means.means[held] + readout.origin) * readout.counts[place]
-            else:
-                sums[place] = readout.statistics.sums(scale, [name])[0]
+        for place in range(len(readout.names)):
+            held, row = readout._at(place)
+            sums[place] = (held.means[row] + readout.origin) * readout.counts[place]
         found[int(scale)] = learned_of(readout.names, readout.counts, sums)
     return found
 
@@ -532,10 +530,6 @@ class FewSampled(TouchSample):
 def read_when_asked() -> Iterator[None]:
     """While it lasts few materials are held, and few changes followed, as if there were thousands."""
     with ExitStack() as patched:
-        own = scroll_tactile.prediction
-        for place in (own.model, own.fitting, scroll_tactile.readouts.readout):
-            patched.enter_context(patch.object(place, "EAGER", FEW))
-        patched.enter_context(patch.object(scroll_tactile.readouts.readout, "MOST_HELD", 2 * FEW))
         patched.enter_context(patch.object(scroll_tactile.persistence.open_memory, "MOST_ADDED", FEW))
         patched.enter_context(patch.object(scroll_tactile.memory.state, "TouchSample", FewSampled))
         yield

@@ -287,11 +287,11 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: Sums) -> FloatArray
         low = (total - (total >> LIMB << LIMB) if limbs else total).astype(np.float64)
         mean, root = means.astype(np.float64), np.sqrt(rows)
         with one_thread():
-            for (first, last), block in zip(blocks, centred, strict=True):
+            for i, (first, last) in enumerate(blocks):
                 if high is not None:
-                    block -= (high[:, first:last].T @ mean[:, :last]).astype(np.int64) << LIMB
-                block -= (low[:, first:last].T @ mean[:, :last]).astype(np.int64)
-                block -= (mean[:, first:last].T @ rest[:, :last]).astype(np.int64)
+                    centred[i] -= (high[:, first:last].T @ mean[:, :last]).astype(np.int64) << LIMB
+                centred[i] -= (low[:, first:last].T @ mean[:, :last]).astype(np.int64)
+                centred[i] -= (mean[:, first:last].T @ rest[:, :last]).astype(np.int64)
                 scatter[first:last, :last] += (rest[:, first:last] / root).T @ (rest[:, :last] / root)
     for (first, last), block in zip(blocks, centred, strict=True):
         np.subtract(block, scatter[first:last, :last], out=scatter[first:last, :last])

@@ -290,16 +290,18 @@ def names_of_arrays(path):
 def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
     """Every array left out, of another shape, type or value; every attribute of another type."""
     changes, refused, allowed = [], 0, []
-    for name in sorted({name.rstrip("-0123456789"): name for name in names_of_arrays(path)}.values()):
+    # The others are empty here: see `many` for these.
+    names = [name for name in names_of_arrays(path) if not name.startswith("others-")]
+    for name in sorted({name.rstrip("-0123456789"): name for name in names}.values()):
         if name not in ("kept-keys", "banks"):  # without them it is a model without kept touches, or without banks
             changes.append((name, less(name)))
         changes.append((name, of_array(name, lambda array: array[..., :-1] if array.ndim else array)))
         changes.append((name, of_array(name, lambda array: np.repeat(array, 2, axis=0))))
         changes.append((name, of_array(name, lambda array: array.astype(np.complex64).view(np.float32))))
         changes.append((name, of_array(name, lambda array: array[None])))
-    for name in ("rows-15", "moments", "weights", "spread", "dependence", "scale_novelty", "deviation", "origin-15"):
+    for name in "near-solved-15 moments weights spread dependence scale_novelty deviation origin-15".split():
         changes.append((name, of_array(name, lambda array: np.full_like(array, np.nan))))
-    for name in ("names-15", "reference-15", "held-15", "kept-order", "kept-materials", "targets", "bank-rows-0"):
+    for name in ("names-15", "kept-order", "kept-materials", "targets", "bank-rows-0"):
         changes.append((name, of_array(name, lambda array: array + 2**40)))
         changes.append((name, of_array(name, lambda array: array - 2**40)))
     for name in ("made_by", "readout", "names", "scales", "calibrations", "moments", "least", "longest", "fitted_to"):
@@ -313,7 +315,7 @@ def test_what_no_model_has_is_refused_and_fitted(made, path, fits):
                 allowed.append(name)
                 assert bits(learner)
     assert refused > 100
-    assert {name.split("-")[0] for name in allowed} <= {"reference"}, allowed  # fewer could be one
+    assert not allowed
     forge(path, less("moments"))
     with opened(path) as learner:
         assert bits(learner) == made[1]
@@ -475,7 +477,7 @@ def test_what_no_model_of_many_materials_has_is_refused_or_misleads_at_most(many
                 refused += 1
             else:
                 bits(learner)
-    assert refused > 30
+    assert refused > 20
 
 
 def test_a_memory_that_is_closed_twice_says_nothing_of_a_model_that_it_kept(tmp_path, caplog):

@@ -11,8 +11,8 @@ behind (README), so of these it is asked that they are of exactly the materials 
 says the same again, to the bit, while others go on. Settled at the end, all is what a memory says that observed the
 same in one thread.
 
-In every other round few touches are sampled and few changes are followed, as if there were thousands. What is solved for
-comes in another order then, and the bits of probability and novelty depend on that.
+In every other round few touches are sampled and few changes are followed, as if there were thousands. What is solved
+for comes in another order then, and the bits of probability and novelty depend on that.
 
 Nothing may be raised but what is named here for each call. A call that takes longer than two minutes hangs.
 """
@@ -46,7 +46,6 @@ from scroll_tactile_store import CompactedError
 import scroll_tactile.learner
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
-import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.predictor
 from faults.common import folder, parser, progress, run

@@ -88,28 +88,6 @@ def test_a_scene_of_ten_thousand_names():
     assert learner.predict(probe, scene=[NAMES[3]]).ranking == ((NAMES[3], 1.0),)
 
 
-@pytest.mark.parametrize("touches", [1, 2])
-def test_materials_of_which_no_touch_is_sampled_are_weighed_alike(monkeypatch, touches):
-    """In double precision and in single precision, in which they are held where there are many."""
-    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
-    plain = learner_of(touches)
-    monkeypatch.setattr("scroll_tactile.readouts.task.IN_DOUBLE", 3)
-    single = learner_of(touches)
-    for i in range(8):
-        scene = [NAMES[place] for place in {i % 12, (5 * i + 1) % 12, (7 * i + 3) % 12}]
-        for chosen in (scene, NAMES[i % 10 : i % 10 + 2], None):
-            monkeypatch.setattr("scroll_tactile.readouts.task.IN_DOUBLE", 1024)
-            ours = plain.predict(stream(i % 12, 50 + i), scene=chosen)
-            monkeypatch.setattr("scroll_tactile.readouts.task.IN_DOUBLE", 3)
-            theirs = single.predict(stream(i % 12, 50 + i), scene=chosen)
-            assert dict(ours.ranking) == pytest.approx(dict(theirs.ranking), rel=1e-5, abs=1e-6)
-            assert ours.novelty == pytest.approx(theirs.novelty, rel=1e-5, abs=1e-5)
-        for learner in (plain, single):
-            learner.observe([*NAMES, "new", "newer"][5 * i % 14], stream(5 * i % 14, 100 + i))
-            if (fit := learner._predictor.current._fit) is not None:  # both go on with what a thread fitted
-                fit.future.result()
-
-
 def test_a_scale_at_which_no_sampled_touch_was_read(monkeypatch):
     monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
     learner = learner_of(sensor=LONG)

@@ -300,8 +300,7 @@ class LiveSession:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
         if self._risk not in known:
-            with self._predictor.turn(model):
-                known[self._risk] = decision_rule(model, self._risk)
+            known[self._risk] = decision_rule(model, self._risk)
         return known[self._risk]
 
     def _warm_up(self, model: Model, rule: DecisionRule) -> None:

@@ -244,10 +244,9 @@ def _summing_to_one(constituents: list[Constituent], targets: Mapping[str, Targe
 def _space_of(model: Model, stage: int, names: list[str]) -> MaterialSpace:
     """The reference materials of the readouts of a stage, in the order of the names."""
     readouts = [model.readouts[scale] for scale in model.stages[stage]]
-    known = [[readout.names[place] for place in readout.reference] for readout in readouts]
     gram = np.zeros((len(names), len(names)))
-    for weight, own, readout in zip(_weights(model, stage), known, readouts, strict=True):
-        places = [own.index(name) for name in names]
+    for weight, readout in zip(_weights(model, stage), readouts, strict=True):
+        places = [readout.places[name] for name in names]
         gram += weight * readout.derived().gram[np.ix_(places, places)]
     return MaterialSpace(names, gram)
 
@@ -257,8 +256,7 @@ def _combined(model: Model, stage: int, names: Sequence[str], means: Mapping[Sca
     total = np.zeros(len(names))
     for weight, scale in zip(_weights(model, stage), model.stages[stage], strict=True):
         readout = model.readouts[scale]
-        places = {readout.names[place]: i for i, place in enumerate(readout.reference)}
-        total += weight * readout.centred(means[scale])[[places[name] for name in names]]
+        total += weight * readout.centred(means[scale])[[readout.places[name] for name in names]]
     return total
 
 

@@ -98,7 +98,6 @@ class CurrentModel:
         model = self.present(ledger)
         lent = self._holder(model)
         if lent is None:
-            model.freeze(ledger.memory.statistics)
             lent = FrozenModel(model)
             self._lent = [*(one for one in self._lent if one() is not None), ref(lent)]
         return lent
@@ -235,10 +234,6 @@ class CurrentModel:
             self._process, self._workers, self._fit, self._renewal = os.getpid(), {}, None, None
         if ledger.version == self._version:
             return
-        if self._model is not None and self._holder(self._model) is None:
-            self._model.read(
-                ledger.memory.statistics
-            )  # releases a snapshot, which would keep a copy of all that changes
         self._exact = False  # of an axis, a touch without a label changes the samples alone
         added = ledger.added if self._model is not None else None
         # None until all changes are noted: if this is interrupted, a touch could be noted twice, or never.

@@ -35,9 +35,9 @@ from scroll_tactile.readouts.calibration import (
 )
 from scroll_tactile.readouts.dependence import Dependence, dependence_of
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
-from scroll_tactile.readouts.readout import EAGER, Readout, ReadoutName
+from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.task import Task
-from scroll_tactile.signals.windows import Scale
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
@@ -47,6 +47,7 @@ FloatArray = npt.NDArray[np.float64]
 Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
 """Scale → a touch's place in the sample → number → mean features in grid units, (d,); see `held_out_scores`."""
 
+MOST_OF_RIDGE = 1024  # materials: it inverts a matrix of all of them
 PACES = (2.0, 1.41, 0.71, 0.5)  # relative to a touch's own: it is resampled to be twice to half as fast
 
 
@@ -60,23 +61,21 @@ class Renewal:
     model: Model
     readouts: dict[Scale, Readout]
     tasks: dict[Scale, Task]
-    memory: Memory
 
     @classmethod
     def of(cls, model: Model, memory: Memory) -> Renewal:
         """The renewal of a model whose materials are all in the memory."""
         tasks = {
-            scale: Task.of(memory.statistics, scale, [readout.names[place] for place in readout.reference])
-            for scale, readout in model.readouts.items()
+            scale: Task.of(memory.statistics, scale, readout.reference) for scale, readout in model.readouts.items()
         }
-        return cls(model.copy({}), dict(model.readouts), tasks, memory)
+        return cls(model.copy({}), dict(model.readouts), tasks)
 
     def solve(self) -> Model:
         """Solve the readouts one after the other; each task is freed."""
         with one_thread():
             for scale in sorted(self.tasks):
                 task = self.tasks.pop(scale)
-                self.model.readouts[scale] = task.solve(self.memory.statistics, like=self.readouts.pop(scale))
+                self.model.readouts[scale] = task.solve(like=self.readouts.pop(scale))
         give_back_scratch()
         return self.model
 
@@ -104,7 +103,7 @@ class Draft:
     """
 
     kind: ReadoutName
-    memory: Memory
+    plan: WindowPlan
     names: list[str]
     stages: list[list[Scale]]
     views: list[Scale]
@@ -120,9 +119,9 @@ class Draft:
         """The draft of a memory as it is now."""
         statistics, sample = memory.statistics, list(memory.sample)
         names = list(statistics.materials)
-        if kind == "ridge" and len(names) > EAGER:
+        if kind == "ridge" and len(names) > MOST_OF_RIDGE:
             raise InputError(
-                f'the readout "ridge" weighs {EAGER} materials at most; there are {len(names)}: take "lda"'
+                f'the readout "ridge" weighs {MOST_OF_RIDGE} materials at most; there are {len(names)}: take "lda"'
             )
         # The ridge's reference materials are all, as in the paper; LDA's are those with a sampled touch.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
@@ -132,7 +131,7 @@ class Draft:
         views = [view for view in memory.plan.views if view in tasks]
         kept = memory.kept.touches() if memory.kept is not None and views else []
         lengths = statistics.longest, statistics.fifth_percentile_length
-        return cls(kind, memory, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
+        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
 
     def fit(self, extractor: FeatureExtractor | None) -> Model:
         """Solve the readouts and fit calibration and weights. Can be called once: it frees the tasks.
@@ -141,7 +140,7 @@ class Draft:
         """
         with one_thread():
             # One after the other, each task freed: all at once would take twice the memory of a model.
-            readouts = {scale: self.tasks.pop(scale).solve(self.memory.statistics) for scale in sorted(self.tasks)}
+            readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
             fit = _Fit(self, readouts, extractor)
             held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
             reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
@@ -150,7 +149,7 @@ class Draft:
         give_back_scratch()
         return Model(
             kind=self.kind,
-            plan=self.memory.plan,
+            plan=self.plan,
             names=self.names,
             stages=self.stages,
             views=self.views,
@@ -210,7 +209,7 @@ class _Fit:
 
         last: the last stage that any touch reached. held_out: each scale's scores of the sampled touches.
         """
-        draft, milestones = self.draft, self.draft.memory.plan.milestones()[: last + 1]
+        draft, milestones = self.draft, self.draft.plan.milestones()[: last + 1]
         matcher = matcher_of(draft.kept) if draft.kept else None
         least = max(1, min(draft.least, draft.longest))
         complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], held_out, {})

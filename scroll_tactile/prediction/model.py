@@ -21,27 +21,16 @@ from scroll_tactile.prediction.moment_table import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.leave_one_out import HeldOutScores
-from scroll_tactile.readouts.pruning import likeliest
-from scroll_tactile.readouts.readout import EAGER, Change, Readout, ReadoutName
+from scroll_tactile.readouts.readout import Change, Readout, ReadoutName
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
 from scroll_tactile.statistics.sample import SampledTouch
-from scroll_tactile.statistics.statistics import Snapshot, Statistics
 
-__all__ = ["Hypothesis", "Judgement", "Model", "enough_memory", "too_many_to_hold"]
+__all__ = ["Hypothesis", "Judgement", "Model", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["prefix", "complete", "paced"]
 """What a touch may be: the prefix of a complete one, a complete one, or a complete one at another pace."""
-
-# Logits behind the best material, to which the logarithm of the number of materials is added. Materials further behind
-# have less than 2e-8 of the probability together, and are not read from the memory.
-NEGLIGIBLE = 18.0
-
-
-def too_many_to_hold(names: Sequence[str]) -> bool:
-    """Whether a model of so many materials reads the requested ones from the memory."""
-    return len(names) > EAGER
 
 
 @contextmanager
@@ -93,8 +82,7 @@ class Model:
     sample: these touches. dependence: the correlations of touches of one thing. least: the 5th percentile of the
     learned touches' lengths in steps, longest: the maximum. fitted_to: the touches that it was fitted to.
 
-    Several threads may use it at once; if it `reads_memory`, only the thread that holds the memory's lock may. `follow`
-    changes it in place: update a copy while another thread uses it.
+    Several threads may use it at once. `follow` changes it in place: update a copy while another thread uses it.
     """
 
     kind: ReadoutName
@@ -122,11 +110,6 @@ class Model:
         """The kept touches."""
         return None if self.fusion is None else self.fusion.matcher
 
-    @property
-    def reads_memory(self) -> bool:
-        """Whether it has too many materials to hold, so that it reads the requested ones from the memory."""
-        return too_many_to_hold(self.names)
-
     def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:
         """A copy that follows independently; both share the parts that `follow` never changes.
 
@@ -141,22 +124,11 @@ class Model:
             other.conformal = self.conformal.copy()
         return other
 
-    def read(self, statistics: Statistics | Snapshot) -> None:
-        """Set the statistics that materials are read from: of this model's state, or of the one that it follows to."""
-        for readout in self.readouts.values():
-            readout.statistics = statistics
-
-    def freeze(self, statistics: Statistics) -> None:
-        """Keep answering from these statistics as they are now, until the next `follow`."""
-        if self.reads_memory:
-            self.read(statistics.snapshot())
-
     def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
         """Update by touches that were observed or retracted, which the memory has already; False where it cannot.
 
         The readouts then rest on all observations; calibration and shrinkage stay as they were fitted.
         """
-        self.read(memory.statistics)
         for scale in memory.statistics.scales:
             changes = _changes(scale, added)
             if not changes or (scale in memory.plan.views and scale not in self.views):
@@ -297,59 +269,20 @@ class Model:
         scales, calibration = self.scales(hypothesis, stage), self.calibration(hypothesis, moment, stage)
         readouts, features = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
         places = [self._places(scale, names) for scale in scales]
-        if len(names) <= EAGER:
-            exact = [
-                readout.scores(own, among, self.kind)
-                for readout, own, among in zip(readouts, features, places, strict=True)
-            ]
-            best = [int(among[int(scores.argmax())]) for among, scores in zip(places, exact, strict=True)]
-            weights, distance = self._weights_at(calibration, readouts, features, best)
-            return np.asarray(sum(weight * scores for weight, scores in zip(weights, exact, strict=True))), distance
-        best = [readout.nearest(own, among)[0] for readout, own, among in zip(readouts, features, places, strict=True)]
-        weights, distance = self._weights_at(calibration, readouts, features, best)
-        parts = list(zip(weights, readouts, features, places, strict=True))
-
-        def exactly(some: npt.NDArray[np.intp]) -> FloatArray:
-            return np.asarray(
-                sum(weight * readout.many.exact(own, among[some]) for weight, readout, own, among in parts)
-            )
-
-        def bounds(some: npt.NDArray[np.intp], fine: int) -> tuple[FloatArray, FloatArray]:
-            # One more scale at each level, the views first: their coarse bounds are the widest.
-            found = [
-                readout.many.bounds(own, among[some], fine=len(parts) - i <= fine)
-                for i, (_, readout, own, among) in enumerate(parts)
-            ]
-            guess, most = (sum(weight * one[i] for weight, one in zip(weights, found, strict=True)) for i in (0, 1))
-            return np.asarray(guess), np.asarray(most)
-
-        every, margin = np.arange(len(names)), NEGLIGIBLE + np.log(len(names))
-        chosen, scores = likeliest(every, bounds, exactly, margin, len(parts))
-        logits = np.minimum(bounds(every, 0)[0], scores.max() - margin)
-        logits[chosen] = scores
-        return logits, distance
-
-    def _weights_at(
-        self,
-        calibration: Calibration,
-        readouts: Sequence[Readout],
-        features: Sequence[FloatArray],
-        best: Sequence[int],
-    ) -> tuple[FloatArray, float]:
-        """The weight of each scale for a touch, (S,), and the distance of `Judgement`.
-
-        features: of the touch, by scale; best: the place of the nearest material.
-        """
-        if not np.isfinite(calibration.median_distances).all():
-            return calibration.weights, 0.0
-        distances = np.array(
-            [
+        found = [
+            readout.scores(own, among, self.kind)
+            for readout, own, among in zip(readouts, features, places, strict=True)
+        ]
+        weights, distance = calibration.weights, 0.0
+        if np.isfinite(calibration.median_distances).all():
+            nearest = [int(among[int(scores.argmax())]) for among, scores in zip(places, found, strict=True)]
+            away = [
                 readout.diagonal_distance(own, place)
-                for readout, own, place in zip(readouts, features, best, strict=True)
+                for readout, own, place in zip(readouts, features, nearest, strict=True)
             ]
-        )
-        novel = measuring([readout.scale for readout in readouts])
-        return calibration.weights_at(distances), float(calibration.relative(distances)[novel].min())
+            weights = calibration.weights_at(np.array(away))
+            distance = float(calibration.relative(np.array(away))[measuring(scales)].min())
+        return np.asarray(sum(weight * scores for weight, scores in zip(weights, found, strict=True))), distance
 
     def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
         """The calibration by which scores are read at a stage: the moment's, if it is of this stage.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal, Protocol, Self, TypeVar
 
@@ -231,7 +230,7 @@ class Predictor:
         """An answer from one state of the memory, which others may change while a touch is embedded.
 
         begin: called with the lock held; reads from the memory, and returns a function that embeds the touch and
-        answers, which is called without the lock unless the model reads the memory.
+        answers, which is called without the lock.
         """
         reading = self._reading()
         try:
@@ -239,8 +238,6 @@ class Predictor:
                 with self.ledger.lock:
                     frozen = self.current.frozen(self.ledger)
                     answered = begin(frozen.model, reading)
-                    if frozen.model.reads_memory:
-                        return answered()
                 return answered()
         except EmbeddingMismatchError as error:
             self._discard_stored(reading, error)
@@ -282,20 +279,11 @@ class Predictor:
         with self.ledger.lock, enough_memory():
             return self.current.frozen(self.ledger)
 
-    @contextmanager
-    def turn(self, model: Model) -> Iterator[None]:
-        """To be held while a model is used: holds the lock if the model reads the memory."""
-        if not model.reads_memory:
-            yield
-            return
-        with self.ledger.lock:
-            yield
-
     def answer_of(
         self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Encoded]
     ) -> Prediction:
         """The prediction of a frozen model for touches of one thing."""
-        with self.turn(model), enough_memory():
+        with enough_memory():
             return self._answer(model, extractor, candidates, [(touch, None) for touch in touches])
 
     def settle(self) -> None:
@@ -336,10 +324,7 @@ class Predictor:
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""
         with self.ledger.lock, enough_memory():
-            memory = self.ledger.memory
-            model = Draft.of(memory, self.recipe.settings.readout).fit(self.extractor)
-            model.freeze(memory.statistics)
-            return model
+            return Draft.of(self.ledger.memory, self.recipe.settings.readout).fit(self.extractor)
 
     def examined(self) -> Model:
         """A copy of the answering model with the scores of its sampled touches, each held out, for pages. It fits a
@@ -348,9 +333,7 @@ class Predictor:
         Raises what `frozen` raises.
         """
         with self.ledger.lock, enough_memory():
-            model = self.current.examined(self.ledger)
-            model.freeze(self.ledger.memory.statistics)
-            return model
+            return self.current.examined(self.ledger)
 
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:

@@ -1,8 +1,8 @@
 """The fitted model as arrays beside its checkpoint, so that the next opening needs no fit.
 
-It has all that predictions read, with the banks of kernels, but not the sample or the held-out touches, and K only
-where there are too many materials to hold: a stored model cannot follow, and is renewed when touches come or go (see
-`prediction.current`). The levels of kept touches are the memory's, and so are the means of materials that are not held.
+It has all that predictions read, with the banks of kernels, but not the sample, the held-out touches or K: a stored
+model cannot follow, and is renewed when touches come or go (see `prediction.current`). The levels of kept touches are
+the memory's.
 
 A file may come from elsewhere. Types, shapes and bounds of its arrays are checked against the memory, so that no
 prediction fails or takes more memory because of it. Whether its numbers are the fitted ones cannot be checked. Models
@@ -29,11 +29,10 @@ from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.matching.match import KeptTouch, NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.model import Model, too_many_to_hold
+from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.moment_table import Fusion, Moment, Trajectories
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.pruning import PruningTable
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.task import readout_to_arrays
 from scroll_tactile.signals.windows import Scale, measuring
@@ -47,7 +46,7 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 FloatArray = npt.NDArray[np.float64]
 
 NAME = "model"
-MADE_BY = f"{__version__}, 4"  # the release, in which judging may differ, and the version of these arrays
+MADE_BY = f"{__version__}, 5"  # the release, in which judging may differ, and the version of these arrays
 MOST_BANKS = 64
 OF_MOMENT = (
     "steps",
@@ -61,9 +60,9 @@ OF_MOMENT = (
     "mean_excess_loss",
     "loss_spread",
 )
-# Arrays that are mapped where the materials are too many to hold. Places are never mapped: they are checked once, and
-# another process could change a mapped file after that.
-MAPPED = ("rows", "triangle", *(f"table-{name}" for name in PruningTable.parts(0, 0)))
+# Arrays that are mapped: they may be large. Places are never mapped: they are checked once, and another process could
+# change a mapped file after that.
+MAPPED = "others-means", "others-solved"
 OF_CALIBRATION = ("weights", "scale_novelty", "median_distances", "novelties", "novelties_if_new")
 
 
@@ -84,12 +83,9 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "targets": fusion.trajectories.targets.astype(np.int64),
     }
     arrays |= {name: np.concatenate([getattr(each, name) for each in calibrations]) for name in OF_CALIBRATION}
-    mapped: list[str] = []
     for scale, readout in model.readouts.items():
         arrays[f"names-{scale}"] = np.array([places[name] for name in readout.names], dtype=np.int64)
-        parts = readout_to_arrays(readout, whole=model.reads_memory)
-        arrays |= {f"{name}-{scale}": part for name, part in parts.items()}
-        mapped += [f"{name}-{scale}" for name in parts if name in MAPPED and model.reads_memory]
+        arrays |= {f"{name}-{scale}": part for name, part in readout_to_arrays(readout).items()}
     if model.matcher is not None and model.conformal is not None:
         arrays |= _kept_to_arrays(model.matcher, model.conformal, places)
     attributes = {
@@ -103,7 +99,11 @@ def model_to_arrays(model: Model) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "longest": model.longest,
         "fitted_to": model.fitted_to,
     }
-    return {name: np.ascontiguousarray(part) for name, part in arrays.items()}, attributes, mapped
+    return (
+        {name: np.ascontiguousarray(part) for name, part in arrays.items()},
+        attributes,
+        [f"{name}-{scale}" for name in MAPPED for scale in model.readouts],
+    )
 
 
 def banks_to_arrays(embedding: Embedding) -> dict[str, npt.NDArray[Any]]:
@@ -222,10 +222,10 @@ class _ModelReader(ArrayReader):
     def _readout(self, scale: Scale) -> Readout:
         count = self.length(f"names-{scale}", len(self._names))
         names = [self._names[place] for place in self.places(f"names-{scale}", count, len(self._names))]
-        statistics = self._memory.statistics
         if self._same:
-            expect(sorted(names) == statistics.names(scale), f"names-{scale}", "the materials there", names)
-        return stored_readout(self, scale, names, statistics, whole=too_many_to_hold(self._names))
+            there = self._memory.statistics.names(scale)
+            expect(sorted(names) == there, f"names-{scale}", "the materials there", names)
+        return stored_readout(self, scale, names, self._memory.statistics.dimension)
 
     def kept(self) -> tuple[TouchMatcher, Conformal]:
         """Matcher and conformal sets of the kept touches that the memory still has."""

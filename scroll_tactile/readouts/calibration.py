@@ -259,8 +259,7 @@ def _weight_without_held_out(names: Sequence[str], readouts: Sequence[Readout], 
         return share
     ahead = np.zeros((len(names), len(names)))
     for readout in readouts:
-        known = [readout.names[place] for place in readout.reference]
-        own = [known.index(name) for name in names]
+        own = [readout.places[name] for name in names]
         gram = readout.derived().gram[np.ix_(own, own)]
         sizes = np.diagonal(gram)
         ahead += (sizes[:, None] + sizes - 2 * gram) / 2

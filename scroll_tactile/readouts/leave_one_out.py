@@ -123,7 +123,7 @@ def held_out_scores(
     any number → mean features in grid units, (d,), scored in place of its own rows; the numbers then stand for stages.
     The result lacks touches that are the only one of their material.
     """
-    names = [readout.names[place] for place in readout.reference]
+    names = readout.reference
     own = {name: i for i, name in enumerate(names)}
     groups: dict[tuple[int, int], list[tuple[int, list[int], FloatArray, float, int, FloatArray]]] = {}
     for number, (material, _, touch) in enumerate(sample):
@@ -131,7 +131,7 @@ def held_out_scores(
         if not judged or material not in own or (queries is not None and not queries.get(number)):
             continue
         weight = float(max(touch.learned[judged[0]], len(judged)))
-        if readout.counts[readout.reference[own[material]]] > weight:
+        if readout.counts[own[material]] > weight:
             rows = touch.rows[judged] - readout.origin
             at, scored = touch.pairs[judged, 0].tolist(), rows
             if queries is not None:
@@ -171,13 +171,12 @@ class _Leaving:
     def __init__(self, readout: Readout, kind: ReadoutName) -> None:
         self.readout, self.kind = readout, kind
         self.derived = readout.derived()
-        means, _ = readout.means_solved()
-        self.counts = readout.counts[readout.reference]
+        self.counts = readout.counts[: len(readout.near)]
         self.total = float(self.counts.sum())
         # The total scatter is that of the reference materials, scaled to the rows of all materials.
         self.excess = float(readout.counts.sum()) / self.total
         with one_thread():
-            self.means = readout.system.whiten(means)
+            self.means = readout.system.whiten(np.asarray(readout.near.means, np.float64))
             self.center = readout.shares @ self.means
             spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
             factor = np.linalg.cholesky(spread @ spread.T + np.eye(len(spread)))
@@ -264,7 +263,7 @@ class _Leaving:
         best: npt.NDArray[np.intp],
     ) -> FloatArray:
         """Diagonal distances of queries (M, q, d) from the material `best` of each, (M, q), without their touch."""
-        means, counts = self.readout.means_solved()[0], self.counts[own]
+        means, counts = self.readout.near.means, self.counts[own]
         nearest = means[best]
         back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
         nearest -= (best == own[:, None])[:, :, None] * back[:, None]

@@ -13,7 +13,6 @@ inverted again from the integers.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from functools import lru_cache
 from itertools import pairwise
 
@@ -62,10 +61,9 @@ class System:
         dimension = len(matrix)
         # numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import.
         self._inverse = InverseTriangle(matrix)
-        self._most = self.most_columns(dimension)
+        self._most = max(LEAST_RANK, dimension // LARGEST_RANK)
         self._white = np.empty((0, dimension))  # L⁻¹ times the columns, and room for more
         self._e = np.empty((0, 0))
-        self._signs = np.empty(0)  # D
         self._largest = 1.0  # entry of what E is the inverse of
         self.rank = 0
 
@@ -75,32 +73,6 @@ class System:
         system = cls(np.empty((0, 0)))
         system._most, system._white = 0, np.empty((0, dimension))
         return system
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, FloatArray]) -> System:
-        """The system of which `to_arrays` gave the arrays, which are taken over: it takes in no more columns."""
-        system = cls.unkept(arrays["white"].shape[1])
-        system._inverse = InverseTriangle.of(arrays["triangle"], arrays["white"].shape[1])
-        system._white, system._e, system._signs = (arrays[name] for name in ("white", "inner", "signs"))
-        system._most = system.rank = len(system._signs)
-        return system
-
-    def to_arrays(self) -> dict[str, FloatArray]:
-        """L⁻¹ in blocks, and of the columns that came since W, (r, d), E, (r, r), and D, (r,)."""
-        own = slice(self.rank)
-        white, inner, signs = self._white[own], self._e[own, own], self._signs[own]
-        return {"triangle": self._inverse.flat(), "white": white, "inner": inner, "signs": signs}
-
-    @staticmethod
-    def most_columns(dimension: int) -> int:
-        """How many columns can come before K is inverted again."""
-        return max(LEAST_RANK, dimension // LARGEST_RANK)
-
-    @staticmethod
-    def parts(dimension: int, rank: int) -> dict[str, tuple[int, ...]]:
-        """The shapes of the arrays of a system that took in so many columns."""
-        size = sum((last - first) * last for first, last in pairwise(_edges(dimension)))
-        return {"triangle": (size,), "white": (rank, dimension), "inner": (rank, rank), "signs": (rank,)}
 
     @property
     def sound(self) -> bool:
@@ -117,41 +89,15 @@ class System:
         """Another system with the same columns: what comes to it does not come to this one."""
         other = copy.copy(self)
         other._white, other._e = self._white[: self.rank].copy(), self._e[: self.rank, : self.rank].copy()
-        other._signs = self._signs[: self.rank].copy()
         return other
 
     def solve(self, rows: FloatArray) -> FloatArray:
         """(K + Uᵀ D U)⁻¹ times each of the rows, shape (k, d)."""
-        return self.solve_whitened(self.towards(rows))
-
-    def towards(self, rows: FloatArray) -> FloatArray:
-        """(I − B) L⁻¹ x of each of the rows x, (k, d): its product with a whitened y is yᵀ (K + Uᵀ D U)⁻¹ x.
-
-        B = Wᵀ E W stands for the columns that came since.
-        """
         white = self.whiten(rows)
         if self.rank:
             came, e = self._white[: self.rank], self._e[: self.rank, : self.rank]
             white -= (white @ came.T) @ e @ came
-        return white
-
-    def solve_whitened(self, white: FloatArray) -> FloatArray:
-        """L⁻ᵀ times each of the rows, (k, d)."""
         return self._inverse.transposed_times(white)
-
-    def lost(self, white: FloatArray) -> FloatArray:
-        """uᵀ B u of each whitened row u, (k, d): how much the columns that came reduce its squared length, (k,)."""
-        onto = white @ self._white[: self.rank].T
-        return np.asarray(np.einsum("kr,kr->k", onto @ self._e[: self.rank, : self.rank], onto))
-
-    @property
-    def most_lost(self) -> float:
-        """A bound of the absolute eigenvalues λ of B, which are those of I − E D: (Σ λ⁸)^⅛."""
-        power = np.eye(self.rank) - self._e[: self.rank, : self.rank] * self._signs[: self.rank]
-        for _ in range(2):
-            power = power @ power
-        # Each λ⁸ is in the trace; rounding may leave it below zero where there is nothing but rounding.
-        return float(max(np.einsum("ij,ji->", power, power), 0.0) ** 0.125) * (1 + 1e-9) + 1e-9
 
     def whiten(self, rows: FloatArray) -> FloatArray:
         """L⁻¹ times each of the rows, (k, d), without the columns that came since: their products are those of K⁻¹."""
@@ -159,9 +105,9 @@ class System:
 
     def _grow(self, rank: int) -> None:
         size, held = max(rank, min(self._most, len(self._white) + MORE)), self.rank
-        white, e, signs = np.empty((size, self._white.shape[1])), np.empty((size, size)), np.empty(size)
-        white[:held], e[:held, :held], signs[:held] = self._white[:held], self._e[:held, :held], self._signs[:held]
-        self._white, self._e, self._signs = white, e, signs
+        white, e = np.empty((size, self._white.shape[1])), np.empty((size, size))
+        white[:held], e[:held, :held] = self._white[:held], self._e[:held, :held]
+        self._white, self._e = white, e
 
     def border(self, columns: FloatArray, sign: int) -> tuple[FloatArray, FloatArray]:
         """Take in columns, (k, d), of one sign. Returns W, (k, d), and C, (k, k): the inverse falls by Wᵀ C W."""
@@ -178,7 +124,7 @@ class System:
         beside = -onto @ corner
         e -= beside @ onto.T
         self._e[:first, first:last], self._e[first:last, :first] = beside, beside.T
-        self._e[first:last, first:last], self._signs[first:last] = corner, sign
+        self._e[first:last, first:last] = corner
         self.rank = last
         return self._inverse.transposed_times(white - onto.T @ self._white[:first]), corner
 
@@ -202,19 +148,6 @@ class InverseTriangle:
         self._blocks = [(first, last, matrix[first:last, :last].copy()) for first, last in edges]
         self._factorise()
         self._invert()
-
-    @classmethod
-    def of(cls, flat: FloatArray, dimension: int) -> InverseTriangle:
-        """The one that `flat` gave, taken over."""
-        triangle = cls(np.empty((0, 0)))
-        edges = list(pairwise(_edges(dimension)))
-        parts = np.split(flat, np.cumsum([(last - first) * last for first, last in edges])[:-1])
-        triangle._blocks = [(*edge, part.reshape(-1, edge[1])) for edge, part in zip(edges, parts, strict=True)]
-        return triangle
-
-    def flat(self) -> FloatArray:
-        """The blocks one after the other."""
-        return np.concatenate([block.ravel() for _, _, block in self._blocks])
 
     def _factorise(self) -> None:
         """Turn the blocks of K into those of L, block of columns after block."""

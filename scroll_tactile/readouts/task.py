@@ -13,20 +13,18 @@ It needs S alone, so there is nothing to hold out and nothing to choose.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.held_means import HeldMeans, class_means
-from scroll_tactile.readouts.pruning import ManyMaterials, PruningTable
-from scroll_tactile.readouts.readout import Numbers, Readout, held_at_first
+from scroll_tactile.readouts.readout import Means, Numbers, Readout
 from scroll_tactile.readouts.system import System
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
-from scroll_tactile.statistics.statistics import Snapshot, Statistics
+from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["LARGEST", "LEAST", "Task", "readout_from_arrays", "readout_to_arrays", "shrinkage"]
 
@@ -34,6 +32,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FIRST_KNOWN = 256  # materials
+IN_DOUBLE = 1024  # materials: of more, those beyond the reference are held in single precision, within 1e-6 of scores
+AT_ONCE = 1024  # materials that are solved for at once
 # Bounds of ρ. Below LEAST the solution would not be accurate to 1e-9; above LARGEST nothing would be left of S. A
 # memory of a million touches stays above LEAST.
 LEAST, LARGEST = 1e-4, 0.99
@@ -80,7 +80,7 @@ class Task:
             (self.sums.sum(axis=0, dtype=np.int64).astype(np.longdouble) / self.counts.sum()).astype(np.float64)
         )
 
-    def solve(self, statistics: Statistics | Snapshot, like: Readout | None = None) -> Readout:
+    def solve(self, like: Readout | None = None) -> Readout:
         """The readout. like: an earlier one of the same reference, to which scores stay comparable.
 
         Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
@@ -90,21 +90,43 @@ class Task:
         share = 0.0
         if trace > 0:
             share = shrinkage(matrix, self.touches, self.times) if like is None else like.share
-        places = held_at_first(self.reference, len(self.names))
-        means = class_means(self.counts[places], self.sums[places], origin)
+        others = np.setdiff1d(np.arange(len(self.names)), self.reference)
+        order = np.concatenate([self.reference, others])
         # Single rows have no scatter: the readout then is the nearest mean.
         penalty = trace / dimension * share / (1 - share)
         if not penalty > 0:  # an earlier one had no share of a scatter either: its penalty stays, as where it follows
-            penalty = max(float(np.mean(np.square(means))), 1.0) if like is None or trace == 0 else like.penalty
+            squares = sum(float(np.square(means).sum()) for _, means in self._means(order))
+            own = max(squares / (len(order) * dimension), 1.0)
+            penalty = own if like is None or trace == 0 else like.penalty
         matrix[np.diag_indices(dimension)] += penalty
         counts = self.counts.astype(np.float64)
         precision: FloatArray = counts.sum() / np.diagonal(matrix) if like is None else like.precision
-        held = HeldMeans.none(dimension)
+        single = len(self.names) > IN_DOUBLE
         with one_thread():
             system = System(matrix)
-            held.add(places, means, system.solve(means))
-        numbers = Numbers(self.reference, origin, counts, share, penalty, precision)
-        return Readout(self.scale, self.names, statistics, system, held, numbers)
+            del matrix  # 8 MB
+            near = self._solved(system, self.reference, np.float64)
+            rest = self._solved(system, others, np.float32 if single else np.float64)
+        numbers = Numbers(origin, counts[order], share, penalty, precision)
+        return Readout(self.scale, [self.names[place] for place in order], system, near, rest, numbers)
+
+    def _means(self, places: npt.NDArray[np.intp]) -> Iterator[tuple[slice, FloatArray]]:
+        """The means of materials at some places about the origin, (k, d) in grid units, block after block."""
+        # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
+        origin = self.origin
+        near = np.rint(origin)
+        for first in range(0, len(places), AT_ONCE):
+            own = places[first : first + AT_ONCE]
+            about = self.sums[own] - np.outer(self.counts[own], near.astype(np.int64))
+            yield slice(first, first + len(own)), about / self.counts[own, None] - (origin - near)
+
+    def _solved(self, system: System, places: npt.NDArray[np.intp], kind: type[np.floating]) -> Means:
+        """The materials at some places."""
+        shape = len(places), self.sums.shape[1]
+        found = Means(np.empty(shape, kind), np.empty(shape, kind), np.empty(len(places)))
+        for rows, means in self._means(places):
+            found.put(rows, means, system.solve(means))
+        return found
 
 
 def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
@@ -121,44 +143,28 @@ def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
     return float(min(max(times * ratio, LEAST), LARGEST))
 
 
-def readout_to_arrays(readout: Readout, *, whole: bool) -> dict[str, npt.NDArray[Any]]:
+PARTS = "near", "others"
+
+
+def readout_to_arrays(readout: Readout) -> dict[str, npt.NDArray[Any]]:
     """The arrays of a readout.
 
-    reference: places, (R,). held: places in the order of what is held, (H,). rows: their means about the origin,
-    and K⁻¹ times these, (H, 2, d). sizes: (H,). origin, precision: (d,). counts: (C,). shape: share and penalty.
-
-    whole: with the system, by which materials that are not held are solved for, as `System.to_arrays` has it; and with
-    the table of `pruning`, where there are too many materials to hold, its arrays' names with "table-" before them.
+    near-means, near-solved, near-sizes, and others- likewise: as `Means` has them. origin, precision: (d,). counts:
+    (C,). shape: share and penalty.
     """
-    held = readout.held_means
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "reference": readout.reference,
-        "held": np.array(held.places, dtype=np.int64),
-        "rows": held.pairs,
-        "sizes": held.sizes,
+    return {
+        **{f"{part}-{name}": array for part in PARTS for name, array in vars(getattr(readout, part)).items()},
         "origin": readout.origin,
         "precision": readout.precision,
         "counts": readout.counts,
         "shape": np.array([readout.share, readout.penalty]),
     }
-    if not whole:
-        return arrays
-    if not readout.holds_all:
-        arrays |= {f"table-{name}": part for name, part in readout.many.table.to_arrays().items()}
-    return arrays | readout.system.to_arrays()
 
 
-def readout_from_arrays(
-    scale: Scale, names: Sequence[str], arrays: Mapping[str, npt.NDArray[Any]], statistics: Statistics
-) -> Readout:
+def readout_from_arrays(scale: Scale, names: Sequence[str], arrays: Mapping[str, npt.NDArray[Any]]) -> Readout:
     """The readout of which `readout_to_arrays` gave the arrays, which are taken over; it can follow nothing."""
-    reference, origin, counts, precision = (arrays[name] for name in ("reference", "origin", "counts", "precision"))
+    near, others = (Means(*(arrays[f"{part}-{name}"] for name in ("means", "solved", "sizes"))) for part in PARTS)
+    origin = arrays["origin"]
     share, penalty = arrays["shape"].tolist()
-    numbers = Numbers(reference, origin, counts, share, penalty, precision)
-    held = HeldMeans(arrays["held"].tolist(), arrays["rows"], arrays["sizes"])
-    system = System.from_arrays(arrays) if "triangle" in arrays else System.unkept(len(origin))
-    table = {name.removeprefix("table-"): part for name, part in arrays.items() if name.startswith("table-")}
-    readout = Readout(scale, names, statistics, system, held, numbers)
-    if table:
-        readout.many = ManyMaterials(readout, PruningTable.from_arrays(table))
-    return readout
+    numbers = Numbers(origin, arrays["counts"], share, penalty, arrays["precision"])
+    return Readout(scale, names, System.unkept(len(origin)), near, others, numbers)

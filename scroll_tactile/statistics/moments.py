@@ -24,7 +24,6 @@ MOST_ROWS = 2 ** (63 - 2 * BITS) - 1  # with one row more an entry could pass in
 BLOCK = 512  # rows whose product is packed at once; below 2¹³ it is exact in float64
 FIRST = 64  # rows that there is room for at once
 LIMB = 22  # bits
-MANY = 1024  # classes
 ROWS = 128  # of a product that are formed at once: the whole of one is 8 MB
 
 
@@ -268,65 +267,32 @@ def within_scatter(packed: IntArray, counts: IntArray, sums: Sums) -> FloatArray
     c_y c_yᵀ / n_y = c_y m_yᵀ + m_y r_yᵀ + r_y r_yᵀ / n_y. The first two are integers and leave A exactly; what is
     rounded is the scatter itself, whatever the distance of the means from zero.
     """
-    # The whole square, of which half is waste: gathering the triangle of each product took three times as long.
-    dimension = sums.shape[1]
-    if len(counts) <= MANY:
-        return _exactly(packed, counts, sums)
-    centred = np.zeros((dimension, dimension), dtype=np.int64)
-    for row, place in _rows_of_triangle(dimension):
-        centred[row, : row + 1] = packed[place]
-    rounded = np.zeros((dimension, dimension))
-    _take_about_the_mean(centred, rounded, counts, sums)
-    rounded *= -1.0
-    rounded += centred
-    return rounded
-
-
-def _exactly(packed: IntArray, counts: IntArray, sums: Sums) -> FloatArray:
-    """The scatter, block of rows after block: of the whole square every step would take 8 MB more."""
     # So many classes at once that products of their sums and means stay below 2⁵³; of large sums, in two limbs.
     largest = int(np.abs(sums).max(initial=1))
     together = min(1024, 2 ** (53 - BITS) // largest)
     limbs, together = (False, together) if together >= 64 else (True, 1024)
-    parts = []
-    for first in range(0, len(counts), together):
-        rows, total = counts[first : first + together, None], sums[first : first + together].astype(np.int64)
+    dimension = sums.shape[1]
+    scatter = np.zeros((dimension, dimension))  # first of the rests alone
+    places = list(_rows_of_triangle(dimension))
+    blocks = [(first, min(first + ROWS, dimension)) for first in range(0, dimension, ROWS)]
+    centred = [np.zeros((last - first, last), dtype=np.int64) for first, last in blocks]
+    for (first, last), block in zip(blocks, centred, strict=True):
+        for row, place in places[first:last]:
+            block[row - first, : row + 1] = packed[place]
+    for begin in range(0, len(counts), together):
+        rows, total = counts[begin : begin + together, None], sums[begin : begin + together].astype(np.int64)
         means = mean_code(total, rows)
         rest = (total - rows * means).astype(np.float64)
         high = (total >> LIMB).astype(np.float64) if limbs else None
         low = (total - (total >> LIMB << LIMB) if limbs else total).astype(np.float64)
-        parts.append((high, low, means.astype(np.float64), rest, np.sqrt(rows)))
-    dimension = sums.shape[1]
-    scatter = np.zeros((dimension, dimension))
-    places = list(_rows_of_triangle(dimension))
-    with one_thread():
-        for first in range(0, dimension, ROWS):
-            last = min(first + ROWS, dimension)
-            centred, rounded = np.zeros((last - first, last), dtype=np.int64), np.zeros((last - first, last))
-            for row, place in places[first:last]:
-                centred[row - first, : row + 1] = packed[place]
-            for high, low, mean, rest, root in parts:
+        mean, root = means.astype(np.float64), np.sqrt(rows)
+        with one_thread():
+            for i, (first, last) in enumerate(blocks):
                 if high is not None:
-                    centred -= (high[:, first:last].T @ mean[:, :last]).astype(np.int64) << LIMB
-                centred -= (low[:, first:last].T @ mean[:, :last]).astype(np.int64)
-                centred -= (mean[:, first:last].T @ rest[:, :last]).astype(np.int64)
-                rounded += (rest[:, first:last] / root).T @ (rest[:, :last] / root)
-            np.subtract(centred, rounded, out=scatter[first:last, :last])
+                    centred[i] -= (high[:, first:last].T @ mean[:, :last]).astype(np.int64) << LIMB
+                centred[i] -= (low[:, first:last].T @ mean[:, :last]).astype(np.int64)
+                centred[i] -= (mean[:, first:last].T @ rest[:, :last]).astype(np.int64)
+                scatter[first:last, :last] += (rest[:, first:last] / root).T @ (rest[:, :last] / root)
+    for (first, last), block in zip(blocks, centred, strict=True):
+        np.subtract(block, scatter[first:last, :last], out=scatter[first:last, :last])
     return scatter
-
-
-def _take_about_the_mean(centred: IntArray, rounded: FloatArray, counts: IntArray, sums: Sums) -> None:
-    """Move `centred` to the integer g next to the mean of all, exactly; add Σ_y n_y (m_y − g)(m_y − g)ᵀ to `rounded`.
-
-    A product of half the operations in place of two: of ten thousand classes a second less for each scale. What is
-    lost is the digits by which the scatter between classes exceeds that within, and not those of the mean.
-    """
-    total, rows = sums.sum(axis=0, dtype=np.int64), int(counts.sum())
-    mean = mean_code(total, rows)
-    centred -= np.outer(total, mean) + np.outer(mean, total - rows * mean)
-    with one_thread():
-        for first in range(0, len(counts), 1024):
-            block = counts[first : first + 1024, None]
-            deviations = (sums[first : first + 1024] - block * mean).astype(np.float64)
-            deviations /= np.sqrt(block)
-            rounded += deviations.T @ deviations

@@ -10,7 +10,6 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
-from weakref import ReferenceType, ref
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +19,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import SecondMoment, Sums, require_room
 from scroll_tactile.statistics.tables import rows_of, table_of
 
-__all__ = ["SECOND", "Snapshot", "Statistics"]
+__all__ = ["SECOND", "Statistics"]
 
 IntArray = npt.NDArray[np.int64]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
@@ -47,10 +46,6 @@ class Statistics:
         # In int32 until a sum needs more: of ten thousand materials they are 40 MB a scale then.
         self._sums: dict[Scale, Sums] = {scale: np.zeros((0, dimension), dtype=np.int32) for scale in self.scales}
         self._seconds = {scale: SecondMoment(dimension) for scale in self.scales}
-        self._snapshots: list[ReferenceType[Snapshot]] = []
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_snapshots": []}  # they are of this one, and a copy has its own
 
     @property
     def materials(self) -> dict[str, int]:
@@ -89,7 +84,6 @@ class Statistics:
         Raises CapacityError, before anything is added, where a sum would not be exact any more.
         """
         self.require_room(codes)
-        self._keep(material)
         place = self._place(material)
         for scale, rows in codes.items():
             self._seconds[scale].add(rows)
@@ -142,25 +136,12 @@ class Statistics:
         place = self._places.get(material)
         if place is None or not self._observations[place] or not self._lengths[columns]:
             raise UnknownMaterialError(f"{material!r} has no observation of {columns} columns that could be taken out")
-        self._keep(material)
         for scale, rows in codes.items():
             self._seconds[scale].remove(rows)
             self._rows[scale][place] -= len(rows)
             self._add_sums(scale, place, -rows.sum(axis=0, dtype=np.int64))
         self._observations[place] -= 1
         self._lengths = +(self._lengths - Counter([columns]))
-
-    def snapshot(self) -> Snapshot:
-        """The counts and sums of each material, which stay as they are now."""
-        made = Snapshot(self)
-        self._snapshots = [*(one for one in self._snapshots if one() is not None), ref(made)]
-        return made
-
-    def _keep(self, material: str) -> None:
-        """Have the snapshots keep a material that is about to change."""
-        for one in self._snapshots:
-            if (snapshot := one()) is not None:
-                snapshot.keep(material)
 
     def _place(self, material: str) -> int:
         place = self._places.get(material)
@@ -337,39 +318,3 @@ def _second(
     if places in late:
         return SecondMoment.of_codes(lambda: rows_of(late[values](), late[places]()), rows, dimension)
     return SecondMoment.of_codes(rows_of(arrays[values], arrays[places]), rows, dimension)
-
-
-class Snapshot:
-    """The counts and sums of each material as they were, whatever is added and taken out since.
-
-    It costs nothing until a material changes: then it keeps that one as it was before. Any thread may ask it, also
-    while something changes. Made by `Statistics.snapshot`.
-    """
-
-    def __init__(self, statistics: Statistics) -> None:
-        self._statistics = statistics
-        self._kept: dict[str, dict[Scale, tuple[int, IntArray]]] = {}
-
-    def keep(self, material: str) -> None:
-        """Keep a material as it is, unless it was kept before."""
-        now = self._statistics
-        if material not in self._kept and material in now._places:
-            place = now._places[material]
-            self._kept[material] = {
-                s: (int(now._rows[s][place]), now._sums[s][place].astype(np.int64)) for s in now.scales
-            }
-
-    def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
-        """Rows of each material, shape (C,)."""
-        return self._as_kept(self._statistics.counts(scale, names), scale, names, 0)
-
-    def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
-        """Sums of codes of each material, shape (C, d)."""
-        return self._as_kept(self._statistics.sums(scale, names), scale, names, 1)
-
-    def _as_kept(self, found: IntArray, scale: Scale, names: Sequence[str], which: int) -> IntArray:
-        """What was found of each material, or what was kept of it: what changed since then is kept by now."""
-        for i, name in enumerate(names):
-            if name in self._kept:
-                found[i] = self._kept[name][scale][which]
-        return found

@@ -12,19 +12,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.pruning import PruningTable
 from scroll_tactile.readouts.readout import Readout
-from scroll_tactile.readouts.system import System
 from scroll_tactile.readouts.task import readout_from_arrays
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import MOST_ROWS
-from scroll_tactile.statistics.statistics import Statistics
 from scroll_tactile.validation.expected import array, counts, expect, whole
 
 __all__ = ["ArrayReader", "stored_readout"]
 
 FloatArray = npt.NDArray[np.float64]
-AT_ONCE = 4096  # rows that are checked at once
 
 
 class ArrayReader:
@@ -34,23 +30,18 @@ class ArrayReader:
         self.arrays = arrays
 
     def floats(
-        self, field: str, shape: tuple[int | None, ...], least: float = -np.inf, most: float = np.inf
+        self,
+        field: str,
+        shape: tuple[int | None, ...],
+        least: float = -np.inf,
+        most: float = np.inf,
+        kinds: tuple[str, ...] = ("float64",),
     ) -> FloatArray:
         """Numbers within bounds; infinity only where `most` is infinite."""
-        found = array(self.arrays, field, ("float64",), shape)
+        found = array(self.arrays, field, kinds, shape)
         ends = np.isposinf(found) & (most == np.inf) & (least >= 0)
         expect(bool((np.isfinite(found) | ends).all()), field, "finite numbers", "others")
         expect(bool(((found >= least) & (found <= most)).all()), field, f"from {least} to {most}", "others")
-        return found
-
-    def finite(self, field: str, kind: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-        """Finite numbers of a type, which may be many: they are looked at part by part. One axis: they are lengths."""
-        found = array(self.arrays, field, (kind,), shape)
-        least = 0.0 if len(shape) == 1 else -np.inf
-        for first in range(0, len(found) if found.dtype.kind == "f" else 0, AT_ONCE):
-            part = found[first : first + AT_ONCE]
-            sound = np.isfinite(part) & (part >= least)
-            expect(bool(sound.all()), field, "finite numbers", "others")
         return found
 
     def places(self, field: str, count: int, among: int) -> npt.NDArray[np.intp]:
@@ -65,32 +56,22 @@ class ArrayReader:
         return whole(field, -1 if found is None or found.ndim != axes else len(found), least, most)
 
 
-def stored_readout(
-    reader: ArrayReader, scale: Scale, names: Sequence[str], statistics: Statistics, *, whole: bool
-) -> Readout:
-    """The readout of a scale; Unexpected for arrays of none. names: its materials. whole: see `readout_to_arrays`."""
-    dimension, count = statistics.dimension, len(names)
-    references = reader.length(f"reference-{scale}", count)
-    held = reader.length(f"held-{scale}", count, references) if whole else count
+def stored_readout(reader: ArrayReader, scale: Scale, names: Sequence[str], dimension: int) -> Readout:
+    """The readout of a scale; Unexpected for arrays of none. names: its materials, the reference first."""
+    count = len(names)
+    near = reader.length(f"near-sizes-{scale}", count)
     parts: dict[str, npt.NDArray[Any]] = {
-        "reference": reader.places(f"reference-{scale}", references, count),
-        "held": reader.places(f"held-{scale}", held, count),
-        "rows": reader.floats(f"rows-{scale}", (held, 2, dimension)),
-        "sizes": reader.floats(f"sizes-{scale}", (held,), -1e300, 1e300),
         "origin": reader.floats(f"origin-{scale}", (dimension,)),
         "precision": reader.floats(f"precision-{scale}", (dimension,), 0.0, 1e300),
         "counts": reader.floats(f"counts-{scale}", (count,), 1.0, MOST_ROWS),
         "shape": reader.floats(f"shape-{scale}", (2,), 0.0, 1e300),
     }
     expect(parts["shape"][0] < 1, f"shape-{scale}", "a share below 1", parts["shape"])
-    own = parts["held"][:references]
-    expect(bool((own == parts["reference"]).all()), f"held-{scale}", "the reference first", own)
-    if whole:
-        rank = reader.length(f"signs-{scale}", System.most_columns(dimension), 0)
-        for name, shape in System.parts(dimension, rank).items():
-            parts[name] = reader.floats(f"{name}-{scale}", shape)
-    if whole and f"table-directions-{scale}" in reader.arrays:  # without them they are made again
-        directions = reader.length(f"table-directions-{scale}", dimension, axes=2)
-        for name, (kind, shape) in PruningTable.parts(count, dimension, directions).items():
-            parts[f"table-{name}"] = reader.finite(f"table-{name}-{scale}", kind, shape)
-    return readout_from_arrays(scale, names, parts, statistics)
+    for part, held, kinds in (("near", near, ("float64",)), ("others", count - near, ("float32", "float64"))):
+        parts[f"{part}-solved"] = solved = reader.floats(f"{part}-solved-{scale}", (held, dimension), kinds=kinds)
+        parts[f"{part}-sizes"] = reader.floats(f"{part}-sizes-{scale}", (held,), -1e300, 1e300)
+        # The means of the others are not read here, which would hold all of the mapped file: see `diagonal_distance`.
+        means = array(reader.arrays, f"{part}-means-{scale}", (str(solved.dtype),), (held, dimension))
+        expect(part == "others" or bool(np.isfinite(means).all()), f"near-means-{scale}", "finite numbers", "others")
+        parts[f"{part}-means"] = means
+    return readout_from_arrays(scale, names, parts)

@@ -11,8 +11,8 @@ behind (README), so of these it is asked that they are of exactly the materials 
 says the same again, to the bit, while others go on. Settled at the end, all is what a memory says that observed the
 same in one thread.
 
-In every other round materials are read from the memory when they are asked for, as otherwise beyond a thousand. What is
-solved for comes in another order then, and the bits of probability and novelty depend on that.
+In every other round few touches are sampled and few changes are followed, as if there were thousands. What is solved
+for comes in another order then, and the bits of probability and novelty depend on that.
 
 Nothing may be raised but what is named here for each call. A call that takes longer than two minutes hangs.
 """
@@ -46,11 +46,8 @@ from scroll_tactile_store import CompactedError
 import scroll_tactile.learner
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
-import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.fusion
-import scroll_tactile.prediction.model
 import scroll_tactile.prediction.predictor
-import scroll_tactile.readouts.readout
 from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of
 from scroll_tactile import TactileLearner
@@ -69,7 +66,7 @@ SAID = ({"silk": 1.0}, {"silk": 0.25, "wool": 0.75}, {"wool": 1.0})
 TAKEN_OUT = 8  # touches to calibrate on, in place of 96: many short fits, and not a few long ones
 HANGS = 120.0  # seconds
 SHOWN = 20  # failures of a round
-FEW = 2  # materials, changes and touches, in place of a thousand
+FEW = 2  # changes and touches, in place of a thousand
 
 Same = Callable[[Prediction, Prediction], bool]
 
@@ -135,15 +132,13 @@ def row_of(learner: TactileLearner) -> int:
 
 
 def learned_by(model: Any) -> Learned:
-    """What the readouts of a model are of, or would read if they were asked."""
+    """What the readouts of a model are of."""
     found = {}
     for scale, readout in model.readouts.items():
         sums = np.empty((len(readout.names), len(readout.origin)))
-        for place, name in enumerate(readout.names):
-            if (held := readout.held_means.rows.get(place)) is not None:
-                sums[place] = (readout.held_means.means[held] + readout.origin) * readout.counts[place]
-            else:
-                sums[place] = readout.statistics.sums(scale, [name])[0]
+        for place in range(len(readout.names)):
+            held, row = readout._at(place)
+            sums[place] = (held.means[row] + readout.origin) * readout.counts[place]
         found[int(scale)] = learned_of(readout.names, readout.counts, sums)
     return found
 
@@ -522,20 +517,16 @@ def short_fits() -> Iterator[None]:
 
 
 class FewSampled(TouchSample):
-    """Calibrated on so few touches that not all materials are among them, which are held from the first."""
+    """Calibrated on so few touches that not all materials are among them."""
 
     def __init__(self, capacity: int = FEW) -> None:
         super().__init__(capacity)
 
 
 @contextmanager
-def read_when_asked() -> Iterator[None]:
-    """While it lasts few materials are held, and few changes followed, as if there were thousands."""
+def few_sampled() -> Iterator[None]:
+    """While it lasts few touches are sampled, and few changes followed, as if there were thousands."""
     with ExitStack() as patched:
-        own = scroll_tactile.prediction
-        for place in (own.model, own.fitting, scroll_tactile.readouts.readout):
-            patched.enter_context(patch.object(place, "EAGER", FEW))
-        patched.enter_context(patch.object(scroll_tactile.readouts.readout, "MOST_HELD", 2 * FEW))
         patched.enter_context(patch.object(scroll_tactile.persistence.open_memory, "MOST_ADDED", FEW))
         patched.enter_context(patch.object(scroll_tactile.memory.state, "TouchSample", FewSampled))
         yield
@@ -563,7 +554,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
             seed = options.seed * 10_000 + rounds
             (where := home / f"round-{rounds}").mkdir()
             many = seed % 2 == 1
-            with read_when_asked() if many else nullcontext():
+            with few_sampled() if many else nullcontext():
                 same: Same = to_rounding if many else operator.eq
                 round_ = begun(where, seed)
                 with watched(round_.fail, same):

@@ -216,7 +216,7 @@ def test_readouts_solved_again_are_those_of_a_fit(monkeypatch):
         # As a fit solves it that would shrink the scatter as far.
         share = before.readouts[scale].share
         monkeypatch.setattr("scroll_tactile.readouts.task.shrinkage", lambda *_, share=share: share)
-        other = Task.of(memory.statistics, scale, names).solve(memory.statistics)
+        other = Task.of(memory.statistics, scale, names).solve()
         for kind in ("lda", "ridge"):
             places = [[each.places[name] for name in names] for each in (readout, other)]
             assert (readout.scores(codes, places[0], kind) == other.scores(codes, places[1], kind)).all()

@@ -17,7 +17,6 @@ from scroll_tactile.live import session
 from scroll_tactile.matching.likelihood import Likelihood, Noise
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.statistics.sample import TouchSample
 
 SETTINGS = {"sensor": PAD, "embedding": SMALL, "kept_touches": 8}  # with few kept ones a fit takes less
 TOUCHES = 5  # of each material: a model is followed for some touches, and fitted anew after more
@@ -149,125 +148,6 @@ def test_a_live_touch_is_answered_by_the_memory_as_it_was_when_it_began(monkeypa
     assert prediction == before.predict(live.touch)
 
 
-class SampleOfTwo(TouchSample):
-    def __init__(self, capacity=2):
-        super().__init__(capacity)
-
-
-MANY = "pqrstu"
-
-
-def of_many(name, seed):
-    return 0.15 * MANY.index(name) + 0.1 * touch("n", seed)
-
-
-@pytest.fixture
-def many(monkeypatch, tmp_path):
-    """Beyond a thousand, materials are read from the memory when they are asked for; here beyond two."""
-    for module in ("prediction.model", "readouts.readout"):
-        monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 2)
-    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SampleOfTwo)
-    with TactileLearner.open(tmp_path / "many", **SETTINGS) as learner:
-        for seed in range(3):
-            for name in MANY:
-                learner.observe(name, of_many(name, seed), source=f"{name}.csv")
-        learner.settle()
-        yield learner
-
-
-def read_later(model):
-    """The materials that a model has yet to read."""
-    readout = min(model.readouts.items())[1]
-    return [name for place, name in enumerate(readout.names) if place not in readout.held_means.rows]
-
-
-def require_alike(prediction, expected):
-    assert dict(prediction.ranking) == pytest.approx(dict(expected.ranking), rel=1e-9)  # solved for in another order
-    assert prediction.novelty == pytest.approx(expected.novelty, rel=1e-9)
-    assert prediction.typicality == expected.typicality
-
-
-def observing(learner, names, tmp_path):
-    for name in names:
-        for seed in range(4):
-            learner.observe(name, touch("n", 10 + seed))
-    learner.predict(of_many("p", 90))
-    learner.observe(names[0], of_many("p", 91))
-
-
-def merging(learner, names, tmp_path, compacted=False):
-    with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
-        for name in names:
-            for seed in range(4):
-                other.observe(name, touch("n", 10 + seed))
-        if compacted:
-            other.compact(keep=0)
-    learner.merge(tmp_path / "other", shared="twice")
-
-
-def forgetting(learner, names, tmp_path):
-    for name in names:
-        learner.forget(name)
-
-
-def retracting(learner, names, tmp_path):
-    for one in learner.observations():
-        if one.material in names and one.sequence > len(MANY):
-            learner.retract(one.sequence)
-
-
-def relabelling(learner, names, tmp_path):
-    for one in learner.observations():
-        if one.material in names and one.sequence > len(MANY):
-            learner.relabel(one.sequence, "p")
-
-
-@pytest.mark.parametrize(
-    ("change", "most_added"),
-    [(observing, 1024), (merging, 1024), (forgetting, 2), (retracting, 2), (relabelling, 2)],
-)
-def test_of_many_materials_too_a_live_touch_is_answered_as_it_was_when_it_began(
-    many, monkeypatch, tmp_path, change, most_added
-):
-    monkeypatch.setattr("scroll_tactile.persistence.open_memory.MOST_ADDED", most_added)
-    before = copy.deepcopy(many)
-    with many.live(contact="manual", risk=1e-12) as live:
-        live.begin()
-        changed = read_later(live._under_way.frozen.model)
-        assert len(changed) > 1
-        change(many, changed, tmp_path)
-        live.push(of_many(changed[0], 9)[:30])
-        prediction = live.end().prediction
-    require_alike(prediction, before.predict(live.touch))
-
-
-def test_of_many_materials_a_reader_answers_a_live_touch_as_it_was_when_it_began(many, tmp_path):
-    with TactileLearner.open(many.path, mode="read") as reader:
-        before = copy.deepcopy(reader)
-        with reader.live(contact="manual", risk=1e-12) as live:
-            live.begin()
-            changed = read_later(live._under_way.frozen.model)
-            observing(many, changed, tmp_path)
-            merging(many, changed, tmp_path, compacted=True)  # one row, in which a whole memory came
-            assert reader.refresh()
-            live.push(of_many(changed[0], 9)[:30])
-            prediction = live.end().prediction
-        require_alike(prediction, before.predict(live.touch))
-
-
-def test_a_model_of_many_materials_has_no_later_touches(many, tmp_path):
-    model = many.model()
-    expected, changed = many.model(), read_later(model)
-    asked = {
-        scale: expected.readouts[scale].linear([*changed], "lda")[0].tobytes() for scale in sorted(expected.readouts)
-    }
-    observing(many, changed, tmp_path)
-    forgetting(many, changed[:1], tmp_path)
-    assert asked == {
-        scale: model.readouts[scale].linear([*changed], "lda")[0].tobytes() for scale in sorted(model.readouts)
-    }
-
-
 @pytest.mark.parametrize("readings", [50, 12])
 def test_a_prediction_is_of_one_state_that_there_was(monkeypatch, readings):
     learner = learned()
@@ -297,7 +177,7 @@ def test_a_held_model_stays_as_it_is_and_what_nobody_holds_is_followed_in_place(
 def _arrays(model):
     found = {}
     for scale, readout in model.readouts.items():
-        found |= {f"{scale} {name}": getattr(readout.held_means, name) for name in ("means", "solved", "sizes")}
+        found |= {f"{scale} {name}": getattr(readout.near, name) for name in ("means", "solved", "sizes")}
         found[f"{scale} counts"] = readout.counts
         rank = readout.system.rank
         found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}

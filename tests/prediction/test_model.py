@@ -1,4 +1,4 @@
-"""The model: scenes, materials that no sampled touch is of, and readouts that hold only the materials asked for."""
+"""The model: scenes, and materials that no sampled touch is of."""
 
 from functools import cache
 
@@ -86,25 +86,6 @@ def test_a_scene_of_ten_thousand_names():
         learner.predict(probe, scene=[*NAMES, *(f"nobody's {i}" for i in range(10_000))])
     assert len(str(raised.value)) < 2000
     assert learner.predict(probe, scene=[NAMES[3]]).ranking == ((NAMES[3], 1.0),)
-
-
-@pytest.mark.parametrize("touches", [1, 2])
-def test_materials_held_only_when_asked_for_are_weighed_alike(monkeypatch, touches):
-    """Of a memory of more materials than are solved for at once, in which a few are of sampled touches."""
-    monkeypatch.setattr("scroll_tactile.memory.state.TouchSample", SmallSample)
-    plain = learner_of(touches)
-    monkeypatch.setattr("scroll_tactile.readouts.readout.EAGER", 3)
-    held = learner_of(touches)
-    for i in range(8):
-        scene = [NAMES[place] for place in {i % 12, (5 * i + 1) % 12, (7 * i + 3) % 12}]
-        for chosen in (scene, NAMES[i % 10 : i % 10 + 2], None):
-            ours, theirs = (learner.predict(stream(i % 12, 50 + i), scene=chosen) for learner in (plain, held))
-            assert dict(ours.ranking) == pytest.approx(dict(theirs.ranking), rel=1e-7, abs=1e-9)
-            assert ours.novelty == pytest.approx(theirs.novelty, rel=1e-7, abs=1e-7)
-        for learner in (plain, held):  # materials that were held, that were not, and new ones
-            learner.observe([*NAMES, "new", "newer"][5 * i % 14], stream(5 * i % 14, 100 + i))
-            if (fit := learner._predictor.current._fit) is not None:  # both go on with what a thread fitted
-                fit.future.result()
 
 
 def test_a_scale_at_which_no_sampled_touch_was_read(monkeypatch):

@@ -112,15 +112,3 @@ def test_joined_kernels_have_views(viewed):
     assert right(joined, ASKED, lasting(2)) >= 0.95
     mixed = learned(TOUCHES[:2], Joined(Kernels(dimension=64), Windowed(seed=2, dimension=64)))
     assert mixed.plan.views == ()
-
-
-def test_of_many_materials_the_answer_is_that_of_few(monkeypatch, viewed):
-    """Beyond a thousand, scores in single precision choose those that are solved for; here beyond four."""
-    for module in ("prediction.model", "readouts.readout"):
-        monkeypatch.setattr(f"scroll_tactile.{module}.EAGER", 4)
-    many = learned(TOUCHES, Kernels(dimension=256))
-    for times in (0.5, 1, 2):
-        for _, touch in ASKED[::6]:
-            ours, theirs = (learner.predict(lasting(times)(touch)) for learner in (viewed, many))
-            assert dict(theirs.ranking) == pytest.approx(dict(ours.ranking), rel=1e-5, abs=1e-6)
-            assert theirs.novelty == pytest.approx(ours.novelty, rel=1e-6, abs=1e-6)

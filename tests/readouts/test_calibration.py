@@ -48,7 +48,7 @@ def scene(noises=(20_000, 20_000), materials=6, touches=120, seed=0, unit=40_000
 def stages_of(statistics, pool, kind="lda", stages=STAGES):
     scales = sorted({scale for stage in stages for scale in stage})
     tasks = [Task.of(statistics, scale, statistics.names(scale)) for scale in scales]
-    readouts = {task.scale: task.solve(statistics) for task in tasks}
+    readouts = {task.scale: task.solve() for task in tasks}
     apart = {scale: held_out_scores(readout, pool, stages, kind) for scale, readout in readouts.items()}
     return [
         calibrate_stage(
@@ -132,8 +132,8 @@ def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(un
     for stage, scales in zip(stages_of(statistics, sample), STAGES, strict=True):
         ahead = np.zeros((6, 6))
         for weight, scale in zip(stage.weights, scales, strict=True):
-            readout = Task.of(statistics, scale, statistics.names(scale)).solve(statistics)
-            own = [readout.scores(mean, range(6), "lda") for mean in readout.means_solved()[0] + readout.origin]
+            readout = Task.of(statistics, scale, statistics.names(scale)).solve()
+            own = [readout.scores(mean, range(6), "lda") for mean in readout.near.means + readout.origin]
             ahead += weight * (np.diagonal(own)[:, None] - own)
         np.fill_diagonal(ahead, np.inf)
         assert np.median(ahead.min(axis=1)) == pytest.approx(AHEAD, rel=1e-6)
@@ -155,7 +155,7 @@ def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are
     statistics, sample = scene(materials=2, touches=4)
     (stage,) = stages_of(statistics, sample, stages=STAGES[:1])
     assert len(stage.novelties) == 0
-    readout = Task.of(statistics, SCALES[0], ["0", "1"]).solve(statistics)
+    readout = Task.of(statistics, SCALES[0], ["0", "1"]).solve()
     means = statistics.sums(SCALES[0], ["0", "1"]) / statistics.counts(SCALES[0], ["0", "1"])[:, None]
     typical = np.mean([readout.novelty(mean, [0, 1]) for mean in means])
     size = np.diagonal(readout.derived().gram).mean()
@@ -250,7 +250,7 @@ def test_new_touches_are_told_where_most_of_them_lie_above_the_threshold():
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_will_be(kind):
     statistics, sample = scene(noises=(20_000, 60_000), touches=60)
-    readouts = [Task.of(statistics, scale, statistics.names(scale)).solve(statistics) for scale in SCALES]
+    readouts = [Task.of(statistics, scale, statistics.names(scale)).solve() for scale in SCALES]
     apart = [held_out_scores(readout, sample, STAGES, kind) for readout in readouts]
     materials = [material for material, *_ in sample]
     found = StageScores(1, sample, apart)

@@ -93,7 +93,7 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     statistics, sample = learned(touches, unsampled, again)
     reference = [name for name in statistics.names(SCALE) if name not in unsampled]
     task = Task.of(statistics, SCALE, reference)
-    readout = task.solve(statistics)
+    readout = task.solve()
     found = held_out_scores(readout, sample, STAGES, kind)
     assert found.names == reference
     total = Fraction(int(statistics.second(SCALE).rows))
@@ -123,7 +123,7 @@ def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_
     touches = touches_of(kinds, seed, offset)
     statistics, sample = learned(touches, again=again)
     reference = statistics.names(SCALE)
-    readout = Task.of(statistics, SCALE, reference).solve(statistics)
+    readout = Task.of(statistics, SCALE, reference).solve()
     total = Fraction(int(statistics.second(SCALE).rows))
     places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
     rng = np.random.default_rng(seed + 1)
@@ -159,7 +159,7 @@ def test_of_few_touches_the_left_out_scores_find_the_materials(kind):
 def heavily_shrunk(statistics):
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr("scroll_tactile.readouts.task.shrinkage", lambda *_: 0.999)
-        return Task.of(statistics, SCALE, [*"abcd"]).solve(statistics)
+        return Task.of(statistics, SCALE, [*"abcd"]).solve()
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
@@ -167,12 +167,12 @@ def test_materials_of_one_touch_and_stages_that_were_not_reached_are_not_there(k
     touches = touches_of([(0, 3, 1), (0, 1, 1), (1, 2, 1)], 0, 0)
     statistics, sample = learned(touches)
     task = Task.of(statistics, SCALE, ["a", "b"])
-    found = held_out_scores(task.solve(statistics), sample, STAGES, kind)
+    found = held_out_scores(task.solve(), sample, STAGES, kind)
     assert sorted(found.rows) == [(0, 0), (0, 1), (0, 2), (1, 0)]
     assert (
         found.scores.shape == found.z.shape == found.distances.shape == (*found.diagonal_distances.shape, 2) == (4, 2)
     )
     alone, none = learned(touches[2:])
     task = Task.of(alone, SCALE, ["b"])
-    empty = held_out_scores(task.solve(alone), none, STAGES, kind)
+    empty = held_out_scores(task.solve(), none, STAGES, kind)
     assert (empty.rows, empty.scores.shape) == ({}, (0, 1))

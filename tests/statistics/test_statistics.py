@@ -1,8 +1,5 @@
 """Statistics: an algebra of exact integers, compared in bytes."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -73,32 +70,6 @@ def test_a_difference_takes_out_again(a, b):
     same((of(a) + of(b)) - of(b), of(a))
     same((of(a) + of(b)) - of(a), of(b))
     same(of(a) - of(a), Statistics(DIMENSION, SCALES))
-
-
-def counts_and_sums(of_these, names):
-    """What they say of some materials, where nothing must be left out."""
-    return {scale: (of_these.counts(scale, names).tolist(), of_these.sums(scale, names).tolist()) for scale in SCALES}
-
-
-@few
-@given(touches, touches, st.randoms(use_true_random=False))
-def test_a_snapshot_stays_as_it_was_and_so_does_each_of_several(a, b, random):
-    statistics, taken = of(a), []
-    changes = [(one, statistics.add) for one in b] + [(one, statistics.remove) for one in a]
-    random.shuffle(changes)
-    for one, change in [*changes, (0, statistics.add)]:
-        names = sorted(statistics.materials)
-        taken.append((statistics.snapshot(), names, counts_and_sums(statistics, names)))
-        change(*touch(one))
-    for other in (copy.deepcopy(statistics), pickle.loads(pickle.dumps(statistics))):
-        names = sorted(statistics.materials)
-        taken.append((statistics.snapshot(), names, counts_and_sums(statistics, names)))
-        other.add(*touch(3))
-        undo = statistics.undo(touch(4)[0], 0)
-        statistics.add(*touch(4))
-        undo()
-    for snapshot, names, said in taken:
-        assert counts_and_sums(snapshot, names) == said
 
 
 @few

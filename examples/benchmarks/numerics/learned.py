@@ -63,7 +63,7 @@ def name_of(place: int) -> str:
 
 def solved(statistics: Statistics) -> Readout:
     """The readout of statistics, all materials its reference."""
-    return Task.of(statistics, SCALE, statistics.names(SCALE)).solve(statistics)
+    return Task.of(statistics, SCALE, statistics.names(SCALE)).solve()
 
 
 def asked(readout: Readout, codes: npt.NDArray[np.integer]) -> Answers:
@@ -99,7 +99,7 @@ def measure_learned(memory: Memory) -> list[Record]:
     truth = truth_of(memory, memory.codes, readout)
     true = truth.answers(evaluated)
     free = truth_of(memory, memory.units, readout)
-    solution = readout.gamma * readout.means_solved()[1].T
+    solution = readout.gamma * readout.near.solved.T
     weights = solution - solution.mean(axis=1, keepdims=True)
     share = truth.share(len(memory.places), LEAST, LARGEST)
     base = {"case": memory.name, "family": memory.family, "penalty": readout.penalty}

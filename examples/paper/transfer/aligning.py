@@ -169,7 +169,7 @@ class OneReadout(_Touches):
             raise InputError("expected touches to have been learned; there are none. Call observe first")
         statistics = parts[0] if len(parts) == 1 else parts[0] + parts[1]
         names = statistics.names(WHOLE)
-        readout = Task.of(statistics, WHOLE, names).solve(statistics)
+        readout = Task.of(statistics, WHOLE, names).solve()
         return readout, [i for i, name in enumerate(names) if not name.startswith(_OLD)]
 
 

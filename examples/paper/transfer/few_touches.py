@@ -105,7 +105,7 @@ class WidestReadout:
         names = self._statistics.names(WHOLE)
         if not names:
             raise InputError("expected a readout that has learned something; it has not. Call observe first")
-        self._readout = self._readout or Task.of(self._statistics, WHOLE, names).solve(self._statistics)
+        self._readout = self._readout or Task.of(self._statistics, WHOLE, names).solve()
         mean = in_units(self._features(stream), self._features.embedding.bound).mean(axis=0)
         return names[int(self._readout.scores(mean, range(len(names)), "lda").argmax())]
 

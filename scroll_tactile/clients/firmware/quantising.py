@@ -88,12 +88,12 @@ def _readouts(memory: Memory, names: Sequence[str]) -> list[Readout]:
     widths = [scale for scale in memory.plan.windows if not set(names) - set(statistics.names(scale))]
     if not widths:
         raise InputError(f"expected materials with a touch of {memory.plan.widths[0]} readings; {names} have none")
-    return [Task.of(statistics, scale, names, memory.plan.shrinkage).solve(statistics) for scale in widths]
+    return [Task.of(statistics, scale, names, memory.plan.shrinkage).solve() for scale in widths]
 
 
 def _calibrations(memory: Memory, readouts: Sequence[Readout]) -> list[tuple[int, Calibration]]:
     """The least readings of each stage that these windows judge, and its calibration by the scene's sampled touches."""
-    plan, names = memory.plan, {readouts[0].names[place] for place in readouts[0].reference}
+    plan, names = memory.plan, set(readouts[0].reference)
     sample = [touch for touch in memory.sample if touch[0] in names]
     judging = [plan.judging(length) for length in plan.milestones()]
     stages = [[*scales, *plan.views] for scales in judging]  # a sampled touch's rows are numbered so
@@ -120,7 +120,7 @@ class _Quantised:
 
     def __init__(self, readout: Readout) -> None:
         self._readout = readout
-        solved, shares = readout.means_solved()[1], readout.shares
+        solved, shares = readout.near.solved, readout.shares
         # z about the mean of the scene's materials, for features in 0 … 1.
         self._weights = readout.gamma * (solved - shares @ solved) * 2.0**BITS
         self._offsets = -(self._weights @ readout.origin) / 2.0**BITS - readout.derived().towards

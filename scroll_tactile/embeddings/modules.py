@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Capabilities, canary
-from scroll_tactile.embeddings.runtimes import steady
+from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.libraries import optional
 from scroll_tactile.signals.augmentation import fit

@@ -102,7 +102,6 @@ def test_cosines_approximate_a_kernel_of_the_surface_alone():
         ({"seed": -1}, "came 0 and -1"),
         ({"seed": np.nan}, "came 0 and nan"),
         ({"cosines": 9, "weights": NETWORK}, "with weights"),
-        ({"runtime": "onnxruntime"}, "expected a runtime with weights"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(bad, said):

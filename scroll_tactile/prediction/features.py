@@ -9,8 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_competing, embed_windows, require_rest
-from scroll_tactile.errors import EmbeddingError
+from scroll_tactile.embeddings.protocol import (
+    Embedding,
+    capabilities_of,
+    embed_competing,
+    embed_windows,
+    require_features,
+    require_rest,
+)
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.touch_rows import Codes
@@ -253,12 +259,8 @@ class FeatureExtractor:
             embedded = self._embedded(image, every)
             return embedded, {WHOLE: embedded.pop(width)}
         features, competing = embed_competing(self._embedding, image, every, width)
-        embedded = self._sound(features, every)
-        if competing.shape != (self._embedding.dimension,):
-            raise EmbeddingError(
-                f"expected competing features of shape ({self._embedding.dimension},) from {self._embedding.name!r}; "
-                f"came {competing.shape}"
-            )
+        embedded = self._sound(image, features, every)
+        self._require(image, competing, (), "all, by competing kernels,")
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
@@ -278,19 +280,20 @@ class FeatureExtractor:
         return {WHOLE: whole, SHAPE: shape_image(whole)}
 
     def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
-        return self._sound(embed_windows(self._embedding, image, windows), windows)
+        return self._sound(image, embed_windows(self._embedding, image, windows), windows)
 
     def _sound(
-        self, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
+        self, image: Image, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
     ) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of windows, checked: raises EmbeddingError for another shape."""
+        """The features of windows. All features that are learned or judged by pass here, and are checked here."""
         for width, features in embedded.items():
-            expected = (len(windows[width]), self._embedding.dimension)
-            if features.shape != expected:
-                raise EmbeddingError(
-                    f"expected features of shape {expected} from {self._embedding.name!r}; came {features.shape}"
-                )
+            self._require(image, features, (len(windows[width]),), f"windows of {width} steps")
         return embedded
+
+    def _require(self, image: Image, features: npt.NDArray[np.floating], rows: tuple[int, ...], what: str) -> None:
+        channels, steps = image.shape
+        touch = f"{what} of a touch of {channels} × {steps}"
+        require_features(self._embedding, features, (*rows, self._embedding.dimension), touch)
 
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.

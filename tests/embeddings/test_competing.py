@@ -124,6 +124,6 @@ def test_competing_features_of_another_shape_are_refused():
 
     learner = TactileLearner(sensor=PAD, embedding=Short(dimension=64))
     with pytest.raises(
-        EmbeddingError, match=r"expected competing features of shape \(64,\) from 'kernels'; came \(63,\)"
+        EmbeddingError, match=r"'kernels' .* expected features of shape \(64,\) of all, by competing .*; came \(63,\)"
     ):
         learner.observe("felt", np.linspace([0.0, 1.0], [1.0, 0.0], 50))

@@ -41,7 +41,6 @@ if typing.TYPE_CHECKING:
     )
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.settings import Settings
-    from scroll_tactile.signals.copies import Augmented
     from scroll_tactile.signals.stream import Stream
     from scroll_tactile.simulation.scene import Scene
     from scroll_tactile.testing.embedding_checks import check_embedding
@@ -51,7 +50,6 @@ __all__ = [
     "Adaptation",
     "Annotated",
     "AnswerLog",
-    "Augmented",
     "Candidates",
     "Capabilities",
     "Compacted",
@@ -101,7 +99,6 @@ _MODULES = {
     "Adaptation": "results",
     "Annotated": "clients.learning.annotating.annotation_run",
     "AnswerLog": "clients.learning.annotating.answer_log",
-    "Augmented": "signals.copies",
     "Candidates": "results",
     "Capabilities": "embeddings.protocol",
     "Compacted": "results",

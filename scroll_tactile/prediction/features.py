@@ -22,7 +22,6 @@ from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.image import shape_image, stretched, tactile_image
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scale, WindowPlan
@@ -96,7 +95,7 @@ class WindowCache:
 
 
 class FeatureExtractor:
-    """Makes features of touches, by a sensor, an embedding, a plan of windows and an augmentation; it learns nothing.
+    """Makes features of touches, by a sensor, an embedding and a plan of windows; it learns nothing.
 
     check: of the embedding's fingerprint, if the embedding was made from the memory's configuration.
 
@@ -108,14 +107,12 @@ class FeatureExtractor:
         sensor: Sensor,
         embedding: Embedding,
         plan: WindowPlan,
-        augmentation: Augmented | None,
         check: FingerprintCheck | None = None,
     ) -> None:
         self._check, self._own = check, True
         self._sensor = sensor
         self._embedding = embedding
         self._plan = plan
-        self._augmentation = augmentation
         require_rest(embedding, sensor)
         self._rest: Rest = capabilities_of(embedding).rest
 
@@ -131,7 +128,7 @@ class FeatureExtractor:
 
     def with_embedding(self, embedding: Embedding) -> FeatureExtractor:
         """The same with an embedding that gives the same features."""
-        other = FeatureExtractor(self._sensor, embedding, self._plan, self._augmentation, self._check)
+        other = FeatureExtractor(self._sensor, embedding, self._plan, self._check)
         other._own = False
         return other
 
@@ -165,22 +162,10 @@ class FeatureExtractor:
     def learned(self, stream: Stream) -> tuple[int, Codes]:
         """What a memory learns of a `stream`: its steps, and the `codes` that it adds. Raises as `verified`."""
         image = self.verified().image(stream)
-        return image.shape[1], self.codes(image, stream.key)
+        return image.shape[1], self.codes(image)
 
-    def codes(self, image: Image, key: bytes) -> Codes:
-        """The quantised features that a touch adds to the statistics, rows by scale: its own, then those of its copies.
-
-        Its own come first: the sample finds them by their place. Copies are no longer than the touch, so they have no
-        other scales.
-        """
-        copies = self._augmentation.copies_of(image, key) if self._augmentation is not None else []
-        own, *others = [self._stage_rows(picture) for picture in (image, *copies)]
-        return {
-            scale: np.concatenate([first, *(other[scale] for other in others if scale in other)])
-            for scale, first in own.items()
-        }
-
-    def _stage_rows(self, image: Image) -> Codes:
+    def codes(self, image: Image) -> Codes:
+        """The quantised features that a touch adds to the statistics, rows by scale."""
         stages, places = self._plan.scored_stages(image.shape[1]), self._plan.places(image.shape[1])
         features = self.features(image, places=places)
         codes = {scale: to_codes(rows, self._embedding.bound) for scale, rows in features.items()}

@@ -159,8 +159,6 @@ def test_planes_are_scaled_as_in_the_networks_training():
         {"stages": (2, 1)},
         {"stages": (1, 1)},
         {"stages": (5,)},
-        {"runtime": "tensorrt"},
-        {"precision": "int8"},
         {"seed": None},
         {"depth": 19},
     ],

@@ -31,7 +31,7 @@ from scroll_tactile import sensors
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.steady import one_torch_thread
-from scroll_tactile.signals.image import tactile_image, three_planes
+from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.scene import Scene
 
@@ -151,7 +151,7 @@ def _start(bench: Bench, memory: str, touches: Path, test: int, stack: ExitStack
 def _forward(seed: int, readings: npt.NDArray[np.float32]) -> Callable[[], object]:
     """A bare forward pass of the touch that `readings` are, on one thread."""
     network = ResNet.random(seed).eval()
-    image = torch.from_numpy(three_planes(tactile_image(validate(readings, sensors.BIOTAC)))[None])
+    image = torch.from_numpy(np.stack([tactile_image(validate(readings, sensors.BIOTAC))] * 3))[None]
 
     def forward() -> None:
         with torch.inference_mode(), one_torch_thread():

@@ -16,6 +16,7 @@ from examples.benchmarks.interleaved import AsIs
 from examples.benchmarks.live_shift import _scored
 from examples.benchmarks.shift import Shift, Truth, quiet_noise, resting_level, shift_of
 from scroll_tactile import sensors
+from scroll_tactile.errors import InputError
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene

@@ -14,7 +14,6 @@ from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.embeddings.vision import pool_windows, to_planes
 from scroll_tactile.errors import InputError
-from scroll_tactile.signals.image import three_planes
 
 REAL = Path.home() / ".cache" / "scroll-tactile" / "weights" / "resnet18_imagenet_vq.safetensors"
 RANDOM = Vision(None, seed=0)
@@ -31,7 +30,7 @@ def test_features_are_the_definition(real_weights):
     """Each stage averaged over rows and columns and scaled to length 1, by NumPy, from the unfolded network."""
     vision, picture = Vision(real_weights, stages=(1, 3, 4)), image(19, 60)
     mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
-    planes = ((three_planes(picture) + 1) / 2 - mean[:, None, None]) / deviation[:, None, None]
+    planes = ((np.stack([picture] * 3) + 1) / 2 - mean[:, None, None]) / deviation[:, None, None]
     with torch.no_grad():
         maps = vision.network().net(torch.from_numpy(planes[None].astype(np.float32)))
     parts = [maps[stage][0].double().numpy().mean(axis=(1, 2)) for stage in (1, 3, 4)]

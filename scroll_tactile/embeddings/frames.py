@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.convolution.banks import LEVELS, to_levels
+from scroll_tactile.embeddings.convolution import LEVELS, to_levels
 from scroll_tactile.embeddings.kernels import angles
 from scroll_tactile.embeddings.protocol import Capabilities, canary
 from scroll_tactile.embeddings.steady import steady

@@ -10,9 +10,18 @@ from images import image
 from touches import PAD
 
 from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.embeddings.convolution.banks import LEVELS, MOST_CHANNELS, bank, to_levels
-from scroll_tactile.embeddings.convolution.counting import GROUP, WEIGHT, competing_counts, competing_groups
-from scroll_tactile.embeddings.convolution.responses import HEAVY, TAPS
+from scroll_tactile.embeddings.convolution import (
+    GROUP,
+    HEAVY,
+    LEVELS,
+    MOST_CHANNELS,
+    TAPS,
+    WEIGHT,
+    bank,
+    competing_counts,
+    competing_groups,
+    to_levels,
+)
 from scroll_tactile.embeddings.joined import Joined
 from scroll_tactile.embeddings.kernels import _dilations, groups_by_dilation
 from scroll_tactile.errors import EmbeddingError

@@ -104,5 +104,5 @@ def test_copies_for_baselines_differ_and_are_never_too_short_to_be_streams():
     streams = [("felt", touch(i)) for i in range(3)]
     made, again = (_copies(streams, Augmentation(), 5) for _ in range(2))
     assert made == again and len({len(stream) for _, stream in made}) > 1
-    short = Augmentation(0, (0.05, 0.05), keep=0.1)
+    short = Augmentation(0, (0.02, 0.02), keep=0.1)
     assert {len(stream) for _, stream in _copies(streams, short, 0)} == {fewest_readings(PAD)}

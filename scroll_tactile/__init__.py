@@ -39,7 +39,6 @@ if typing.TYPE_CHECKING:
     )
     from scroll_tactile.sensors import Sensor
     from scroll_tactile.settings import Settings
-    from scroll_tactile.signals.copies import Augmented
     from scroll_tactile.signals.stream import Stream
     from scroll_tactile.simulation.scene import Scene
     from scroll_tactile.testing.embedding_checks import check_embedding
@@ -47,7 +46,6 @@ if typing.TYPE_CHECKING:
 
 __all__ = [
     "Adaptation",
-    "Augmented",
     "Candidates",
     "Capabilities",
     "Compacted",
@@ -94,7 +92,6 @@ __version__ = "0.15.0"
 # Imported on first use: a sensor's name should not wait for the libraries behind a learner.
 _MODULES = {
     "Adaptation": "results",
-    "Augmented": "signals.copies",
     "Candidates": "results",
     "Capabilities": "embeddings.protocol",
     "Compacted": "results",

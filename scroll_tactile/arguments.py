@@ -9,7 +9,6 @@ from typing import Any
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor, known
-from scroll_tactile.signals.copies import Augmented
 
 __all__ = ["require_arguments", "silent"]
 
@@ -60,7 +59,6 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "descriptions": ("'same', 'ours' or 'theirs'", lambda value: value in ("same", "ours", "theirs")),
     "sensor": ("a Sensor", lambda value: isinstance(value, Sensor)),
     "embedding": ("an embedding, such as Kernels()", _is_embedding),
-    "augmentation": ("an Augmented", lambda value: isinstance(value, Augmented)),
     "unfamiliar": ("a probability from 0 to 1", _is_probability),
     "after": _ROW,
     "until": _ROW,
@@ -79,7 +77,7 @@ def _advice(name: str, value: Any) -> str:
     """What was probably meant."""
     if name == "sensor" and isinstance(value, str) and value in known():
         return f". Use sensors.{value.upper().replace('-', '_')}"
-    if name in ("sensor", "embedding", "augmentation") and isinstance(value, type):
+    if name in ("sensor", "embedding") and isinstance(value, type):
         return f". Call it: {value.__name__}(...)"
     if name == "embedding" and isinstance(value, str) and value.lower() in ("kernels", "frames", "vision"):
         return f". Use {value.capitalize()}(...)"

@@ -47,7 +47,6 @@ from scroll_tactile.results import (
 )
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings, names_of, require_name, require_source, require_text
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.ranges import range_problem
 from scroll_tactile.signals.stream import Stream, validate
@@ -76,7 +75,6 @@ class TactileLearner:
 
     sensor: whose streams it reads. embedding: the frozen features; `Kernels()` unless given, and `Frames()` for a
     camera. Of a camera's frames only those count in which the gel is pressed (see `signals.contact`).
-    augmentation: the copies that each touch is observed with, as one observation; see `Augmented`.
     settings: readout, false_alarms, kept_touches and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
@@ -92,11 +90,10 @@ class TactileLearner:
         *,
         sensor: Sensor,
         embedding: Embedding | None = None,
-        augmentation: Augmented | None = None,
         **settings: Any,
     ) -> None:
         require_arguments({"sensor": sensor})
-        self._set_up(Predictor.new(RecipeRequest.of(sensor, embedding, augmentation, settings).recipe()))
+        self._set_up(Predictor.new(RecipeRequest.of(sensor, embedding, settings).recipe()))
 
     def _set_up(self, predictor: Predictor, snapshot_of: str | None = None) -> None:
         self._predictor, self._snapshot_of, self._range_warned = predictor, snapshot_of, False
@@ -108,14 +105,13 @@ class TactileLearner:
         *,
         sensor: Sensor | None = None,
         embedding: Embedding | None = None,
-        augmentation: Augmented | None = None,
         mode: Literal["write", "read"] = "write",
         **settings: Any,
     ) -> TactileLearner:
         """Open the memory in folder `path`, or make a new one there; the other arguments are those of the class.
 
-        An existing memory knows what it was made with: leave out sensor, augmentation, exemplars, and an embedding that
-        ships with scroll-tactile. Nothing is embedded before the first touch.
+        An existing memory knows what it was made with: leave out sensor, exemplars, and an embedding that ships with
+        scroll-tactile. Nothing is embedded before the first touch.
         mode: "read" shows what was committed when it was opened, also while another process writes the memory.
 
         Raises SensorMismatchError, EmbeddingMismatchError or MismatchError for a memory made with others, or with a
@@ -124,7 +120,7 @@ class TactileLearner:
         """
         require_arguments({"path": path, "mode": mode})
         learner = cls.__new__(cls)
-        learner._set_up(Predictor.open(path, RecipeRequest.of(sensor, embedding, augmentation, settings), mode))
+        learner._set_up(Predictor.open(path, RecipeRequest.of(sensor, embedding, settings), mode))
         return learner
 
     @property
@@ -157,11 +153,6 @@ class TactileLearner:
     def embedding(self) -> Embedding:
         """The frozen features that it learns."""
         return self._recipe.embedding
-
-    @property
-    def augmentation(self) -> Augmented | None:
-        """The copies that each touch is observed with."""
-        return self._recipe.augmentation
 
     @property
     def settings(self) -> Settings:

@@ -13,7 +13,6 @@ from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import Settings
-from scroll_tactile.signals.copies import Augmented, require_augmentable
 from scroll_tactile.signals.windows import WindowPlan
 
 __all__ = ["Recipe", "RecipeRequest", "default_embedding", "default_kept_touches"]
@@ -29,17 +28,10 @@ class Recipe:
 
     sensor: Sensor
     embedding: Embedding
-    augmentation: Augmented | None
     settings: Settings
 
     @classmethod
-    def of(
-        cls,
-        sensor: Sensor,
-        embedding: Embedding,
-        augmentation: Augmented | None = None,
-        settings: Settings | None = None,
-    ) -> Self:
+    def of(cls, sensor: Sensor, embedding: Embedding, settings: Settings | None = None) -> Self:
         """The recipe with the default numbers of exemplars and kept touches where the settings say none."""
         given = Settings() if settings is None else settings
         exemplars, kept_touches = given.exemplars, given.kept_touches
@@ -48,7 +40,7 @@ class Recipe:
         if kept_touches is None:
             kept_touches = default_kept_touches(sensor, views=window_plan(sensor, embedding).whole > 0)
         resolved = given.model_copy(update={"exemplars": exemplars, "kept_touches": kept_touches})
-        return cls(sensor, embedding, augmentation, resolved)
+        return cls(sensor, embedding, resolved)
 
     @cached_property
     def plan(self) -> WindowPlan:
@@ -77,20 +69,13 @@ class RecipeRequest:
 
     sensor: Sensor | None
     embedding: Embedding | None
-    augmentation: Augmented | None
     settings: Settings
 
     @classmethod
-    def of(
-        cls,
-        sensor: Sensor | None,
-        embedding: Embedding | None,
-        augmentation: Augmented | None,
-        settings: Mapping[str, Any],
-    ) -> Self:
+    def of(cls, sensor: Sensor | None, embedding: Embedding | None, settings: Mapping[str, Any]) -> Self:
         """What a public call was given. Raises InputError for anything else."""
-        require_arguments({}, {"sensor": sensor, "embedding": embedding, "augmentation": augmentation})
-        return cls(sensor, embedding, augmentation, Settings(**settings))
+        require_arguments({}, {"sensor": sensor, "embedding": embedding})
+        return cls(sensor, embedding, Settings(**settings))
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -98,17 +83,16 @@ class RecipeRequest:
         return _arguments(self)
 
     def recipe(self) -> Recipe:
-        """The recipe of a new memory. Raises InputError without a sensor, or for an augmentation that is not for it."""
+        """The recipe of a new memory. Raises InputError without a sensor."""
         if self.sensor is None:
             raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
-        require_augmentable(self.sensor, self.augmentation)
         embedding = default_embedding(self.sensor) if self.embedding is None else self.embedding
-        return Recipe.of(self.sensor, embedding, self.augmentation, self.settings)
+        return Recipe.of(self.sensor, embedding, self.settings)
 
 
 def _arguments(made: Recipe | RecipeRequest) -> dict[str, Any]:
     kept = {"exemplars": made.settings.exemplars, "kept_touches": made.settings.kept_touches}
-    return {"sensor": made.sensor, "embedding": made.embedding, "augmentation": made.augmentation, **kept}
+    return {"sensor": made.sensor, "embedding": made.embedding, **kept}
 
 
 def default_embedding(sensor: Sensor) -> Embedding:

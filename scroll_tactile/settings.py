@@ -62,7 +62,8 @@ def _described(error: ValidationError, model: type[BaseModel]) -> str:
     first = error.errors()[0]
     name = str(first["loc"][0]) if first["loc"] else model.__name__
     if first["type"] == "extra_forbidden":
-        return f"{name!r} is no setting of {model.__name__}; there are {', '.join(model.model_fields)}"
+        left = ". It left with 0.16: flip, crop and jitter are of fine-tuning" if name == "augmentation" else ""
+        return f"{name!r} is no setting of {model.__name__}; there are {', '.join(model.model_fields)}{left}"
     if first["type"] == "missing":
         return f"{model.__name__} needs {name}"
     what = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")

@@ -267,7 +267,6 @@ IDENTITIES: dict[str, dict[str, list[Any]]] = {
         "embedding": ["x", {}, [], None],
         "grid": [None, {}, {"bits": 20, "scales": ["a"]}, {"bits": 20, "scales": []}, {"bits": True, "scales": [15]}],
         "exemplars": ["abc", [1], -1, True, 10**30, None],
-        "augmentation": [{"x": 1}, "x", {"copies": 10**9}, {"copies": 2, "speed": 1e300}, {"copies": True}],
         "kept_touches": ["x", -1, True, 10**30, None],
         "views": [1, "true", None],
         "reading": [[1, "all"], ["x", "y"], [True], None],

@@ -11,7 +11,7 @@ import torch
 from scroll_tactile_store import NotAStoreError, Store, StoreError
 
 import scroll_tactile
-from scroll_tactile import Kernels, Prediction, Sensor, TactileLearner, sensors
+from scroll_tactile import Joined, Kernels, Prediction, Sensor, TactileLearner, sensors
 from scroll_tactile.errors import (
     CapacityError,
     ChannelCountError,
@@ -360,15 +360,41 @@ class Broken:
         return self.features
 
 
-@pytest.mark.parametrize(
-    "features", [np.full(4, np.nan), np.full(4, 1.5), np.zeros(5), np.zeros((1, 4))], ids=["NaN", "bound", "5", "2-D"]
-)
-def test_an_embedding_that_breaks_its_promise_is_named(features):
-    learner = TactileLearner(sensor=PAD, embedding=Broken(features))
-    empty = learner.digest()
-    with pytest.raises(EmbeddingError, match="expected"):
+WRONG = {
+    "NaN": (np.array([0.5, np.nan, 0.5, 0.5]), r"'broken' .* not finite: 1 of 4 features, \[1\], the first nan"),
+    "inf": (np.array([np.inf, 0.5, 0.5, -np.inf]), r"'broken' .* not finite: 2 of 4 features, \[0, 3\], the first inf"),
+    "bound": (np.full(4, 1.5), r"'broken' .* beyond its bound 1.0: 4 of 4 features, \[0, 1, 2, 3\], the first 1.5"),
+    "5": (np.zeros(5), "'broken' .* expected features of shape"),
+    "2-D": (np.zeros((1, 4)), "'broken' .* expected features of shape"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_features_that_are_none_are_refused_by_name_and_the_memory_keeps_working(tmp_path, kind):
+    features, said = WRONG[kind]
+    embedding = Broken(np.full(4, 0.25))
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=embedding) as learner:
         learner.observe("wool", touch("wool", 1))
-    assert learner.digest() == empty
+        before = learner.digest()
+        embedding.features = features
+        with pytest.raises(EmbeddingError, match=said):
+            learner.observe("silk", touch("silk", 1))
+        with pytest.raises(EmbeddingError, match=said):
+            learner.predict(touch("wool", 2))
+        assert learner.digest() == before
+        embedding.features = np.full(4, 0.5)
+        learner.observe("silk", touch("silk", 1))
+        assert learner.predict(touch("silk", 2)).material in ("wool", "silk")
+        whole = learner.digest()
+    with TactileLearner.open(tmp_path / "m", embedding=embedding) as learner:
+        assert learner.digest() == whole and learner.materials == {"wool": 1, "silk": 1}
+
+
+def test_of_joined_embeddings_the_part_whose_features_are_none_is_named():
+    learner = TactileLearner(sensor=PAD, embedding=Joined(Kernels(dimension=64), Broken(np.full(4, np.nan))))
+    with pytest.raises(EmbeddingError, match=r"4 of 68 features, \[64, 65, 66, 67\], .*They are those of its 'broken'"):
+        learner.observe("wool", touch("wool", 1))
+    assert learner.materials == {}
 
 
 # Exactness

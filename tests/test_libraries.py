@@ -123,7 +123,7 @@ def test_every_extra_that_is_named_is_there():
         for call in ast.walk(ast.parse(path.read_text())):
             if isinstance(call, ast.Call) and getattr(call.func, "id", "") in ("optional", "missing", "install_line"):
                 named.update(node.value for node in ast.walk(call.args[1]) if isinstance(node, ast.Constant))
-    assert {"torch", "ros", "hdf5"} < named <= {*extras, "onnxruntime"}
+    assert {"torch", "ros", "hdf5"} < named <= set(extras)
 
 
 def test_no_text_has_one_install_from_a_package_index_where_it_is_not():
@@ -143,7 +143,6 @@ TAKE_TORCH = [
     "scroll_tactile.Vision",
     "scroll_tactile.ModuleEmbedding",
     "scroll_tactile.Frames()",
-    "importlib.import_module('scroll_tactile.clients.learning.onnx_export')",
     "importlib.import_module('scroll_tactile.finetune.fine_tune')",
 ]
 

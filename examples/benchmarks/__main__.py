@@ -19,7 +19,6 @@ from examples.benchmarks.live_shift import live
 from examples.benchmarks.many_materials import many
 from examples.benchmarks.node_latency import ros2
 from examples.benchmarks.speed import speed
-from examples.benchmarks.vision_speed import vision
 from scroll_tactile.clients.cli.terminal import Commands
 from scroll_tactile.libraries import missing
 
@@ -32,7 +31,7 @@ app = typer.Typer(
     help="Measure speed beside error, side by side in one run.",
 )
 BENCHMARKS: tuple[Callable[..., None], ...] = (
-    *(speed, many, live, decisions, ros2, vision),
+    *(speed, many, live, decisions, ros2),
     *(buffers, interleaved, log, fleet, chips, health, adapt),
 )
 for benchmark in BENCHMARKS:

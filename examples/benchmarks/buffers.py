@@ -226,7 +226,7 @@ def _tuned(
     """Accuracy of an f* fine-tuned on a buffer, whether it would be kept or not."""
     of = {exemplar.key: exemplar for exemplar in kept}
     exemplars = {name: [of[key] for key in chosen] for name, chosen in buffer.items()}
-    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
+    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan)
     statistics = learner.memory.statistics
     tuned, _ = fine_tune(learner.embedding, learner.model(), statistics, exemplars, extractor, seed=seed)
     reader = TunedReader(learner.embedding, learner.plan, tuned)

@@ -87,7 +87,7 @@ def _learned(recordings: Recordings, fold: int, without: Iterable[str] = ()) -> 
 
 def _fold(recordings: Recordings, fold: int, every: int, progress: Progress) -> Record:
     learner = _learned(recordings, fold)
-    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
+    extractor = FeatureExtractor(learner.sensor, learner.embedding, learner.plan)
     model = learner.model()
     rules = [decision_rule(model, risk) for risk in RISKS]
     tested = np.flatnonzero(recordings.fold == fold)[::every].tolist()

@@ -18,20 +18,20 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import typer
+from torch.nn.functional import adaptive_avg_pool2d
 
 from examples.benchmarks.checkouts import Worker, checkouts, disk_bytes, in_turns, write_touches
 from examples.benchmarks.many_materials import filled, run_many
 from examples.benchmarks.speed_bench import Bench, Note, Record, Sides, Sizes
 from examples.benchmarks.speed_touches import SHORT, Touch, biotac_touches
 from examples.benchmarks.timing import Timing, timed
-from examples.benchmarks.vision_speed import BareResNet
 from examples.paper.runs.options import Json, Seed
 from examples.paper.runs.results import show, write
 from scroll_tactile import sensors
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.embeddings.runtimes import one_torch_thread
-from scroll_tactile.signals.image import tactile_image, three_planes
+from scroll_tactile.embeddings.steady import one_torch_thread
+from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 from scroll_tactile.simulation.scene import Scene
 
@@ -150,12 +150,12 @@ def _start(bench: Bench, memory: str, touches: Path, test: int, stack: ExitStack
 
 def _forward(seed: int, readings: npt.NDArray[np.float32]) -> Callable[[], object]:
     """A bare forward pass of the touch that `readings` are, on one thread."""
-    network = BareResNet(ResNet.random(seed)).eval()
-    image = torch.from_numpy(three_planes(tactile_image(validate(readings, sensors.BIOTAC)))[None])
+    network = ResNet.random(seed).eval()
+    image = torch.from_numpy(np.stack([tactile_image(validate(readings, sensors.BIOTAC))] * 3))[None]
 
     def forward() -> None:
         with torch.inference_mode(), one_torch_thread():
-            network(image)
+            adaptive_avg_pool2d(network(image)[-1], 1)
 
     return forward
 

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.convolution.banks import LEVELS, to_levels
+from scroll_tactile.embeddings.convolution import LEVELS, to_levels
 from scroll_tactile.embeddings.kernels import angles
 from scroll_tactile.embeddings.protocol import Capabilities, canary
-from scroll_tactile.embeddings.runtimes import RuntimeName, make_runtime, steady, version_of
+from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import require
 from scroll_tactile.signals.contact import Rest
@@ -71,7 +71,6 @@ class Frames:
     cosines: where not 0, so many random Fourier features (Rahimi and Recht 2007) of the counts, without the light, take
         the place of all: they tell attributes of new objects better, and objects that were touched worse.
         seed: of the cosines. They are rounded, so that another machine's last bits rarely matter.
-    runtime: of the network, as for `Vision`.
 
     Raises InputError for a resting image that is none, cosines or a seed below 0, and cosines beside weights;
     WeightsError for weights that cannot be used.
@@ -91,7 +90,6 @@ class Frames:
         rest: Rest | npt.ArrayLike = "first",
         cosines: int = 0,
         seed: int = 1,
-        runtime: RuntimeName = "torch",
     ) -> None:
         whole = all(type(number) is int and number >= 0 for number in (cosines, seed))
         if not whole or (cosines and weights is not None):
@@ -99,23 +97,21 @@ class Frames:
                 "expected cosines and a seed as whole numbers of 0 or more, and no weights beside cosines; came "
                 f"{cosines!r} and {seed!r}" + (" with weights" if weights is not None else "")
             )
-        if weights is None and runtime != "torch":
-            raise InputError(f"expected a runtime with weights, which it is to run; came {runtime!r} without")
         require("torch", "torch", "the embedding Frames")
         self.rest: Rest = _checked(rest)
         self.capabilities = Capabilities(reads_frames=True, rest=self.rest)
         self.cosines = cosines
         self.seed = seed
-        self.runtime: RuntimeName = runtime
         self._net: ResNet | None = None
         self._source: str | None = None
         self.dimension = cosines or LIGHT + SURFACE
         if weights is not None:
+            from scroll_tactile.embeddings.resnet import folded
             from scroll_tactile.embeddings.weights import load_network, source_name
 
             self._source = source_name(weights)
             self._net = load_network(weights).requires_grad_(False)
-            self._run = make_runtime(runtime, self._net, NETWORK_STAGES[-1])
+            self._quick = folded(self._net, NETWORK_STAGES[-1])
             self.dimension = LIGHT + 2 * sum(self._net.widths[stage] for stage in NETWORK_STAGES)
 
     def __repr__(self) -> str:
@@ -132,20 +128,21 @@ class Frames:
 
             weights = {"name": self._source, "sha256": digest_of(self._net)}
         rest = _picture_to_json(self.rest) if isinstance(self.rest, np.ndarray) else self.rest
-        settings = {"cosines": self.cosines, "seed": self.seed, "runtime": self.runtime}
-        return {"kind": "frames", "weights": weights, "rest": rest, **settings}
+        return {"kind": "frames", "weights": weights, "rest": rest, "cosines": self.cosines, "seed": self.seed}
 
     @cached_property
     def fingerprint(self) -> str:
-        """A hash of the resting image, the network and its runtime, and of the features of three fixed images."""
+        """A hash of the resting image, the network and torch's version, and of the features of three fixed images."""
         digest = hashlib.sha256(
             f"frames 1 {LEVELS} {SMOOTH} {GAIN} {NETWORK_STAGES} {self.cosines} {self.seed}".encode()
         )
         digest.update(self.rest.tobytes() if isinstance(self.rest, np.ndarray) else repr(self.rest).encode())
         if self._net is not None:
+            import torch
+
             from scroll_tactile.embeddings.weights import hash_tensors
 
-            digest.update(f"{self._net.depth} {self._net.stem} {self.runtime} {version_of(self.runtime)}".encode())
+            digest.update(f"{self._net.depth} {self._net.stem} {torch.__version__}".encode())
             hash_tensors(digest, self._net)
         for channels, columns in ((3, 1), (24, 9), (120, 64)):
             digest.update(self.embed(canary(channels, columns)).astype("<f4").tobytes())
@@ -195,10 +192,10 @@ class Frames:
         with steady():
             shown = torch.tensor(planes[None], dtype=torch.float32)
             shown = (GAIN * (shown - _blurred(shown, max(1, planes.shape[2] // SMOOTH)))).clamp(-1, 1)
-            maps = self._run(to_planes(shown).numpy())
+            maps = self._quick(to_planes(shown).contiguous(memory_format=torch.channels_last), NETWORK_STAGES[-1])
             parts = []
             for stage in NETWORK_STAGES:
-                found = torch.from_numpy(maps[stage])[0].flatten(1)
+                found = maps[stage][0].flatten(1)
                 parts += [found.mean(dim=1), found.std(dim=1, correction=0)]
             normalised = torch.cat([functional.normalize(part, dim=0) for part in parts])
             # Rounding may pass 1 by a unit in the last place.

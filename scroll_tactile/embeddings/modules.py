@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import Capabilities, canary
-from scroll_tactile.embeddings.runtimes import steady
+from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.errors import EmbeddingError, InputError
 from scroll_tactile.libraries import optional
 from scroll_tactile.signals.augmentation import fit
@@ -104,7 +104,8 @@ class ModuleEmbedding:
     def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Features of shape (d,), float32, of a tactile image of shape (C, T) in [-1, 1].
 
-        Raises EmbeddingError where the module's output has another shape, is not finite or exceeds the bound.
+        Raises EmbeddingError where the module's output has another shape. Whether features are finite and within the
+        bound is looked at where they are learned from or judged by.
         """
         with steady():
             output = self._module(torch.tensor(fit(image, max(SHORTEST, image.shape[-1]))[None], dtype=torch.float32))
@@ -115,10 +116,4 @@ class ModuleEmbedding:
                 f"came {came}"
             )
         features: npt.NDArray[np.float32] = output[0].float().contiguous().numpy()
-        largest = float(np.abs(features).max())
-        if not largest <= self.bound:
-            raise EmbeddingError(
-                f"expected from {self!r} finite features of magnitude at most {self.bound}; the largest for an image "
-                f"of {image.shape} is {largest}. Scale them, by tanh or by their norm, or give the bound that holds"
-            )
         return features

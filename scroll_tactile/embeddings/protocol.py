@@ -27,6 +27,7 @@ __all__ = [
     "embed_windows",
     "is_embedding",
     "parts_of",
+    "require_features",
     "require_rest",
     "window_plan",
 ]
@@ -35,6 +36,8 @@ FloatArray = npt.NDArray[np.floating]
 
 TOGETHER: Final = 48
 """Columns from which windows may share one pass over an image; narrower ones are always read as if cut out."""
+
+NAMED = 5  # features in a message
 
 
 @dataclass(frozen=True)
@@ -216,6 +219,33 @@ def embed_competing(
     """
     features, competing = cast(CompetingEmbedding, embedding).embed_competing(image, windows, width)
     return dict(features), competing
+
+
+def require_features(
+    embedding: Embedding, features: npt.NDArray[np.floating], shape: tuple[int, ...], what: str
+) -> None:
+    """Raise EmbeddingError for features of another shape, that are not finite, or that exceed the embedding's bound.
+
+    what: whose features they are, for the message.
+    """
+    broken = f"embedding {embedding.name!r} breaks a promise"
+    if features.shape != shape:
+        raise EmbeddingError(f"{broken}: expected features of shape {shape} of {what}; came {features.shape}")
+    if float(np.abs(features).max(initial=0.0)) <= embedding.bound:  # NaN is not
+        return
+    endless = ~np.isfinite(features)
+    bad = endless if endless.any() else ~(np.abs(features) <= embedding.bound)
+    wrong = "are not finite" if endless.any() else f"lie beyond its bound {embedding.bound}"
+    columns = np.flatnonzero(bad.reshape(-1, shape[-1]).any(axis=0))
+    listed = ", ".join(map(str, columns[:NAMED].tolist())) + (", …" if len(columns) > NAMED else "")
+    edges = np.cumsum([part.dimension for part in parts_of(embedding)])
+    parts = [parts_of(embedding)[i].name for i in np.unique(np.searchsorted(edges, columns, side="right")).tolist()]
+    theirs = "" if len(edges) == 1 else f" They are those of its {', '.join(map(repr, parts))}."
+    raise EmbeddingError(
+        f"{broken}: the features of {what} {wrong}: {len(columns)} of {shape[-1]} features, [{listed}], the first "
+        f"{features[bad][0]}.{theirs} Nothing was learned or answered. Mend the embedding, which `check_embedding` "
+        "tries, or take another, such as Kernels()"
+    )
 
 
 def canary(channels: int, steps: int) -> npt.NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 A configuration is read from a disk and may be damaged or hostile: its types, sizes and totals are checked before
 anything is made, and what is made holds no features yet. It names a file of weights and the hash of its tensors, and no
-path: weights are a published name's, or a file's in the cache folder of weights.
+path: weights are torchvision's, or a file's in the cache folder of weights.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ _KINDS = {  # each a module's name, too
 
 _Seed = Annotated[int, Field(ge=0, lt=2**63)]
 _Hex = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-_Runtime = Literal["torch", "onnxruntime"]
 
 
 class Configuration(BaseModel):
@@ -91,7 +90,6 @@ class FramesConfiguration(Configuration):
     rest: Literal["first"] | PictureConfiguration | None
     cosines: Annotated[int, Field(ge=0, le=MOST_COSINES)]
     seed: _Seed
-    runtime: _Runtime
 
 
 class VisionConfiguration(Configuration):
@@ -103,8 +101,6 @@ class VisionConfiguration(Configuration):
     depth: Literal[18, 34, 50]
     stem: Literal["torchvision", "universal"]
     stages: Annotated[list[Annotated[int, Field(ge=0, le=4)]], Field(min_length=1, max_length=5)]
-    runtime: _Runtime
-    precision: Literal["float32", "bfloat16"]
 
 
 class JoinedConfiguration(Configuration):
@@ -141,7 +137,7 @@ def from_configuration(configuration: Mapping[str, Any]) -> Embedding:
     Published weights are fetched where the cache has none. No fingerprint is computed: compare it.
 
     Raises EmbeddingError that names what is wrong or missing and what to pass instead, WeightsError for weights that
-    cannot be had or read, InputError where a package for its runtime is missing.
+    cannot be had or read, InputError where torch is missing.
     """
     return _made(_validated(configuration))
 
@@ -226,15 +222,16 @@ def _weighted(make: Callable[..., Any], held: WeightsConfiguration | None, **set
 
 def _source(held: WeightsConfiguration, kind: str) -> str | Path:
     """The published name, or the file of that name in the cache folder of weights."""
-    from scroll_tactile.embeddings.weights import PUBLISHED, weights_file
+    from scroll_tactile.embeddings.weights import PUBLISHED, cache_folder
 
     if held.name in PUBLISHED:
         return held.name
-    folder, file = weights_file(held.name)
-    if file is not None:
-        return file
-    came = "a state dict" if held.name is None else f"the file {held.name!r}"
-    put = "" if folder is None else f", or put that file into {folder}"
+    came, put = "a state dict", ""
+    if held.name is not None:
+        file = cache_folder() / held.name
+        if file.is_file():
+            return file
+        came, put = f"the file {held.name!r}", f", or put that file into {file.parent}"
     raise EmbeddingError(
         f"expected the weights of a {kind} that came from {came} and whose tensors have the SHA-256 "
         f"{held.sha256[:12]}…; they are not at hand. Pass embedding={kind}(weights=…) with them{put}"

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import TOGETHER, Capabilities, canary
-from scroll_tactile.embeddings.resnet import ResNet
-from scroll_tactile.embeddings.runtimes import Precision, RuntimeName, make_runtime, steady, version_of
+from scroll_tactile.embeddings.resnet import ResNet, folded
+from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.embeddings.weights import digest_of, hash_tensors, load_network, source_name
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import optional
@@ -48,16 +48,14 @@ class Vision:
         torchvision's or Meta-Dataset's (URL) layout; a state dict; or None for a random network, the control that shows
         what the weights are worth.
     stages: which, ascending: 0 the stem, 1 to 4 the layers. Nothing after the last of them is computed.
-    runtime: "torch", or "onnxruntime", which is faster and needs the extra onnx.
-    precision: "bfloat16" is faster on processors that have it, with an error of half a percent.
     seed, depth: of the random network; the depth of given weights is seen from them.
 
     A touch narrower than a window is not read at that scale (`Capabilities.partial_windows`): a network is lost at a
     length that it did not learn from. Where several scales fit only the widest is judged (`judged_scales`), so that
     a touch costs one forward pass.
 
-    One image gives the same bytes whatever was embedded before; another machine, runtime or version may give other
-    last bits, and so another fingerprint.
+    It runs in float32. One image gives the same bytes whatever was embedded before; another machine or version of torch
+    may give other last bits, and so another fingerprint.
 
     Raises WeightsError for weights that cannot be used, InputError for settings that do not fit.
 
@@ -75,8 +73,6 @@ class Vision:
         weights: str | os.PathLike[str] | Mapping[str, torch.Tensor] | None = "resnet18",
         *,
         stages: Sequence[int] = (1, 2, 3),
-        runtime: RuntimeName = "torch",
-        precision: Precision = "float32",
         seed: int | None = None,
         depth: int = 18,
     ) -> None:
@@ -88,8 +84,6 @@ class Vision:
                 f"a random network, weights=None, and only that, needs a seed; came seed={seed!r} with weights "
                 f"{'None' if weights is None else 'given'}"
             )
-        self.runtime: RuntimeName = runtime
-        self.precision: Precision = precision
         self.seed = seed
         self._source = source_name(weights)
         if weights is None:
@@ -98,26 +92,24 @@ class Vision:
         else:
             self._net = load_network(weights)
         self._net.requires_grad_(False)
-        self._run = make_runtime(runtime, self._net, self.stages[-1], precision)
+        self._quick = folded(self._net, self.stages[-1])
         self.dimension = sum(self._net.widths[stage] for stage in self.stages)
 
     def __repr__(self) -> str:
-        settings = f"stages={self.stages}, runtime={self.runtime!r}, precision={self.precision!r}"
         source = repr(self._source or "<state dict>") if self.seed is None else f"None, seed={self.seed}"
-        return f"Vision({source}, {settings}, depth={self._net.depth})"
+        return f"Vision({source}, stages={self.stages}, depth={self._net.depth})"
 
     def configuration(self) -> dict[str, Any]:
         """What makes an equal one, in JSON's types; of weights their file's name and their hash."""
         weights = {"name": self._source, "sha256": digest_of(self._net)} if self.seed is None else None
         network = {"weights": weights, "seed": self.seed, "depth": self._net.depth, "stem": self._net.stem}
-        reading = {"stages": list(self.stages), "runtime": self.runtime, "precision": self.precision}
-        return {"kind": "vision", **network, **reading}
+        return {"kind": "vision", **network, "stages": list(self.stages)}
 
     @cached_property
     def fingerprint(self) -> str:
-        """A hash of all the tensors, the settings, the runtime's version and the features of three fixed images."""
-        settings = (self._net.depth, self._net.stem, self.stages, self.runtime, version_of(self.runtime))
-        digest = hashlib.sha256(f"vision 1 {settings} {self.precision} {MEAN} {DEVIATION} {TOGETHER}".encode())
+        """A hash of all the tensors, the settings, torch's version and the features of three fixed images."""
+        settings = (self._net.depth, self._net.stem, self.stages, torch.__version__)
+        digest = hashlib.sha256(f"vision 1 {settings} {MEAN} {DEVIATION} {TOGETHER}".encode())
         hash_tensors(digest, self._net)
         for channels, steps in ((3, 9), (19, 30), (60, 75)):
             digest.update(self.embed(canary(channels, steps)).astype("<f4").tobytes())
@@ -203,8 +195,8 @@ class Vision:
             return features
 
     def _window_features(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], steps: int) -> FloatArray:
-        maps = self._run(planes.numpy())
-        pooled = pool_windows([torch.from_numpy(maps[stage]) for stage in self.stages], steps, windows)
+        maps = self._quick(planes.contiguous(memory_format=torch.channels_last), self.stages[-1])
+        pooled = pool_windows([maps[stage] for stage in self.stages], steps, windows)
         # Rounding may pass 1 by a unit in the last place.
         features: FloatArray = np.minimum(pooled.numpy(), np.float32(1))
         return features
@@ -256,7 +248,7 @@ def pool_windows(maps: Sequence[torch.Tensor], steps: int, windows: Sequence[tup
     """
     parts = []
     for stage in maps:
-        across = int(stage.shape[-1])  # a number where this is traced: ONNX divides negative ones otherwise
+        across = stage.shape[-1]
         # Window by window: what is asked for beside a window must not change its bits, and a product would.
         averages = []
         for start, width in windows:

@@ -31,10 +31,8 @@ __all__ = [
     "digest_of",
     "hash_tensors",
     "load_network",
-    "network_of",
     "read_tensors",
     "source_name",
-    "weights_file",
 ]
 
 Tensors = dict[str, torch.Tensor]
@@ -61,9 +59,9 @@ def load_network(source: str | os.PathLike[str] | Mapping[str, torch.Tensor]) ->
     Raises WeightsError for weights that cannot be had, are damaged, or belong to another architecture.
     """
     if isinstance(source, Mapping):
-        return network_of(source, "the given state dict")
+        return _network_of(source, "the given state dict")
     path = _published(source) if isinstance(source, str) and source in PUBLISHED else Path(source)
-    return network_of(read_tensors(path), str(path))
+    return _network_of(read_tensors(path), str(path))
 
 
 def source_name(source: str | os.PathLike[str] | Mapping[str, torch.Tensor] | None) -> str | None:
@@ -114,7 +112,7 @@ def read_tensors(path: Path) -> Mapping[str, Any]:
     return held
 
 
-def network_of(tensors: Mapping[str, Any], where: str) -> ResNet:
+def _network_of(tensors: Mapping[str, Any], where: str) -> ResNet:
     """Make the network that tensors belong to; depth and stem are read off their names and shapes.
 
     where: what messages call their source. The tensors are copied.
@@ -149,17 +147,6 @@ def cache_folder() -> Path:
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen).expanduser() / "weights"
     return Path(_pooch().os_cache("scroll-tactile")) / "weights"
-
-
-def weights_file(name: str | None) -> tuple[Path | None, Path | None]:
-    """The folder that a file of weights is looked for in, and the file of that name, None where it has none."""
-    try:
-        folder = cache_folder()
-    except WeightsError:  # without pooch there is no such folder, unless the environment names it
-        return None, None
-    if name is None:
-        return None, None
-    return folder, folder / name if (folder / name).is_file() else None
 
 
 def _published(name: str) -> Path:

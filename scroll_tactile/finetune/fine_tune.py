@@ -173,7 +173,7 @@ def _samples(
             image = extractor.image(extractor.stream(exemplar.readings))
             columns = image.shape[1]
             if material in known and model.is_last(columns) and touches.reads(columns):
-                codes = extractor.codes(image, exemplar.key)
+                codes = extractor.codes(image)
                 yield TrainingSample(material, exemplar.key, image, touches.frozen(image), codes)
             done += 1
             progress("reading exemplars", done, total)

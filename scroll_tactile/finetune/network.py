@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows, parts_of
 from scroll_tactile.embeddings.resnet import folded
-from scroll_tactile.embeddings.runtimes import steady
+from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.embeddings.vision import MOST_STEPS, TunableVision, Vision
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.libraries import optional

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.runtimes import full_float32, one_torch_thread
+from scroll_tactile.embeddings.steady import full_float32, one_torch_thread
 from scroll_tactile.errors import FineTuneError
 from scroll_tactile.finetune.network import Backbone, TouchFeatures, TrainingSample, adapted
 from scroll_tactile.libraries import optional

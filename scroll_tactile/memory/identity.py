@@ -27,7 +27,6 @@ from scroll_tactile.embeddings.registry import MOST_DEPTH, configuration_of, fro
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, InputError, MismatchError, SensorMismatchError
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.windows import COMPETING, ScaleKind
 from scroll_tactile.statistics.grid import BITS
 
@@ -103,7 +102,6 @@ class Identity(_Kept):
     grid: Grid
     reading: tuple[bool, Literal["all", "widest"]]
     views: tuple[ScaleKind, ...]
-    augmentation: Augmented | None
     exemplars: _Streams
     kept_touches: _Streams
 
@@ -128,7 +126,6 @@ class Identity(_Kept):
                 grid=Grid(bits=BITS, scales=plan.widths, frames=plan.frames),
                 reading=(plan.partial, plan.judged),
                 views=tuple(view.kind for view in plan.views),
-                augmentation=recipe.augmentation,
                 exemplars=recipe.exemplars,
                 kept_touches=recipe.kept_touches,
             )
@@ -184,11 +181,10 @@ class Identity(_Kept):
             embedding = request.embedding
             self.require_embedding(path, embedding)
         kept = {"exemplars": self.exemplars, "kept_touches": self.kept_touches}
-        return Recipe(self.sensor, embedding, self.augmentation, request.settings.model_copy(update=kept))
+        return Recipe(self.sensor, embedding, request.settings.model_copy(update=kept))
 
     def _require(self, path: Path, request: RecipeRequest) -> None:
-        sensor, augmentation = request.sensor, request.augmentation
-        exemplars, kept_touches = request.settings.exemplars, request.settings.kept_touches
+        sensor, exemplars, kept_touches = request.sensor, request.settings.exemplars, request.settings.kept_touches
         if sensor is not None and sensor != self.sensor:
             differing = [
                 f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
@@ -198,12 +194,6 @@ class Identity(_Kept):
             raise SensorMismatchError(
                 f"{path} holds the memory of sensor {self.sensor.name!r}; it was opened for {sensor.name!r} "
                 f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
-            )
-        if augmentation is not None and augmentation != self.augmentation:
-            made = "no augmentation" if self.augmentation is None else repr(self.augmentation)
-            raise MismatchError(
-                f"{path} was made with {made}; it was opened with {augmentation!r}. "
-                "Its touches were not observed with those copies: leave the augmentation out, or take another path"
             )
         if exemplars not in (None, self.exemplars):
             raise MismatchError(

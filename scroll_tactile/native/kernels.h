@@ -2,7 +2,7 @@
  *
  * A kernel sums some channels; its response at a place is 2 at three of nine taps and −1 at the six others, times these
  * sums. A feature is the number of places of a window at which a response exceeds a threshold. See
- * embeddings/convolution/banks.py.
+ * embeddings/convolution.py.
  */
 #ifndef SCROLL_TACTILE_KERNELS_H
 #define SCROLL_TACTILE_KERNELS_H

@@ -320,7 +320,7 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
     if same_folder(ours.path, theirs.path):
         raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
     mine, other = Identity.read(ours), Identity.read(theirs)
-    for part in ("sensor", "embedding", "reading", "views", "grid", "augmentation"):
+    for part in ("sensor", "embedding", "reading", "views", "grid"):
         own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
         if own != incoming:
             raise MismatchError(

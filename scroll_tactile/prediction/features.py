@@ -9,14 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import Embedding, capabilities_of, embed_competing, embed_windows, require_rest
-from scroll_tactile.errors import EmbeddingError
+from scroll_tactile.embeddings.protocol import (
+    Embedding,
+    capabilities_of,
+    embed_competing,
+    embed_windows,
+    require_features,
+    require_rest,
+)
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.image import shape_image, stretched, tactile_image
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scale, WindowPlan
@@ -90,7 +95,7 @@ class WindowCache:
 
 
 class FeatureExtractor:
-    """Makes features of touches, by a sensor, an embedding, a plan of windows and an augmentation; it learns nothing.
+    """Makes features of touches, by a sensor, an embedding and a plan of windows; it learns nothing.
 
     check: of the embedding's fingerprint, if the embedding was made from the memory's configuration.
 
@@ -102,14 +107,12 @@ class FeatureExtractor:
         sensor: Sensor,
         embedding: Embedding,
         plan: WindowPlan,
-        augmentation: Augmented | None,
         check: FingerprintCheck | None = None,
     ) -> None:
         self._check, self._own = check, True
         self._sensor = sensor
         self._embedding = embedding
         self._plan = plan
-        self._augmentation = augmentation
         require_rest(embedding, sensor)
         self._rest: Rest = capabilities_of(embedding).rest
 
@@ -125,7 +128,7 @@ class FeatureExtractor:
 
     def with_embedding(self, embedding: Embedding) -> FeatureExtractor:
         """The same with an embedding that gives the same features."""
-        other = FeatureExtractor(self._sensor, embedding, self._plan, self._augmentation, self._check)
+        other = FeatureExtractor(self._sensor, embedding, self._plan, self._check)
         other._own = False
         return other
 
@@ -159,22 +162,10 @@ class FeatureExtractor:
     def learned(self, stream: Stream) -> tuple[int, Codes]:
         """What a memory learns of a `stream`: its steps, and the `codes` that it adds. Raises as `verified`."""
         image = self.verified().image(stream)
-        return image.shape[1], self.codes(image, stream.key)
+        return image.shape[1], self.codes(image)
 
-    def codes(self, image: Image, key: bytes) -> Codes:
-        """The quantised features that a touch adds to the statistics, rows by scale: its own, then those of its copies.
-
-        Its own come first: the sample finds them by their place. Copies are no longer than the touch, so they have no
-        other scales.
-        """
-        copies = self._augmentation.copies_of(image, key) if self._augmentation is not None else []
-        own, *others = [self._stage_rows(picture) for picture in (image, *copies)]
-        return {
-            scale: np.concatenate([first, *(other[scale] for other in others if scale in other)])
-            for scale, first in own.items()
-        }
-
-    def _stage_rows(self, image: Image) -> Codes:
+    def codes(self, image: Image) -> Codes:
+        """The quantised features that a touch adds to the statistics, rows by scale."""
         stages, places = self._plan.scored_stages(image.shape[1]), self._plan.places(image.shape[1])
         features = self.features(image, places=places)
         codes = {scale: to_codes(rows, self._embedding.bound) for scale, rows in features.items()}
@@ -253,12 +244,8 @@ class FeatureExtractor:
             embedded = self._embedded(image, every)
             return embedded, {WHOLE: embedded.pop(width)}
         features, competing = embed_competing(self._embedding, image, every, width)
-        embedded = self._sound(features, every)
-        if competing.shape != (self._embedding.dimension,):
-            raise EmbeddingError(
-                f"expected competing features of shape ({self._embedding.dimension},) from {self._embedding.name!r}; "
-                f"came {competing.shape}"
-            )
+        embedded = self._sound(image, features, every)
+        self._require(image, competing, (), "all, by competing kernels,")
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
@@ -278,19 +265,20 @@ class FeatureExtractor:
         return {WHOLE: whole, SHAPE: shape_image(whole)}
 
     def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
-        return self._sound(embed_windows(self._embedding, image, windows), windows)
+        return self._sound(image, embed_windows(self._embedding, image, windows), windows)
 
     def _sound(
-        self, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
+        self, image: Image, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
     ) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of windows, checked: raises EmbeddingError for another shape."""
+        """The features of windows. All features that are learned or judged by pass here, and are checked here."""
         for width, features in embedded.items():
-            expected = (len(windows[width]), self._embedding.dimension)
-            if features.shape != expected:
-                raise EmbeddingError(
-                    f"expected features of shape {expected} from {self._embedding.name!r}; came {features.shape}"
-                )
+            self._require(image, features, (len(windows[width]),), f"windows of {width} steps")
         return embedded
+
+    def _require(self, image: Image, features: npt.NDArray[np.floating], rows: tuple[int, ...], what: str) -> None:
+        channels, steps = image.shape
+        touch = f"{what} of a touch of {channels} × {steps}"
+        require_features(self._embedding, features, (*rows, self._embedding.dimension), touch)
 
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.

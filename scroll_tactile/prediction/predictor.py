@@ -337,7 +337,7 @@ class Predictor:
 
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:
-    return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, recipe.augmentation, check)
+    return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, check)
 
 
 def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) -> Codes:

@@ -57,7 +57,7 @@ def embed_again(
             predictor.replace()
             kept = {"exemplars": None, "kept_touches": None}  # those of the new one
             settings = predictor.recipe.settings.model_copy(update=kept)
-            return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, None, settings))
+            return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, settings))
     finally:
         carried.close()
 
@@ -70,6 +70,6 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     # recipe.
     default = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
     kept = Settings(exemplars=made.exemplars, kept_touches=None if default else made.kept_touches)
-    recipe = Recipe.of(made.sensor, chosen, made.augmentation, kept)
-    extractor = FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, recipe.augmentation)
+    recipe = Recipe.of(made.sensor, chosen, kept)
+    extractor = FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan)
     return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))

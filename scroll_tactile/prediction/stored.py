@@ -19,8 +19,7 @@ import numpy.typing as npt
 from scroll_tactile_store import Checkpoint
 
 from scroll_tactile import __version__
-from scroll_tactile.embeddings.convolution.banks import MOST_CHANNELS, THRESHOLDS, bank_size
-from scroll_tactile.embeddings.convolution.responses import ROUND, Bank
+from scroll_tactile.embeddings.convolution import MOST_CHANNELS, ROUND, THRESHOLDS, Bank, bank_size
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.matching.conformal import Conformal

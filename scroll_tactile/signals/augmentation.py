@@ -5,25 +5,20 @@ jitters them. Here all four act along time: the slide went the other way, faster
 noisier, drifting sensor. The channels keep their places: a sensor's electrodes do not move.
 
 Each takes an image (C, T) or a batch of images of one width, (…, C, T), and does the same to all of it; noise and drift
-are drawn for each image of a batch apart. `changed` puts any of them on a stream, and `Augmentation.streams` draws all
-four for each of several streams.
+are drawn for each image of a batch apart.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.signals.image import tactile_image
-from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 
-__all__ = ["Augmentation", "Change", "augment", "changed", "crop", "fit", "flip", "jitter", "resize"]
+__all__ = ["Augmentation", "Change", "crop", "fit", "flip", "jitter", "resize"]
 
 Image = npt.NDArray[np.float32]
 
@@ -189,45 +184,6 @@ class Augmentation:
     def augment(self, image: Image, rng: np.random.Generator, *, steps: int | None = None) -> Image:
         """The image with all four changes, drawn from `rng`; see `Change.apply`."""
         return self.draw(rng).apply(image, steps)
-
-    def streams(self, streams: Sequence[Stream], rng: np.random.Generator) -> list[Stream]:
-        """Each of N streams as another touch of its material would have given it, drawn from `rng` for each alone.
-
-        None is made shorter than the two readings that make a stream: it goes on as its mirror image up to there.
-        Raises InputError for a camera's stream.
-        """
-        return [
-            changed(stream, partial(_long_enough, self.draw(rng), fewest_readings(stream.sensor))) for stream in streams
-        ]
-
-
-def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
-    """The stream whose tactile image, float32 (C, T) in [-1, 1], is what `change` makes of this one's.
-
-    `changed(stream, flip)` is the slide the other way. Raises InputError for a camera's stream, and what `validate`
-    raises for what came out.
-    """
-    sensor = stream.sensor
-    if sensor.camera:
-        raise InputError(f"changes are of channels along time, and camera {sensor.name!r} takes whole frames")
-    image = change(tactile_image(stream)).T.astype(np.float64)
-    low, high = np.asarray(sensor.low), np.asarray(sensor.high)
-    return validate(low + (image + 1) / 2 * (high - low), sensor)
-
-
-def _long_enough(change: Change, least: int, image: Image) -> Image:
-    made = change.apply(image)
-    return made if made.shape[-1] >= least else fit(made, least)
-
-
-def augment(image: Image, rng: np.random.Generator, *, steps: int | None = None) -> Image:
-    """A tactile image of shape (C, T) as another touch of the same material would have given it.
-
-    All four augmentations at their default strengths, drawn from `rng`; float32 of shape (C, steps) in [-1, 1],
-    without `steps` as wide as its speed and duration make it. Raises InputError for another image than float32 of
-    shape (C, T), or less than one step.
-    """
-    return Augmentation().augment(image, rng, steps=steps)
 
 
 def _require_image(image: Image) -> None:

@@ -13,10 +13,9 @@ and 85; clean, 99.5 and 98.8 become 99.2 and 99.0. On the eight sets of other se
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError
 from scroll_tactile.signals.stream import Stream
 
-__all__ = ["scaled_down", "shape_image", "stretched", "tactile_image", "three_planes"]
+__all__ = ["scaled_down", "shape_image", "stretched", "tactile_image"]
 
 Image = npt.NDArray[np.float32]
 
@@ -51,16 +50,6 @@ def tactile_image(stream: Stream, rest: npt.NDArray[np.float32] | None = None) -
         image -= np.float32(1)
     # Rounding may pass 1 by a unit in the last place.
     return np.clip(image, np.float32(-1), np.float32(1), out=image)
-
-
-def three_planes(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Repeat a tactile image of shape (C, T) as three equal colour planes, shape (3, C, T), for `vision`.
-
-    Raises InputError if the image has not two axes.
-    """
-    if image.ndim != 2:
-        raise InputError(f"expected a tactile image of shape (C, T); came {image.shape}")
-    return np.stack([image, image, image])
 
 
 def scaled_down(frames: npt.NDArray[np.float32], rows: int, columns: int) -> npt.NDArray[np.float32]:

@@ -22,7 +22,6 @@ from scroll_tactile.errors import (
     StreamTooShortError,
 )
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.interpolation import interpolate
 
 if TYPE_CHECKING:
     import torch
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Stream", "as_rows", "fewest_readings", "validate"]
 
 _Array = npt.NDArray[Any]
+_BLOCK = 2**20  # missing values at once: a camera that drops a frame lacks a million
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class Stream:
         _require_any(mask, self.sensor)
         unread = mask if raw is None else mask & ~self.mask.all(axis=0)  # not the lost channels: these are guessed
         part = part.copy()
-        interpolate(part, unread, self.sensor)
+        _interpolate(part, unread, self.sensor)
         part.setflags(write=False)
         return Stream(self.sensor, part, min(self.clipped, int(np.count_nonzero(~mask))), mask, raw)
 
@@ -204,7 +204,7 @@ def _sound(array: _Array, sensor: Sensor) -> Stream:
         clipped = int(np.count_nonzero(outside if mask is None else outside & ~mask))
         np.clip(values, low, high, out=values)
     if mask is not None:
-        interpolate(values, mask, sensor)
+        _interpolate(values, mask, sensor)
     values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
     values.setflags(write=False)
     return Stream(sensor, values, clipped, mask)
@@ -381,3 +381,35 @@ def _expected(sensor: Sensor) -> str:
 
 def _article(noun: str) -> str:
     return f"{'an' if noun[0] in 'aeiouAEIOU' else 'a'} {noun}"
+
+
+def _interpolate(values: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], sensor: Sensor) -> None:
+    """Write into each missing value, in place, the line between its channel's neighbours in time.
+
+    values: contiguous, (T, n) or (T, height, width, 3), within the sensor's range except where missing. mask: which are
+    missing, of the same shape. At a channel's ends its nearest value is held; a channel without any reads the low end.
+    """
+    flat, flags = values.reshape(len(values), -1), mask.reshape(len(mask), -1)
+    low = np.broadcast_to(sensor.limits[0], sensor.shape).reshape(-1)
+    channels = np.flatnonzero(flags.any(axis=0))
+    size = max(1, _BLOCK // len(values))
+    for block in (channels[first : first + size] for first in range(0, len(channels), size)):
+        flat[:, block] = _lines(flat[:, block].astype(np.float64), flags[:, block], low[block])
+    np.clip(values, *sensor.limits, out=values)  # rounding may pass a neighbour by a unit in the last place
+
+
+def _lines(
+    values: npt.NDArray[np.float64], gap: npt.NDArray[np.bool_], low: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float64]:
+    """Values (T, n) whose gaps are interpolated, held at the ends, `low` in a channel (n,) that is all gap."""
+    dead = gap.all(axis=0)
+    values[:, dead], gap = low[dead], gap & ~dead
+    last = len(values)
+    time = np.arange(last)[:, None]
+    before = np.maximum.accumulate(np.where(gap, -1, time), axis=0)
+    after = np.minimum.accumulate(np.where(gap, last, time)[::-1], axis=0)[::-1]
+    before, after = np.where(before < 0, after, before), np.where(after == last, before, after)  # held at the ends
+    begin, end = np.take_along_axis(values, before, axis=0), np.take_along_axis(values, after, axis=0)
+    # Step by step in float64, not np.interp: a fused multiply-add would round otherwise on another machine.
+    slope = (end - begin) / np.maximum(after - before, 1)
+    return np.where(gap, begin + slope * (time - before), values)

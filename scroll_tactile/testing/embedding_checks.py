@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import TOGETHER, Embedding, capabilities_of, embed_windows, is_embedding
+from scroll_tactile.embeddings.protocol import (
+    TOGETHER,
+    Embedding,
+    capabilities_of,
+    embed_windows,
+    is_embedding,
+    require_features,
+)
 from scroll_tactile.errors import EmbeddingError
 
 __all__ = ["check_embedding"]
@@ -180,11 +187,7 @@ def _require_sound(embedding: Embedding, features: npt.NDArray[np.floating], sha
     if not isinstance(features, np.ndarray) or not np.issubdtype(features.dtype, np.floating):
         kind = features.dtype if isinstance(features, np.ndarray) else type(features).__name__
         raise _broken(embedding, f"expected floating-point NumPy features of {what}; came {kind}")
-    if features.shape != shape:
-        raise _broken(embedding, f"expected features of shape {shape} of {what}; came {features.shape}")
-    largest = float(np.abs(features).max(initial=0.0))
-    if not largest <= embedding.bound:  # NaN is not either
-        raise _broken(embedding, f"the largest feature of {what} is {largest}; its bound is {embedding.bound}")
+    require_features(embedding, features, shape, what)
 
 
 def _require_same(

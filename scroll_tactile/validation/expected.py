@@ -48,7 +48,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name, require_source
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, fewest_readings
-from scroll_tactile.signals.windows import MOST_WINDOWS, WindowPlan
+from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.annotations import MOST_AXES
 from scroll_tactile.statistics.grid import BITS
 
@@ -177,13 +177,11 @@ def keys(arrays: Mapping[str, npt.NDArray[Any]], field: str, materials: list[str
 class RowChecks:
     """The checks of journal rows of one sensor, dimension and plan of windows.
 
-    copies: of each touch, whose rows lie behind its own.
-
     Each raises Unexpected; MismatchError for kinds and arrays that this version does not know.
     """
 
-    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan, copies: int) -> None:
-        self._sensor, self._dimension, self._plan, self._copies = sensor, dimension, plan, copies
+    def __init__(self, sensor: Sensor, dimension: int, plan: WindowPlan) -> None:
+        self._sensor, self._dimension, self._plan = sensor, dimension, plan
         self._expected = lru_cache(256)(self._rows_of)
 
     def check_head(self, head: Head, most_rows: Callable[[], int]) -> None:
@@ -263,12 +261,10 @@ class RowChecks:
             return
         own = self._expected(columns)
         expect(set(found) == set(own), "scales", f"{sorted(own)} of a touch of {columns} columns", sorted(found))
-        copies = self._copies * MOST_WINDOWS * len(self._plan.milestones())
         for number, field in found.items():
             rows = array(arrays, field, ("int32",), (None, self._dimension))
             codes(field, rows)
-            fits = own[number] <= len(rows) <= own[number] + copies
-            expect(fits, field, f"{own[number]} rows of {columns} columns, and those of copies", len(rows))
+            expect(len(rows) == own[number], field, f"{own[number]} rows of {columns} columns", len(rows))
 
     def _rows_of(self, columns: int) -> dict[int, int]:
         """How many rows a touch of so many columns has, by the number of the scale."""

@@ -73,9 +73,8 @@ class Gate:
 
     def __init__(self, path: Path, identity: Identity, plan: WindowPlan, *, thorough: bool = False) -> None:
         self._path, self.thorough = path, thorough
-        copies = identity.augmentation.copies if identity.augmentation else 0
         made_with = identity.sensor, identity.embedding.dimension, plan
-        self._rows = RowChecks(*made_with, copies)
+        self._rows = RowChecks(*made_with)
         self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.kept_touches))
 
     def head(self, head: Head) -> Head:

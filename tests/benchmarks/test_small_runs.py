@@ -14,11 +14,12 @@ from scroll_tactile_store.row_encoding import decode_row
 from examples.benchmarks import appending, health, health_peers, live_shift
 from examples.benchmarks.interleaved import AsIs
 from examples.benchmarks.live_shift import _scored
+from examples.benchmarks.shift import Shift, Truth, quiet_noise, resting_level, shift_of
 from scroll_tactile import sensors
+from scroll_tactile.errors import InputError
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
-from scroll_tactile.simulation.shift import Shift, Truth
 from scroll_tactile.testing import check_embedding
 
 
@@ -129,3 +130,17 @@ def test_contacts_are_scored_by_the_truth():
     assert (scored["touches"], scored["found"], scored["in_parts"], scored["false"]) == (3, 2, 1, 1)
     assert scored["named_right"] == 1
     assert scored["onset_ms"]["median"] == pytest.approx(15.0)
+
+
+def test_a_shift_of_anybody_s_touches():
+    scene = Scene(sensor=sensors.ROBOSKIN)
+    streams = [scene.touch("oak", repetition) for repetition in range(8)]
+    noise, level = quiet_noise(streams), resting_level(streams)
+    touches = [("oak", stream.readings) for stream in streams]
+    made = shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=30, lost=0, gaps=1, jitter=0.0, drift=0.0)
+    assert len(made.readings) == len(made.times) == 1500
+    first = int(np.searchsorted(made.times, made.touches[0].begin))
+    assert np.array_equal(made.readings[first : first + 75], streams[0].readings)
+    assert (np.diff(made.times) > 0.2).sum() == 1
+    with pytest.raises(InputError, match="hold"):
+        shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=1)

@@ -7,7 +7,6 @@ default learner needs no torch: an empty module stands for the one that a worker
 import json
 import time
 from dataclasses import replace
-from itertools import count
 
 import pytest
 from commands import refused, run
@@ -20,7 +19,7 @@ from examples.benchmarks.health import Measured
 from examples.benchmarks.speed import run_speed
 from examples.benchmarks.speed_bench import Sizes
 from examples.benchmarks.speed_touches import SKIN
-from examples.benchmarks.timing import CLOCKS, Timing, take_turns
+from examples.benchmarks.timing import Timing
 from examples.benchmarks.worker import NAME_BYTES as READ_BYTES
 from examples.benchmarks.worker import _Calls, _resident
 from scroll_tactile import Kernels
@@ -36,19 +35,6 @@ def test_a_timing_is_the_median_and_the_99th_percentile_of_its_calls():
     assert 500 < timing.p99 < 1000
     assert timing.mean == pytest.approx(15.98)
     assert timing.record("of_") == {"of_median_milliseconds": 1.0, "of_p99_milliseconds": timing.p99}
-    assert Timing.of([0.004, 0.002, 0.003], times=2).median == 1.5
-
-
-def test_alternatives_take_turns_and_all_calls_count(monkeypatch):
-    ticks = count()
-    monkeypatch.setitem(CLOCKS, "wall", lambda: next(ticks) / 1000)
-    called = []
-    found = take_turns({name: lambda name=name: called.append(name) for name in "ab"}, rounds=3, warm_up=1)
-    assert "".join(called) == "ab" + "aaaaabbbbb" * 3
-    assert {name: (timing.calls, timing.median, timing.clock) for name, timing in found.items()} == {
-        "a": (15, pytest.approx(1.0), "wall"),
-        "b": (15, pytest.approx(1.0), "wall"),
-    }
 
 
 @pytest.fixture(scope="module")

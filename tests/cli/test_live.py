@@ -11,10 +11,10 @@ from live_touches import slide
 from rich.console import Console
 from touches import PAD, SMALL
 
+from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Kernels, TactileLearner, sensors
 from scroll_tactile.clients.cli import replay
 from scroll_tactile.simulation.scene import Scene
-from scroll_tactile.simulation.shift import simulated_shift
 
 SCENE = Scene(sensors.ROBOSKIN)
 SHIFT = simulated_shift(SCENE, ["silk", "wool"], seconds=22)

@@ -220,7 +220,7 @@ class TestExport:
         with np.load(out / "statistics.npz") as arrays:
             assert arrays["materials"].tolist() == ["a", "b/ü", "c"]
             for scale in whole.memory.statistics.scales:
-                found = [whole._predictor.extractor.codes(whole_image(touch), b"") for _, touch in left]
+                found = [whole._predictor.extractor.codes(whole_image(touch)) for _, touch in left]
                 codes = np.concatenate([rows[scale] for rows in found if scale in rows]).astype(np.int64)
                 assert np.array_equal(arrays[f"second-{scale}"], codes.T @ codes)
                 assert np.array_equal(arrays[f"sums-{scale}"].sum(axis=0), codes.sum(axis=0))

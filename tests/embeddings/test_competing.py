@@ -10,9 +10,18 @@ from images import image
 from touches import PAD
 
 from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.embeddings.convolution.banks import LEVELS, MOST_CHANNELS, bank, to_levels
-from scroll_tactile.embeddings.convolution.counting import GROUP, WEIGHT, competing_counts, competing_groups
-from scroll_tactile.embeddings.convolution.responses import HEAVY, TAPS
+from scroll_tactile.embeddings.convolution import (
+    GROUP,
+    HEAVY,
+    LEVELS,
+    MOST_CHANNELS,
+    TAPS,
+    WEIGHT,
+    bank,
+    competing_counts,
+    competing_groups,
+    to_levels,
+)
 from scroll_tactile.embeddings.joined import Joined
 from scroll_tactile.embeddings.kernels import _dilations, groups_by_dilation
 from scroll_tactile.errors import EmbeddingError
@@ -124,6 +133,6 @@ def test_competing_features_of_another_shape_are_refused():
 
     learner = TactileLearner(sensor=PAD, embedding=Short(dimension=64))
     with pytest.raises(
-        EmbeddingError, match=r"expected competing features of shape \(64,\) from 'kernels'; came \(63,\)"
+        EmbeddingError, match=r"'kernels' .* expected features of shape \(64,\) of all, by competing .*; came \(63,\)"
     ):
         learner.observe("felt", np.linspace([0.0, 1.0], [1.0, 0.0], 50))

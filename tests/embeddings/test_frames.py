@@ -102,7 +102,6 @@ def test_cosines_approximate_a_kernel_of_the_surface_alone():
         ({"seed": -1}, "came 0 and -1"),
         ({"seed": np.nan}, "came 0 and nan"),
         ({"cosines": 9, "weights": NETWORK}, "with weights"),
-        ({"runtime": "onnxruntime"}, "expected a runtime with weights"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(bad, said):
@@ -175,7 +174,7 @@ def test_a_cameras_frames_are_learned_one_by_one_and_judged_together():
     frames = GEL.touch("cord", 0).readings[2:5]
     learner.observe("cord", frames)
     (scale,) = learner.memory.statistics.scales
-    rows = np.concatenate([learner._predictor.extractor.codes(frame_image(frame), b"")[scale] for frame in frames])
+    rows = np.concatenate([learner._predictor.extractor.codes(frame_image(frame))[scale] for frame in frames])
     second = SecondMoment(rows.shape[1])
     second.add(rows)
     assert learner.memory.statistics.counts(scale, ["cord"]).tolist() == [3]

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from images import image
 
 from scroll_tactile import Kernels
-from scroll_tactile.embeddings import kernels
-from scroll_tactile.embeddings.convolution import banks
+from scroll_tactile.embeddings import convolution, kernels
 from scroll_tactile.embeddings.protocol import embed_windows
 
 SMALL = Kernels(dimension=64)
@@ -19,7 +18,7 @@ BOTH = [SMALL, Kernels()]  # the default as well: it uses several thresholds of 
 
 
 def forget_caches():
-    for module in (banks, kernels):
+    for module in (convolution, kernels):
         for item in vars(module).values():
             if hasattr(item, "cache_clear"):
                 item.cache_clear()

@@ -14,16 +14,19 @@ from hypothesis import strategies as st
 from images import image
 
 from scroll_tactile import Kernels, native
-from scroll_tactile.embeddings.convolution import counting
-from scroll_tactile.embeddings.convolution.banks import LEVELS, MOST_CHANNELS, bank
-from scroll_tactile.embeddings.convolution.counting import (
+from scroll_tactile.embeddings import convolution
+from scroll_tactile.embeddings.convolution import (
     GROUP,
+    LEVELS,
+    MOST_CHANNELS,
+    ROUND,
+    Bank,
     CountRequest,
+    bank,
     competing_groups,
     count_by_c,
     count_by_numpy,
 )
-from scroll_tactile.embeddings.convolution.responses import ROUND, Bank
 from scroll_tactile.matching import comparing
 from scroll_tactile.matching.likelihood import MISSING, Table
 from scroll_tactile.matching.matcher import _Pairs
@@ -107,12 +110,12 @@ def test_a_module_that_counts_wrong_is_not_used(monkeypatch):
 
     expected = Kernels(dimension=64).embed(image(3, 60))
     monkeypatch.setattr(native, "count", wrong)
-    counting._agrees.cache_clear()
+    convolution._agrees.cache_clear()
     try:
         assert Kernels(dimension=64).embed(image(3, 60)).tobytes() == expected.tobytes()
-        assert not counting._agrees()
+        assert not convolution._agrees()
     finally:
-        counting._agrees.cache_clear()
+        convolution._agrees.cache_clear()
 
 
 @compiled
@@ -139,7 +142,7 @@ def arguments():
     """Those of a sound call, by name, for an image of 3 channels and 40 readings."""
     own = bank(1, 3, 2)
     groups = competing_groups(own, 2)
-    heavy, begins, channels, thresholds = counting.compiled_bank(own)
+    heavy, begins, channels, thresholds = convolution.compiled_bank(own)
     return {
         "readings": 40, "dilation": 2, "features": 20,
         "levels": np.zeros((3, 40), np.int16), "heavy": heavy, "begins": begins, "channels": channels,
@@ -247,7 +250,7 @@ import importlib.util, sys, numpy as np
 spec = importlib.util.spec_from_file_location("scroll_tactile.native._kernels", sys.argv[1])
 module = importlib.util.module_from_spec(spec); spec.loader.exec_module(module)
 from scroll_tactile import Kernels, native
-from scroll_tactile.embeddings.convolution import counting
+from scroll_tactile.embeddings import convolution
 native._module, native.available = module, True
 rows, known = np.full((3, 300), 254, np.uint8), np.ones(300, np.bool_)
 sums, seen = np.empty((3, 2), np.int64), np.empty(3, np.int64)
@@ -260,7 +263,7 @@ for channels, readings in ((1, 12), (3, 17), (5, 64), (40, 301), (70, 90), (2, 1
     whole = rng.uniform(-1, 1, (channels, readings)).astype(np.float32)
     windows = {readings: [0], 12: [0, readings - 12], readings // 2 + 1: [readings // 3]}
     embedding.embed_competing(whole, windows, readings + 5)
-assert counting._agrees()
+assert convolution._agrees()
 """
 
 

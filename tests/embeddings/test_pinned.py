@@ -10,7 +10,7 @@ import pytest
 
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Frames, Joined, Kernels, sensors
-from scroll_tactile.embeddings.convolution.banks import bank
+from scroll_tactile.embeddings.convolution import bank
 from scroll_tactile.embeddings.protocol import embed_windows, window_plan
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.simulation.scene import Scene

@@ -45,7 +45,6 @@ SHIPPED = {
     "maps of a grid by cosines": (Maps(layout=(4, 5), parts=2, views=["corner"], cosines=64), SKIN),
     "vision": (Vision(NETWORK), SEEN),
     "vision, all stages": (Vision(None, seed=1, stages=(0, 1, 2, 3, 4)), SEEN),
-    "vision, bfloat16": (Vision(NETWORK, stages=(0, 4), precision="bfloat16"), SEEN),
     "joined": (Joined(KERNELS, Vision(NETWORK, stages=(1, 2))), SEEN),
     "joined with one's own": (Joined(Loud(), KERNELS), ((19,), (9, 60))),
     "a module": (ModuleEmbedding(pool(), name="pool", dimension=16), ((19,), (9, 60))),

@@ -11,9 +11,9 @@ from images import image
 
 from scroll_tactile import Vision
 from scroll_tactile.embeddings.resnet import ResNet
+from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.embeddings.vision import pool_windows, to_planes
 from scroll_tactile.errors import InputError
-from scroll_tactile.signals.image import three_planes
 
 REAL = Path.home() / ".cache" / "scroll-tactile" / "weights" / "resnet18_imagenet_vq.safetensors"
 RANDOM = Vision(None, seed=0)
@@ -30,7 +30,7 @@ def test_features_are_the_definition(real_weights):
     """Each stage averaged over rows and columns and scaled to length 1, by NumPy, from the unfolded network."""
     vision, picture = Vision(real_weights, stages=(1, 3, 4)), image(19, 60)
     mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
-    planes = ((three_planes(picture) + 1) / 2 - mean[:, None, None]) / deviation[:, None, None]
+    planes = ((np.stack([picture] * 3) + 1) / 2 - mean[:, None, None]) / deviation[:, None, None]
     with torch.no_grad():
         maps = vision.network().net(torch.from_numpy(planes[None].astype(np.float32)))
     parts = [maps[stage][0].double().numpy().mean(axis=(1, 2)) for stage in (1, 3, 4)]
@@ -97,12 +97,8 @@ def test_the_fingerprint_is_of_all_that_features_depend_on():
     assert RANDOM.fingerprint == Vision(state).fingerprint
     touched = {name: tensor.clone() for name, tensor in state.items()}
     touched["layer4.1.bn2.bias"][0] += 1e-6  # not even used by the default stages
-    others = [
-        Vision(touched),
-        Vision(None, seed=0, stages=(1, 2)),
-        Vision(None, seed=0, precision="bfloat16"),
-    ]
-    assert len({one.fingerprint for one in [RANDOM, *others]}) == 4
+    others = [Vision(touched), Vision(None, seed=0, stages=(1, 2))]
+    assert len({one.fingerprint for one in [RANDOM, *others]}) == 3
     assert len(RANDOM.fingerprint) == 64
     int(RANDOM.fingerprint, 16)
 
@@ -162,8 +158,6 @@ def test_planes_are_scaled_as_in_the_networks_training():
         {"stages": (2, 1)},
         {"stages": (1, 1)},
         {"stages": (5,)},
-        {"runtime": "tensorrt"},
-        {"precision": "int8"},
         {"seed": None},
         {"depth": 19},
     ],
@@ -180,3 +174,18 @@ def test_the_universal_stem_says_what_is_too_small_for_it():
     assert vision.fingerprint
     with pytest.raises(InputError, match="at least 3 channels"):
         vision.embed(image(2, 30))
+
+
+def test_steady_gives_back_what_it_changed():
+    threads, precision = torch.get_num_threads(), torch.get_float32_matmul_precision()
+    try:
+        torch.set_num_threads(2)
+        torch.set_float32_matmul_precision("high")
+        with pytest.raises(KeyError), steady():
+            assert torch.get_num_threads() == 1
+            assert torch.get_float32_matmul_precision() == "highest"
+            raise KeyError
+        assert (torch.get_num_threads(), torch.get_float32_matmul_precision()) == (2, "high")
+    finally:
+        torch.set_num_threads(threads)
+        torch.set_float32_matmul_precision(precision)

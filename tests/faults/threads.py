@@ -428,7 +428,7 @@ def begun(home: Path, seed: int) -> Round:
                 material = worker.material()
                 readings = round_.fresh(material)
                 round_.readings[other.observe(material, readings).key] = readings
-    codes = learner._predictor.extractor.codes(learner._predictor.extractor.image(learner.stream(touch("a", 0))), b"")
+    codes = learner._predictor.extractor.codes(learner._predictor.extractor.image(learner.stream(touch("a", 0))))
     ROWS.update({int(scale): len(rows) for scale, rows in codes.items()})
     round_.reader = TactileLearner.open(home / "memory", mode="read")
     return round_

@@ -76,7 +76,7 @@ class Truth:
         """What it added to the sums."""
         if key not in self._codes:
             extractor = self._learner._predictor.extractor
-            self._codes[key] = extractor.codes(extractor.image(self.stream(key)), key)
+            self._codes[key] = extractor.codes(extractor.image(self.stream(key)))
         return self._codes[key]
 
     def between(self, since: int, until: int, *, inside: bool) -> Iterator[int]:

@@ -267,7 +267,7 @@ def test_a_fold_held_out_starts_as_a_memory_that_never_observed_it(readout):
     samples = []
     for name, stream in held:
         image = extractor.image(stream)
-        samples.append(TrainingSample(name, stream.key, image, {}, extractor.codes(image, stream.key)))
+        samples.append(TrainingSample(name, stream.key, image, {}, extractor.codes(image)))
     start = training.start_without(model, statistics, samples, model.names)
     assert statistics == learner.memory.statistics
     others = learned("kernels", [*range(4), *range(14, len(touches))], readout=readout).model()
@@ -284,7 +284,7 @@ def test_a_material_of_which_all_is_held_out_is_not_compared():
     learner.observe("once", SCENE.touch(SCENE.materials[6], 0))
     stream = extractor.stream(SCENE.touch(SCENE.materials[6], 0))
     image = extractor.image(stream)
-    sample = TrainingSample("once", stream.key, image, {}, extractor.codes(image, stream.key))
+    sample = TrainingSample("once", stream.key, image, {}, extractor.codes(image))
     start = training.start_without(learner.model(), learner.memory.statistics, [sample], [*model.names, "once"])
     assert start.names == model.names
 

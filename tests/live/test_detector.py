@@ -5,12 +5,11 @@ import pytest
 from live_touches import learner, shift, slide
 from touches import PAD, SMALL
 
+from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Sensor, TactileLearner, sensors
-from scroll_tactile.errors import InputError
 from scroll_tactile.live.detector import ContactDetector
 from scroll_tactile.live.rest import Rest
 from scroll_tactile.simulation.scene import Scene
-from scroll_tactile.simulation.shift import quiet_noise, resting_level, shift_of, simulated_shift
 
 
 def found(sensor, rows, false_contacts=1.0, size=10_000):
@@ -182,20 +181,6 @@ def test_a_simulated_shift_s_touches_are_found():
     off = [touch.at - truth.begin for touch, truth in zip(touches, shift_.touches, strict=True)]
     assert np.median(np.abs(off)) <= 0.03
     assert live.report.gaps == 5 and live.report.lost > 0
-
-
-def test_a_shift_of_anybody_s_touches(tmp_path):
-    scene = Scene(sensor=sensors.ROBOSKIN)
-    streams = [scene.touch("oak", repetition) for repetition in range(8)]
-    noise, level = quiet_noise(streams), resting_level(streams)
-    touches = [("oak", stream.readings) for stream in streams]
-    made = shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=30, lost=0, gaps=1, jitter=0.0, drift=0.0)
-    assert len(made.readings) == len(made.times) == 1500
-    first = int(np.searchsorted(made.times, made.touches[0].begin))
-    assert np.array_equal(made.readings[first : first + 75], streams[0].readings)
-    assert (np.diff(made.times) > 0.2).sum() == 1
-    with pytest.raises(InputError, match="hold"):
-        shift_of(touches, sensors.ROBOSKIN, level, noise, seconds=1)
 
 
 @pytest.mark.filterwarnings("error")

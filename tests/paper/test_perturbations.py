@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from paper_touches import PAD
 
-from examples.paper.studies.perturbations import dead, drift, gaussian, length, noise, speed
+from examples.paper.studies.baselines import _copies
+from examples.paper.studies.perturbations import changed, dead, drift, gaussian, length, noise, speed
 from scroll_tactile import sensors
 from scroll_tactile.errors import InputError, StreamTooShortError
-from scroll_tactile.signals.stream import validate
+from scroll_tactile.signals.augmentation import Augmentation, flip, resize
+from scroll_tactile.signals.stream import fewest_readings, validate
 
 DRAWN = (noise, gaussian, dead, drift)
 
@@ -87,3 +89,20 @@ def test_what_cannot_be_is_refused():
     frame = validate(np.zeros((1, *sensors.GELSIGHT.shape)), sensors.GELSIGHT)
     with pytest.raises(InputError, match="whole frames"):
         noise(frame, 0.5, 0)
+
+
+def test_what_is_changed_is_the_image_of_a_stream():
+    stream = touch()
+    assert changed(stream, flip).readings[0].tolist() == pytest.approx(stream.readings[-1].tolist())
+    assert len(changed(stream, lambda image: resize(image, 0.5))) == len(stream) // 2
+    camera = PAD.model_copy(update={"name": "cam", "channels": 192, "layout": (8, 8, 3), "camera": True})
+    with pytest.raises(InputError, match="camera 'cam' takes whole frames"):
+        changed(validate(np.zeros((5, 8, 8, 3)), camera), flip)
+
+
+def test_copies_for_baselines_differ_and_are_never_too_short_to_be_streams():
+    streams = [("felt", touch(i)) for i in range(3)]
+    made, again = (_copies(streams, Augmentation(), 5) for _ in range(2))
+    assert made == again and len({len(stream) for _, stream in made}) > 1
+    short = Augmentation(0, (0.02, 0.02), keep=0.1)
+    assert {len(stream) for _, stream in _copies(streams, short, 0)} == {fewest_readings(PAD)}

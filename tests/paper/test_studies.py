@@ -175,7 +175,7 @@ STUDIES = {
         ("hardness, composed",),
     ),
     "contactile": Study(
-        "fabric contactile --simulated --size 5,6,2 --rows least-squares,resnet-biotac,kernels,ratios-copies "
+        "fabric contactile --simulated --size 5,6,2 --rows least-squares,resnet-biotac,kernels,ratios "
         "--weights W --biotac DATA --epochs 1 --biotac-epochs 1 --every 24 --take 1",
         {
             ("rows", 0): {"key", "system", "paper", "difference", "parts"},

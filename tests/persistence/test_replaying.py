@@ -10,7 +10,7 @@ from scroll_tactile_store import DamageError, Store
 from touches import OBSERVED, PAD, fed, held, stream, without
 
 from examples.paper.transfer.maps import Maps
-from scroll_tactile import Augmented, Capabilities, Joined, Kernels, TactileLearner
+from scroll_tactile import Capabilities, Joined, Kernels, TactileLearner
 from scroll_tactile.persistence import open_memory
 
 
@@ -27,7 +27,6 @@ MADE = {
     "a user's own": {"embedding": OwnKernels(seed=0, dimension=64)},
     "maps, no exemplars": {"embedding": Maps(layout=(2,)), "exemplars": 0},
     "joined": {"embedding": Joined(SMALL, Maps(layout=(2,)))},
-    "copies": {"embedding": SMALL, "augmentation": Augmented(copies=2)},
 }
 
 

@@ -43,7 +43,7 @@ def model(learner):
 
 @pytest.fixture(scope="module")
 def extractor(learner):
-    return FeatureExtractor(learner.sensor, learner.embedding, learner.plan, None)
+    return FeatureExtractor(learner.sensor, learner.embedding, learner.plan)
 
 
 def faster(readings, times):
@@ -65,7 +65,7 @@ def table(model):
 
 def test_a_readout_without_a_touch_is_one_that_followed_its_going(model, extractor):
     material, touch = TOUCHES[5]
-    codes = extractor.codes(extractor.image(touch), touch.key)
+    codes = extractor.codes(extractor.image(touch))
     for scale, readout in model.readouts.items():
         before = readout.scores(codes[scale].mean(axis=0), np.arange(len(NAMES)), "lda")
         without = readout.without(material, codes[scale].astype(np.float64))

@@ -17,7 +17,7 @@ SCENE = Scene(sensor=sensors.BIOTAC, seed=3)
 def test_a_longer_touch_is_viewed_whole_and_its_windows_are_read_as_far_as_was_learned():
     embedding = Kernels(dimension=64)
     plan = window_plan(sensors.BIOTAC, embedding)
-    features, touch = FeatureExtractor(sensors.BIOTAC, embedding, plan, None), SCENE.touch(SCENE.materials[0], 9)
+    features, touch = FeatureExtractor(sensors.BIOTAC, embedding, plan), SCENE.touch(SCENE.materials[0], 9)
     found, part, whole = (
         features.encode(stream, longest, lambda _: plan.scales)
         for stream, longest in ((touch, 200), (touch.first(2.0), 200), (touch, 400))

@@ -71,7 +71,7 @@ def test_how_strange_a_view_looks_depends_on_what_can_be_there(readout, scene, s
     """So the odds within a scene are those of all only where it holds the best of every scale."""
     learner, probe = shared(readout, kept_touches=0), stream(seed % 12, seed)
     model, image = model_of(readout, kept_touches=0), tactile_image(validate(probe, PAD))
-    means = FeatureExtractor(PAD, SMALL, learner.plan, None).means(image, learner.plan.scales)
+    means = FeatureExtractor(PAD, SMALL, learner.plan).means(image, learner.plan.scales)
     for scale in learner.plan.scales:
         scores = model.readouts[scale].scores(means[scale], np.arange(len(NAMES)), readout)
         scene = scene | {NAMES[int(scores.argmax())]}
@@ -129,7 +129,7 @@ def test_competing_kernels_weigh_in_probabilities_and_not_in_novelty_or_distance
     assert moment.calibration.weights[scales.index(COMPETING)] > 0
     assert len(moment.calibration.scale_novelty) == len(scales) - 1
     image = tactile_image(validate(touch, PAD))
-    means = FeatureExtractor(PAD, SMALL, model.plan, None).means(image, scales)
+    means = FeatureExtractor(PAD, SMALL, model.plan).means(image, scales)
     moved = means | {COMPETING: means[COMPETING][::-1]}
     before, after = (model.judge(NAMES, one, image.shape[1], "complete") for one in (means, moved))
     assert (before.novelty, before.distance) == (after.novelty, after.distance)

@@ -17,7 +17,7 @@ from scroll_tactile.statistics.sample import SampledTouch
 PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1.0, unit="N", duration=2.0)
 EMBEDDING = Kernels(dimension=128)
 PLAN = window_plan(PAD, EMBEDDING)
-EXTRACTOR = FeatureExtractor(PAD, EMBEDDING, PLAN, None)
+EXTRACTOR = FeatureExtractor(PAD, EMBEDDING, PLAN)
 SCENE = Scene(sensor=PAD)
 FORCE = Quantity(name="force", unit="N", low=0.0, high=4.0, resolution=0.001)
 NAMES = ["felt", "denim", "cork", "silk"]

@@ -54,7 +54,7 @@ def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
 
 def grown(learner, touches, rule=None):
     model = learner.model()
-    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
+    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan)
     streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
     held_out = [touch for touch in held_out_touches(model, 0.05) if touch.key in touches]
     rule = rule or decision_rule(model, 0.05)
@@ -97,7 +97,7 @@ def test_a_few_touches_of_different_materials_are_chosen(learner):
 
 def test_how_soon_answers_come_is_counted(learner):
     model = learner.model()
-    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan, None)
+    extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan)
     counted = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, together=0.0, least_new=0.0), 0.05)
     assert counted.decided == (1.0,) * len(counted.seconds)
     assert counted.median == counted.seconds[0]

@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.augmentation import Augmentation, Change, augment, changed, crop, fit, flip, jitter, resize
-from scroll_tactile.signals.stream import fewest_readings, validate
-from scroll_tactile.simulation.scene import Scene
-
-PATCH = Sensor(name="patch", channels=6, rate=50.0, low=0.0, high=255.0, unit="counts", duration=1.0)
+from scroll_tactile.signals.augmentation import Augmentation, Change, crop, fit, flip, jitter, resize
 
 few = settings(max_examples=40, deadline=None)
 images = hnp.arrays(
@@ -112,10 +107,10 @@ def test_strengths_do_not_change_what_is_drawn_after():
 def test_by_default_touches_change_and_only_by_the_generator_given():
     state = np.random.get_state()[1].tobytes()  # noqa: NPY002 - it is the one that must not be drawn from
     rng = np.random.default_rng(0)
-    first, second = augment(RAMP, rng, steps=40), augment(RAMP, rng, steps=40)
+    first, second = (Augmentation().augment(RAMP, rng, steps=40) for _ in range(2))
     assert first.shape == second.shape == (2, 40)
     assert first.tobytes() != second.tobytes()
-    assert augment(RAMP, np.random.default_rng(0), steps=40).tobytes() == first.tobytes()
+    assert Augmentation().augment(RAMP, np.random.default_rng(0), steps=40).tobytes() == first.tobytes()
     assert np.random.get_state()[1].tobytes() == state  # noqa: NPY002
 
 
@@ -136,7 +131,7 @@ def test_what_is_no_tactile_image_is_refused(image):
         lambda image: crop(image, 0, 1),
         lambda image: jitter(image, image, image),
         lambda image: fit(image, 3),
-        lambda image: augment(image, rng),
+        lambda image: Augmentation().augment(image, rng),
     ):
         with pytest.raises(InputError, match="expected a tactile image"):
             change(image)
@@ -196,26 +191,3 @@ def test_a_batch_is_changed_as_each_of_it(batch, factor, columns):
     for together, apart in both:
         assert together.tobytes() == np.stack(apart).tobytes()
     assert sound(Change(flip=True, speed=factor, keep=0.5, noise=0.1, drift=0.1).apply(batch, columns))
-
-
-def test_streams_are_changed_each_by_its_own_draw_of_the_seed():
-    scene = Scene(PATCH, seed=0)
-    streams = [scene.touch("felt", i) for i in range(3)]
-    made, again = (Augmentation().streams(streams, np.random.default_rng(5)) for _ in range(2))
-    assert made == again
-    assert len({len(stream) for stream in made}) > 1
-    assert all(one.sensor == PATCH and one != stream for one, stream in zip(made, streams, strict=True))
-    assert changed(streams[0], flip).readings[0].tolist() == pytest.approx(streams[0].readings[-1].tolist())
-    assert len(changed(streams[0], lambda image: resize(image, 0.5))) == len(streams[0]) // 2
-
-
-def test_a_stream_is_never_made_too_short_to_be_one():
-    stream = Scene(PATCH, seed=0).touch("felt", 0)
-    short = Augmentation(0, (0.05, 0.05), keep=0.1)
-    assert {len(one) for one in short.streams([stream] * 20, np.random.default_rng(0))} == {fewest_readings(PATCH)}
-
-
-def test_a_cameras_stream_is_refused():
-    camera = PATCH.model_copy(update={"name": "cam", "channels": 192, "layout": (8, 8, 3), "camera": True})
-    with pytest.raises(InputError, match="camera 'cam' takes whole frames"):
-        changed(validate(np.zeros((5, 8, 8, 3)), camera), flip)

@@ -3,9 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
-from scroll_tactile.signals.image import tactile_image, three_planes
+from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import validate
 
 
@@ -83,13 +82,3 @@ def test_areas_that_divide_pixels_share_them(height, width):
     rows, columns = min(height, 120), min(width, 160)
     truth = np.einsum("rh,hwk,cw->rck", shares(height, rows), frame, shares(width, columns), optimize=True)
     assert np.allclose(image, truth.transpose(0, 2, 1).reshape(rows * 3, columns) / 127.5 - 1, atol=1e-6)
-
-
-def test_three_planes_are_the_image_thrice():
-    image = tactile_image(validate(np.zeros((10, 19)), BIOTAC))
-    planes = three_planes(image)
-    assert planes.shape == (3, 19, 10)
-    assert all(np.array_equal(plane, image) for plane in planes)
-    assert not np.shares_memory(planes, image)
-    with pytest.raises(InputError, match=r"expected a tactile image of shape \(C, T\); came \(3, 19, 10\)"):
-        three_planes(planes)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scroll_tactile_store import DamageError, StoreError
 from touches import PAD, SETTINGS, filled, held, stream
 
-from scroll_tactile import Augmented, Kernels, Quantity, TactileLearner
+from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, MismatchError, ScrollTactileError
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -597,9 +597,3 @@ def test_a_configuration_that_makes_nothing_is_found_before_it_is_opened(path, c
     assert any("configuration" in found for found in check_memory(path))
     with pytest.raises(EmbeddingError):
         opened(path)
-
-
-def test_copies_have_bounds():
-    for wrong in ({"copies": 1001}, {"speed": 101.0}):
-        with pytest.raises(ValueError, match="expected"):
-            Augmented(**wrong)

@@ -34,7 +34,6 @@ from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.signals.augmentation import Augmentation
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 
 __all__ = [
@@ -56,10 +55,8 @@ ROWS = {
     "resnet-augmented": "… and augmentation",
     "resnet-biotac": "… and BioTac pre-training",
     "kernels": "ours, kernels",
-    "kernels-copies": "ours, kernels, and copies at other speeds",
     "kernels+vision": "ours, kernels+vision",
     "ratios": "ours, kernels, on ratios of forces",
-    "ratios-copies": "ours, kernels, on ratios of forces, and copies at other speeds",
 }
 """Key, as on the command line → name, as in tables."""
 
@@ -73,12 +70,10 @@ PAPER = {
 """The paper's scores from protocol 1 to 2, on real fabrics, which are not public."""
 PAPER_EPOCHS = 50
 
-OURS = ("kernels", "kernels-copies", "kernels+vision", "ratios", "ratios-copies")
+OURS = ("kernels", "kernels+vision", "ratios")
 NEED_WEIGHTS = ("least-squares", "least-squares-biotac", "resnet-biotac", "kernels+vision")
 NEED_BIOTAC = ("least-squares-biotac", "resnet-biotac")
 EPOCHAL = ("least-squares-biotac", "resnet", "resnet-augmented", "resnet-biotac")
-
-COPIES = Augmented(copies=4, speed=2.0)
 
 
 @dataclass(frozen=True)
@@ -180,8 +175,7 @@ class RowMaker:
         name = ROWS[key]
         if key in OURS:
             read = ratios if key.startswith("ratios") else _as_it_is
-            copies = COPIES if key.endswith("copies") else None
-            return ConstituentMemory(name, self.shares, self._embedding(key), read, copies)
+            return ConstituentMemory(name, self.shares, self._embedding(key), read)
         if key == "least-squares":
             return ConstituentSquares(name, self.shares, self._squares)
         if key == "least-squares-biotac":

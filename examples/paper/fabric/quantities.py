@@ -107,7 +107,7 @@ class Quantities:
     def _encoded(self) -> list[EncodedSlide]:
         embedding = Kernels()
         plan = window_plan(CPM_FINGER, embedding)
-        extractor = FeatureExtractor(CPM_FINGER, embedding, plan, None)
+        extractor = FeatureExtractor(CPM_FINGER, embedding, plan)
 
         def encoded(place: int, material: str, slide: Stream) -> EncodedSlide:
             stream = slide.first(CPM_FINGER.duration)

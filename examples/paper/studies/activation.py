@@ -45,7 +45,7 @@ from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.signals.image import tactile_image, three_planes
+from scroll_tactile.signals.image import tactile_image
 
 __all__ = [
     "CONTROL",
@@ -202,7 +202,7 @@ def _maps(net: ResNet, images: Sequence[npt.NDArray[np.float32]]) -> FloatArray:
     rows = []
     with torch.inference_mode():
         for image in images:
-            planes = torch.from_numpy(three_planes(image))[None]
+            planes = torch.from_numpy(np.stack([image] * 3))[None]
             rows.append(first_block(net, planes)[0].flatten(1).T.numpy())
     return np.concatenate(rows)
 

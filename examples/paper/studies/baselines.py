@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from examples.paper.runs.cells import held_back
+from examples.paper.studies.perturbations import changed
 from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, OURS, SYSTEMS, Catalogue
 from examples.paper.systems.own import code_digest, is_own
 from examples.paper.systems.system_protocol import System
 from scroll_tactile.clients.learning.classification import Labelled
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
-from scroll_tactile.signals.augmentation import Augmentation, Change
+from scroll_tactile.signals.augmentation import Augmentation, Change, Image, fit
+from scroll_tactile.signals.stream import fewest_readings
 
 if TYPE_CHECKING:
     from examples.paper.studies.strengths import Make
@@ -91,4 +94,14 @@ def _part(train: Sequence[Labelled], seed: int) -> tuple[list[Labelled], list[La
 
 def _copies(touches: Sequence[Labelled], augmentation: Augmentation, seed: int) -> list[Labelled]:
     random = np.random.default_rng([seed, 4])
-    return [(name, copy) for name, stream in touches for copy in augmentation.streams([stream] * COPIES, random)]
+    return [
+        (name, changed(stream, partial(_long_enough, augmentation.draw(random), fewest_readings(stream.sensor))))
+        for name, stream in touches
+        for _ in range(COPIES)
+    ]
+
+
+def _long_enough(change: Change, least: int, image: Image) -> Image:
+    """The changed image; where it is shorter than a stream can be it goes on as its mirror image."""
+    made = change.apply(image)
+    return made if made.shape[-1] >= least else fit(made, least)

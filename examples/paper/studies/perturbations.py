@@ -13,10 +13,11 @@ from collections.abc import Callable
 import numpy as np
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.signals.augmentation import Image, changed, resize
-from scroll_tactile.signals.stream import Stream, fewest_readings
+from scroll_tactile.signals.augmentation import Image, resize
+from scroll_tactile.signals.image import tactile_image
+from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 
-__all__ = ["dead", "drift", "gaussian", "length", "noise", "speed"]
+__all__ = ["changed", "dead", "drift", "gaussian", "length", "noise", "speed"]
 
 _KINDS = {"noise": 0, "dead": 1, "drift": 2, "gaussian": 3}
 
@@ -77,6 +78,20 @@ def drift(stream: Stream, strength: float, seed: int = 0) -> Stream:
     return _drawn(stream, "drift", strength, seed, lambda image, rng: _wander(image, strength, strength, rng))
 
 
+def changed(stream: Stream, change: Callable[[Image], Image]) -> Stream:
+    """The stream whose tactile image, float32 (C, T) in [-1, 1], is what `change` makes of this one's.
+
+    `changed(stream, flip)` is the slide the other way. Raises InputError for a camera's stream, and what `validate`
+    raises for what came out.
+    """
+    sensor = stream.sensor
+    if sensor.camera:
+        raise InputError(f"changes are of channels along time, and camera {sensor.name!r} takes whole frames")
+    image = change(tactile_image(stream)).T.astype(np.float64)
+    low, high = np.asarray(sensor.low), np.asarray(sensor.high)
+    return validate(low + (image + 1) / 2 * (high - low), sensor)
+
+
 def _drawn(
     stream: Stream, kind: str, strength: float, seed: int, change: Callable[[Image, np.random.Generator], Image]
 ) -> Stream:
@@ -86,7 +101,6 @@ def _drawn(
         raise InputError(f"expected a seed of 0 or more; came {seed}")
     if strength == 0:
         return stream
-    # With 2 in front, where copies that are learned from have 1: never the same draw.
     rng = np.random.default_rng([2, seed, _KINDS[kind], int.from_bytes(stream.key, "little")])
     return changed(stream, lambda image: change(image, rng))
 

@@ -28,7 +28,6 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.training import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.results import Composition
-from scroll_tactile.signals.copies import Augmented
 from scroll_tactile.signals.stream import Stream
 
 __all__ = [
@@ -253,8 +252,7 @@ class _Body(nn.Module):
 class ConstituentMemory(OneByOne[TactileLearner]):
     """Ours: a `TactileLearner` that is given what fabrics are made of, and composes.
 
-    embedding: frozen. read: from a touch to the stream that is learned or tested. augmentation: copies that
-    touches are observed with, or none.
+    embedding: frozen. read: from a touch to the stream that is learned or tested.
     """
 
     def __init__(
@@ -263,11 +261,10 @@ class ConstituentMemory(OneByOne[TactileLearner]):
         shares: Shares,
         embedding: Embedding,
         read: Callable[[Stream], Stream] = lambda stream: stream,
-        augmentation: Augmented | None = None,
     ) -> None:
         super().__init__(name)
         self._read = read
-        self._shares, self._embedding, self._augmentation = shares, embedding, augmentation
+        self._shares, self._embedding = shares, embedding
 
     def compositions(
         self, streams: Sequence[Stream], unfamiliar: float, progress: Progress = silent
@@ -288,8 +285,7 @@ class ConstituentMemory(OneByOne[TactileLearner]):
         return estimates_of(self._shares.names, self.compositions(streams, 0.0, progress))
 
     def _made(self, stream: Stream) -> TactileLearner:
-        sensor, augmentation = self._read(stream).sensor, self._augmentation
-        learner = TactileLearner(sensor=sensor, embedding=self._embedding, exemplars=0, augmentation=augmentation)
+        learner = TactileLearner(sensor=self._read(stream).sensor, embedding=self._embedding, exemplars=0)
         for fabric, shares in self._shares.of.items():
             learner.describe(fabric, {name: shares.get(name, 0.0) for name in self._shares.names})
         return learner

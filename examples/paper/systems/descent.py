@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from scroll_tactile.embeddings.runtimes import full_float32
+from scroll_tactile.embeddings.steady import full_float32
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.finetune.training import Progress
 

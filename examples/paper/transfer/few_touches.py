@@ -63,7 +63,7 @@ class WidestFeatures:
             raise InputError(f"expected an embedding that judges by the widest scale alone; came {embedding!r}")
         self.embedding = embedding
         self._plan = plan
-        self._extractor = FeatureExtractor(sensor, embedding, plan, None)
+        self._extractor = FeatureExtractor(sensor, embedding, plan)
         self._kept: dict[bytes, npt.NDArray[np.floating]] = {}
 
     def __call__(self, stream: Stream) -> npt.NDArray[np.floating]:

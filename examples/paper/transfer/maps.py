@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, shift
 
 from scroll_tactile.embeddings.protocol import Capabilities, canary
-from scroll_tactile.embeddings.runtimes import one_torch_thread
+from scroll_tactile.embeddings.steady import one_torch_thread
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import optional
 

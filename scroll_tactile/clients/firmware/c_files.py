@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from scroll_tactile import __version__
 from scroll_tactile.clients.firmware.exported_judge import ANGLES, CHANCES, ExportedAnswer, ExportedJudge, LevelRows
-from scroll_tactile.embeddings.convolution.counting import compiled_bank
+from scroll_tactile.embeddings.convolution import compiled_bank
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.features import stream_of

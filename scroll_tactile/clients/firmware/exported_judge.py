@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.convolution.banks import LEVELS, to_levels
+from scroll_tactile.embeddings.convolution import LEVELS, to_levels
 from scroll_tactile.embeddings.kernels import Kernels
 from scroll_tactile.errors import InputError
 from scroll_tactile.prediction.features import Readings

@@ -74,7 +74,7 @@ def _require_exportable(recipe: Recipe, names: Sequence[str]) -> None:
     if not isinstance(recipe.embedding, Kernels) or recipe.sensor.camera or len(recipe.plan.widths) > MOST_SCALES:
         raise InputError(
             f"only memories of the default embedding, Kernels, can be exported as C; this one's is "
-            f"{recipe.embedding!r} for {recipe.sensor.name}. Carry it over with reembed(Kernels()), or export ONNX"
+            f"{recipe.embedding!r} for {recipe.sensor.name}. Carry it over with reembed(Kernels())"
         )
     if not 0 < len(names) <= MOST_MATERIALS:
         raise InputError(

@@ -43,7 +43,6 @@ from scroll_tactile.memory.touch_rows import SOURCE
 from scroll_tactile.persistence.merge import Choice
 from scroll_tactile.recipe import RecipeRequest
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.signals.copies import Augmented
 
 __all__ = ["FleetReport", "learn"]
 
@@ -63,7 +62,6 @@ def learn(
     *,
     sensor: Sensor | None = None,
     embedding: Embedding | None = None,
-    augmentation: Augmented | None = None,
     exemplars: int | None = None,
     kept_touches: int | None = None,
     workers: int | None = None,
@@ -77,8 +75,7 @@ def learn(
 
     sources: files, folders and addresses that fsspec knows, of recordings (as `recordings.read` takes them) and of
     memories, in folders or packed. options: how recordings are cut into touches and named.
-    sensor, embedding, augmentation, exemplars, kept_touches: of the memory, as of `TactileLearner`; an existing one
-    knows.
+    sensor, embedding, exemplars, kept_touches: of the memory, as of `TactileLearner`; an existing one knows.
     workers: processes on this machine; as many as it has cores unless given. With one, and no patience, this one
     learns. client: of a `dask.distributed` cluster, or anything whose `get_executor` gives an Executor, or an Executor;
     its workers must reach the folder beside the destination, where packed memories lie until they are merged.
@@ -101,9 +98,7 @@ def learn(
     place = Path(destination).absolute()
     found, missing = expand([os.fspath(source) for source in sources], patience)
     report = FleetReport(refused=missing)
-    requested = RecipeRequest.of(
-        sensor, embedding, augmentation, {"exemplars": exemplars, "kept_touches": kept_touches}
-    )
+    requested = RecipeRequest.of(sensor, embedding, {"exemplars": exemplars, "kept_touches": kept_touches})
     folder = place.with_name(place.name + ".fleet")
     with ExitStack() as stack:
         stack.enter_context(alone_in(folder, place))

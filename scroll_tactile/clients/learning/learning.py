@@ -14,7 +14,7 @@ import numpy as np
 from scroll_tactile.clients.learning.classification import Answers
 from scroll_tactile.clients.learning.metrics import calibration_error, interval_figures
 from scroll_tactile.clients.learning.sources import Refused, SourceOptions, SourceTouch, source_touches
-from scroll_tactile.errors import InputError, printable
+from scroll_tactile.errors import EmbeddingError, InputError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.results import Estimate, Prediction, Receipt
@@ -147,6 +147,9 @@ class _Batch:
             return self._learner.observe(material, touch.stream, **noted, source=touch.source, again=self._every)
         except InputError as error:
             return str(error)
+        except EmbeddingError as error:
+            error.add_note(f"The touch is {touch.source}, of {material!r}.")
+            raise
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,7 @@ class MemoryFacts:
     def extractor(self) -> FeatureExtractor:
         """What makes features of touches."""
         learner = self.learner
-        return FeatureExtractor(learner.sensor, learner.embedding, learner.plan, learner.augmentation)
+        return FeatureExtractor(learner.sensor, learner.embedding, learner.plan)
 
     @cached_property
     def rule(self) -> DecisionRule | None:

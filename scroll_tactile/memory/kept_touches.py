@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from scroll_tactile.matching.likelihood import LevelArray, levels_of
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.touch_rows import Arrays
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Annotations, together
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.statistics.sample import Sample
 
 __all__ = ["KeptTouches"]
@@ -52,22 +51,9 @@ class KeptTouches(Sample[KeptTouch]):
         readings: npt.NDArray[np.floating] | None,
         annotation: Annotation = NO_ANNOTATION,
     ) -> None:
-        """Keep a touch where it belongs in, if its readings are there, or note how one that is kept was annotated."""
-        if self.holds(material, key):
-            self.note(material, key, annotation)
-        elif readings is not None and self.wants(material, key):
-            self.add(material, key, KeptTouch(material, key, self.levels(readings), together([(annotation, 1)])))
-
-    def note(self, material: str, key: bytes, annotation: Annotation) -> None:
-        """Note how one more observation of a touch was annotated, if it is kept."""
-        if annotation:
-            self.change(
-                material, key, lambda held: replace(held, annotations=together(held.annotations, [(annotation, 1)]))
-            )
-
-    def joined(self, held: KeptTouch, item: KeptTouch) -> KeptTouch:
-        """The touch with the annotations of both."""
-        return replace(held, annotations=together(held.annotations, item.annotations))
+        """Keep a touch where it belongs in, if its readings are there."""
+        if readings is not None and self.wants(material, key):
+            self.add(material, key, KeptTouch(material, key, self.levels(readings), annotation))
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the material of each touch."""
@@ -79,9 +65,9 @@ class KeptTouches(Sample[KeptTouch]):
             "kept-levels": np.diff(levels, prepend=np.uint8(0)),
         }, [touch.material for touch in kept]
 
-    def fill(self, arrays: Arrays, materials: Sequence[str], annotations: Sequence[Annotations] = ()) -> None:
+    def fill(self, arrays: Arrays, materials: Sequence[str], annotations: Sequence[Annotation] = ()) -> None:
         """Take in what `to_arrays` described; annotations: of each touch."""
-        noted = annotations or [()] * len(materials)
+        noted = annotations or [NO_ANNOTATION] * len(materials)
         columns, channels = arrays["kept-columns"], self.sensor.channels
         parts = np.split(np.cumsum(arrays["kept-levels"], dtype=np.uint8), np.cumsum(columns * channels)[:-1])
         for i, material in enumerate(materials):

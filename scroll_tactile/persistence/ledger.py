@@ -28,6 +28,7 @@ from scroll_tactile.memory.touch_rows import (
     Added,
     Codes,
     annotated,
+    annotation_of,
     declaration,
     pack_codes,
     pack_readings,
@@ -75,19 +76,17 @@ class Ledger(OpenMemory):
         codes: Codes,
         source: str | None = None,
         annotation: Annotation = NO_ANNOTATION,
-        *,
-        again: bool = False,
     ) -> Receipt:
         """Append an observation to the journal, then add it to the memory; durable on return, in a batch at its end.
 
-        again: observe once more a touch that the memory has under this name. Raises AnnotationError for one that it has
+        Of a touch that the memory has under this name nothing is learned. Raises AnnotationError for one that it has
         with another annotation.
         """
         require_row(stream)
         with self.lock:
             self.require_open()
             # A memory opened to read skips this: its journal refuses the row below.
-            if not again and (self.store is None or self.store.mode == "write"):
+            if self.store is None or self.store.mode == "write":
                 known = self._known(material, stream.key, annotation)
                 if known is None and stream.raw is not None:  # learned before the memory was adapted
                     known = self._known(material, stream.raw.key, annotation)
@@ -106,29 +105,27 @@ class Ledger(OpenMemory):
             return self._receipt(sequence, material, stream)
 
     def _known(self, material: str, key: bytes, annotation: Annotation) -> int | None:
-        """The first row that has a touch under this name, and so annotated unless nothing is said; None without any.
+        """The row that has a touch under this name; None where there is none.
 
-        Raises AnnotationError where it has the touch annotated otherwise.
+        Raises AnnotationError where it has the touch annotated otherwise than is said, if anything is.
         """
-        rows = self.contents().rows(material, key)
-        if not rows or not annotation:
-            return min(rows, default=None)
-        if same := [sequence for sequence, there in rows.items() if there == annotation]:
-            return min(same)
-        quantities, first = self.memory.quantities, min(rows)
-        raise AnnotationError(
-            f"observation {first} has this touch of {material!r} with {rows[first].shown(quantities)}; came "
-            f"{annotation.shown(quantities)}. Retract it first, or count the touch once more with again=True"
-        )
+        sequence, there = self.contents().rows(key).get(material, (None, annotation))
+        if annotation and there != annotation:
+            quantities = self.memory.quantities
+            raise AnnotationError(
+                f"observation {sequence} has this touch of {material!r} with {there.shown(quantities)}; came "
+                f"{annotation.shown(quantities)}. Retract it first, which takes a path and a row that was not compacted"
+            )
+        return sequence
 
     def _undo_of(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
         """A function that undoes the next observation, for a memory without a store."""
-        memory, sequence = self._memory.undo(material, key, columns, annotation), self._memory.sequence + 1
+        memory = self._memory.undo(material, key, columns, annotation)
 
         def undo() -> None:
             memory()
             if self._contents is not None:
-                self._contents.remove(material, key, sequence)
+                self._contents.remove(material, key)
 
         return undo
 
@@ -294,6 +291,9 @@ class Ledger(OpenMemory):
             record = observation_of(store, self.memory, receipt)
             if record.label == material:
                 raise InputError(f"observation {record.sequence} of {store.path} is called {material!r} already")
+            if (known := self._known(material, record.key, annotation_of(record.attributes))) is not None:
+                self._retract(store, [record], "")
+                return known
             store.compaction()  # raises where it is damaged: choosing samples again needs it
             memory = self._memory
             with self._mutation(), store.batch():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import takewhile
 from typing import cast
 
@@ -35,7 +34,6 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.correction import Correction
-from scroll_tactile.statistics.annotations import Annotation, Annotations, together
 from scroll_tactile.validation.gate import misdeclared, wrong_values
 
 __all__ = [
@@ -256,36 +254,13 @@ def _compaction_samples(memory: Memory, store: Store) -> Memory:
             "repair)",
             damage,
         )
-        counted = _counted(memory, store)
+        rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
+        # The memory is asked as well: a row that retracts one of them may have been lost to damage.
+        left = {(head.label, head.key) for head in rows if not memory.is_gone(head.sequence)}
         fresh.quantities = dict(memory.quantities)
-        fresh.sample.update(
-            (name, key, replace(touch, copies=count, annotations=noted))
-            for name, key, touch in memory.sample
-            for count, noted in counted.get((name, key), ())
-        )
-        if fresh.kept is not None and memory.kept is not None:
-            fresh.kept.update(
-                (name, key, replace(touch, annotations=noted))
-                for name, key, touch in memory.kept
-                for _, noted in counted.get((name, key), ())
-            )
-        if fresh.exemplars is not None and memory.exemplars is not None:
-            fresh.exemplars.update(item for item in memory.exemplars if item[:2] in counted)
+        for sample, before in zip(fresh.samples, memory.samples, strict=True):
+            sample.update(item for item in before if item[:2] in left)
     return fresh
-
-
-def _counted(memory: Memory, store: Store) -> dict[tuple[str, bytes], list[tuple[int, Annotations]]]:
-    """(material, key) → how often the compacted rows observed the stream, without retracted observations, and how
-    these were annotated: a list of one.
-
-    `memory.is_gone` is asked as well: a row that retracts one of them may have been lost to damage.
-    """
-    rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
-    left = [head for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence)]
-    noted: dict[tuple[str, bytes], list[Annotation]] = {}
-    for head in left:
-        noted.setdefault((head.label, head.key), []).append(annotation_of(head.attributes))
-    return {stream: [(len(own), together((one, 1) for one in own))] for stream, own in noted.items()}
 
 
 def require_compaction(memory: Memory, store: Store) -> None:

@@ -15,10 +15,9 @@ from scroll_tactile.memory.touch_rows import Arrays
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.grid import BITS, rows_of
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
 from scroll_tactile.statistics.statistics import SECOND
-from scroll_tactile.statistics.tables import rows_of
 from scroll_tactile.validation.expected import (
     LONGEST_TOUCH,
     array,
@@ -72,10 +71,6 @@ class CheckpointChecks:
         rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
         sampled = _names("sample", attributes.get("sample"), materials)
         self._check_sample(arrays, sampled)
-        copies: Any = attributes.get("copies")
-        expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of sample", copies)
-        for each in copies:
-            whole("copies", each, 1, MOST_ROWS)
         check_axis = partial(self._check_axis, arrays, totals, thorough=thorough)
         check_targets(arrays, attributes, dict(zip(materials, touches, strict=True)), check_axis)
         if self._keeps or "kept" in attributes:

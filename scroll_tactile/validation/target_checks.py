@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from scroll_tactile.memory.state import ANNOTATED
 from scroll_tactile.memory.touch_rows import LABELS, VALUES, Arrays
 from scroll_tactile.quantities import MOST_QUANTITIES, Quantity
-from scroll_tactile.statistics.annotations import MOST_AXES
-from scroll_tactile.statistics.targets import axis_arrays
+from scroll_tactile.statistics.annotations import MOST_AXES, axis_arrays
 from scroll_tactile.validation.expected import array, check_annotation, check_quantity, expect, name, whole
 
 __all__ = ["check_targets"]
@@ -43,8 +42,7 @@ def check_targets(
         check_axis(axis_arrays(arrays, number), labels)
     for which, of in zip(ANNOTATED, SAMPLES, strict=True):
         if of in attributes:
-            copies = attributes["copies"] if of == "sample" else [touches[material] for material in attributes[of]]
-            noted = _check_annotations(which, attributes.get(which), copies, quantities, axes)
+            noted = _check_annotations(which, attributes.get(which), len(attributes[of]), quantities, axes)
             expect(noted <= about["touches"], which, f"those of {about['touches']} touches", noted)
 
 
@@ -87,21 +85,16 @@ def _axes(stored: Any) -> dict[str, list[str]]:
 
 
 def _check_annotations(
-    field: str, stored: Any, copies: Sequence[int], quantities: Mapping[str, Quantity], axes: Mapping[str, list[str]]
+    field: str, stored: Any, count: int, quantities: Mapping[str, Quantity], axes: Mapping[str, list[str]]
 ) -> int:
-    """How many observations of the touches of a sample were annotated; copies: at most so many of each."""
-    expect(isinstance(stored, list) and len(stored) == len(copies), field, "one of each touch", stored)
-    for of, most in zip(stored, copies, strict=True):
-        pairs = isinstance(of, list) and all(isinstance(each, list) and len(each) == 2 for each in of)
-        expect(pairs, field, "annotations, each with the observations that had it", of)
-        for attributes, count in of:
-            whole(field, count, 1, most)
-            expect(isinstance(attributes, dict) and bool(attributes), field, "values or labels", attributes)
-            check_annotation(f"{field}.", attributes)
-            for quantity, steps in attributes.get(VALUES, {}).items():
-                known = quantity in quantities and steps <= quantities[quantity].steps
-                expect(known, field, "values of declared quantities", attributes)
-            for axis, label in attributes.get(LABELS, {}).items():
-                expect(label in axes.get(axis, ()), field, "labels that touches have", attributes)
-        expect(sum(count for _, count in of) <= most, field, f"at most {most} observations", of)
-    return sum(count for of in stored for _, count in of)
+    """How many of so many touches of a sample are annotated."""
+    expect(isinstance(stored, list) and len(stored) == count, field, "one of each touch", stored)
+    for attributes in stored:
+        expect(isinstance(attributes, dict), field, "values or labels", attributes)
+        check_annotation(f"{field}.", attributes)
+        for quantity, steps in attributes.get(VALUES, {}).items():
+            known = quantity in quantities and steps <= quantities[quantity].steps
+            expect(known, field, "values of declared quantities", attributes)
+        for axis, label in attributes.get(LABELS, {}).items():
+            expect(label in axes.get(axis, ()), field, "labels that touches have", attributes)
+    return sum(map(bool, stored))

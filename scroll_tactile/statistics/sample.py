@@ -23,7 +23,8 @@ __all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage
 
 CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
 
-T, U = TypeVar("T"), TypeVar("U")
+T = TypeVar("T")
+U = TypeVar("U")
 Codes = dict[Scale, npt.NDArray[np.int32]]
 
 

@@ -24,7 +24,7 @@ def test_it_is_refused_and_left_as_it_is(path):
         with pytest.raises(VersionError, match=SAID):
             TactileLearner.open(path, **settings)
     with TactileLearner.open(path.parent / "ours", **SETTINGS) as ours, pytest.raises(VersionError, match=SAID):
-        ours.merge(path, shared="once")
+        ours.merge(path)
     assert sorted(entry.name for entry in path.iterdir()) == ["generations", "journal.sqlite"]
 
 

@@ -28,11 +28,11 @@ class TestSource:
             learner.reembed()
             assert sources(learner) == expected
             with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
-                other.merge(learner, shared="once")
+                other.merge(learner)
                 assert sources(other) == expected
             learner.compact()
             with TactileLearner.open(tmp_path / "third", **SETTINGS) as third:
-                third.merge(learner, shared="once")
+                third.merge(learner)
                 kept = [(material, state, source) for _, material, state, source in sources(third)]
                 assert kept == [("a", "compacted", expected[0][3]), ("b", "compacted", None)]
 

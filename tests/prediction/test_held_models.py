@@ -202,7 +202,7 @@ def merging(learner, names, tmp_path, compacted=False):
                 other.observe(name, touch("n", 10 + seed))
         if compacted:
             other.compact(keep=0)
-    learner.merge(tmp_path / "other", shared="twice")
+    learner.merge(tmp_path / "other")
 
 
 def forgetting(learner, names, tmp_path):

@@ -117,7 +117,7 @@ class TestIdentity:
             assert again.augmentation is None
             filled(tmp_path / "other", FELT[:1])[0].close()
             with pytest.raises(MismatchError, match="augmentations differ"):  # nor are memories of two merged
-                again.merge(tmp_path / "other", shared="once")
+                again.merge(tmp_path / "other")
 
     def test_cameras_and_other_things_are_refused(self):
         with pytest.raises(InputError, match="whole frames"):

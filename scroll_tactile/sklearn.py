@@ -157,10 +157,8 @@ class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  
 
     Touches X: as of `TactileClassifier`. Numbers y, (N,), finite. materials: what each touch is of, (N,), passed to
     `fit`, two or more: intervals for materials that were never felt come from those held out. A touch that comes twice
-    of one material counts once, and is refused with another number.
-
-    sensor, embedding, readout, kept_touches: as of `TactileClassifier`. It rests on 256 touches at most, drawn by their
-    content (see `TactileLearner.estimate`).
+    of one material counts once, and with another number it is refused. It rests on 256 touches at most, drawn by their
+    content (see `TactileLearner.estimate`). sensor, embedding, readout, kept_touches: as of `TactileClassifier`.
 
     After fitting: n_features_in_, as of `TactileClassifier`; learner_, the learner, whose quantity is "y", from the
     least y to the most and their difference beyond both.

@@ -134,9 +134,8 @@ class Current:
                 )
             if known["format"] < FORMAT_VERSION:
                 raise VersionError(
-                    f"{path} is written in format {known['format']}, by scroll-tactile 0.15 or a release before it; "
-                    f"this release reads format {FORMAT_VERSION}: learn it again from the recordings, or open it with "
-                    "scroll-tactile 0.15; nothing was changed"
+                    f"{path} is written in format {known['format']}, by scroll-tactile 0.15 or before; this one reads "
+                    f"format {FORMAT_VERSION}: learn it again from the recordings, or open it with scroll-tactile 0.15"
                 )
             number, identity = known["log"]
             newest, compaction = (

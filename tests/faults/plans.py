@@ -52,19 +52,13 @@ def draw(rng: random.Random, state: State, others: Others, kind: str) -> Operati
         "retract": lambda: (_row(rng, state),),
         "forget": lambda: (_material(rng, state),),
         "relabel": lambda: (_row(rng, state), rng.choice(KIT.materials)),
-        "merge": lambda: _to_merge(rng, state, others),
+        "merge": lambda: (rng.choice([*sorted(others), *dict(state.packed)]), rng.choice(("same", "ours", "theirs"))),
         "compact": lambda: (rng.choice((0, 1, 2, 4)),),
         "pack": lambda: (f"packed-{len(state.packed)}", rng.random() < 0.7),
         "reembed": lambda: (rng.choice(sorted(KIT.embeddings)),),
         "fleet": lambda: (_of_one_name(rng, state),),
     }
     return kind, *drawn.get(kind, tuple)()
-
-
-def _to_merge(rng: random.Random, state: State, others: Others) -> Operation:
-    """One of the others, or what this memory was packed as."""
-    name = rng.choice([*sorted(others), *dict(state.packed)])
-    return name, rng.choice(("same", "ours", "theirs"))
 
 
 def _row(rng: random.Random, state: State) -> int:

@@ -11,7 +11,7 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.kept_touches import KeptTouches
+from scroll_tactile.memory.state import KeptTouches
 from scroll_tactile.recipe import default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
 

@@ -22,11 +22,11 @@ from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
-from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.persistence.replaying import ranked_exemplars
 from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches
 from scroll_tactile.prediction.features import Readings
 from scroll_tactile.prediction.model import Model

@@ -142,17 +142,7 @@ class Sample(Generic[T]):
 
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
-        given = list(items)
-        if not self._items and len(given) <= self.capacity:  # all stay: there is nothing to choose
-            for material, key, item in given:
-                self._items.setdefault((material, key), item)
-            for material, key in self._items:
-                self._keys.setdefault(material, []).append(key)
-            for keys in self._keys.values():
-                keys.sort()
-            self._greatest = None
-            return
-        for material, key, item in given:
+        for material, key, item in items:
             self.add(material, key, item)
 
     def refill(self, streams: Iterable[tuple[str, bytes, U]], make: Callable[[U], T]) -> None:

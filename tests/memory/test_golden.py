@@ -7,6 +7,7 @@ checkpoints, and `tests/data/format-2.json`, what is in it. A release from 1.0 o
 
 import hashlib
 import json
+import re
 import shutil
 import tempfile
 import zipfile
@@ -212,6 +213,18 @@ def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
     assert {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()} == before
 
 
+@pytest.fixture(params=["0.15", "0.7"])
+def old(request, tmp_path):
+    """What two releases left, and what is said of it."""
+    path = tmp_path / "m"
+    if request.param == "0.15":
+        shutil.unpack_archive(GOLDEN.with_name("format-1.zip"), path)
+        return path, r"in format 1, by scroll-tactile 0\.15 or before; this one reads format 2: learn it again from the"
+    (path / "generations" / "00000001").mkdir(parents=True)
+    (path / "journal.sqlite").write_bytes(b"SQLite format 3\0" + bytes(4080))
+    return path, "was made by a release 0.x, whose memories this one does not read: learn it again from the"
+
+
 @pytest.mark.parametrize(
     "use",
     [
@@ -225,15 +238,16 @@ def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
     ],
     ids=["open", "write", "read", "merge", "check", "check_memory", "repair"],
 )
-def test_a_memory_of_0_15_is_refused_by_name_and_left_as_it_is(tmp_path, use):
-    path = tmp_path / "m"
-    shutil.unpack_archive(GOLDEN.with_name("format-1.zip"), path)
-    before = {file: file.read_bytes() for file in path.rglob("*")}
-    with pytest.raises(VersionError, match=r"format 1, by scroll-tactile 0\.15 .* format 2: learn it again from"):
+def test_a_memory_of_an_older_release_is_refused_by_name_and_left_as_it_is(old, use):
+    path, said = old
+    before = {file: file.is_file() and file.read_bytes() for file in path.rglob("*")}
+    with pytest.raises(VersionError, match=said):
         use(path)
-    assert "learn it again from the recordings" in refused("memory", "backup", path, tmp_path / "copy")
-    assert not (tmp_path / "copy").exists()
-    assert {file: file.read_bytes() for file in path.rglob("*")} == before
+    np.save(path.with_name("t.npy"), stream(1))
+    for words in (("memory", "backup", path, path.with_name("copy")), ("predict", path, path.with_name("t.npy"))):
+        assert re.search(said, refused(*words))
+    assert not path.with_name("copy").exists()
+    assert {file: file.is_file() and file.read_bytes() for file in path.rglob("*")} == before
 
 
 def test_a_row_of_an_unknown_kind_is_refused_with_what_to_do(golden):

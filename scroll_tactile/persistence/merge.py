@@ -68,17 +68,17 @@ class MergePlan:
 
     source: the other memory. rows: heads of its journal that are appended. compaction: its compaction checkpoint, which
     stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
-    rows that are not appended: shared streams, and refused ones. refused: touches that have another
-    name already, each with the reason. descriptions: material → the description that is taken over. quantities: that
-    ours lacks. default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be
-    added in place of its rows.
+    rows that are not appended: shared streams, and refused ones. refused: touches that have another name already, each
+    with the reason. descriptions: material → the description that is taken over. quantities: that ours lacks.
+    default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be added in place
+    of its rows.
     """
 
     source: MemoryStore
     compaction: Checkpoint | None
     rows: list[Head]
     shared: int
-    left_out: list[Head]
+    left_out: set[int]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
     quantities: list[Quantity]
@@ -111,13 +111,11 @@ class MergePlan:
         known, refused = _already_there(incoming, contents, ours.path, compacted, rules, declared)
         if refused and not rules.one_name:
             raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {refused[0][1]}")
-        out = {*known, *(head.sequence for head, _ in refused)}
-        if fixed := [
-            head for head in incoming if head.sequence in out and (head.sequence <= compacted or head.kind == MEMBER)
-        ]:
+        left_out = {*known, *(head.sequence for head, _ in refused)}
+        out = [head for head in incoming if head.sequence in left_out]
+        if fixed := [head for head in out if head.sequence <= compacted or head.kind == MEMBER]:
             raise _cannot_be_left_out(ours, theirs, fixed, refused)
-        rows = [head for head in incoming if head.sequence not in out]
-        left_out = [head for head in incoming if head.sequence in out]
+        rows = [head for head in incoming if head.sequence not in left_out]
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
@@ -173,7 +171,7 @@ class MergePlan:
             return None
         if memory.kept is not None and Identity.read(source).kept_touches != memory.kept.capacity:
             return None
-        return sums_without(source, self.newest, memory, {head.sequence for head in self.left_out})
+        return sums_without(source, self.newest, memory, self.left_out)
 
     def _rows_to_append(
         self, compaction: Checkpoint | None

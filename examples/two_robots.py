@@ -48,7 +48,7 @@ with tempfile.TemporaryDirectory() as folder:
             for material, repetition in half:
                 learner.observe(material, scene.touch(material, repetition))
     with TactileLearner.open(left) as learner:
-        learner.merge(right, shared="once")
+        learner.merge(right)
         print(f"put together, the same bytes: {learner.digest() == expected}")
         slip = learner.observe(scene.materials[0], scene.touch(scene.materials[9], 0))
         learner.retract(slip)

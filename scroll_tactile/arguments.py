@@ -55,7 +55,6 @@ _EXPECTED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "destination": _PATH,
     "other": ("a TactileLearner with a path, or its path", _is_path),
     "mode": ("'write' or 'read'", lambda value: value in ("write", "read")),
-    "shared": ("'once' or 'twice'", lambda value: value in ("once", "twice")),
     "descriptions": ("'same', 'ours' or 'theirs'", lambda value: value in ("same", "ours", "theirs")),
     "sensor": ("a Sensor", lambda value: isinstance(value, Sensor)),
     "embedding": ("an embedding, such as Kernels()", _is_embedding),

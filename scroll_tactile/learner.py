@@ -22,11 +22,11 @@ from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.tuned import TuneReport
-from scroll_tactile.persistence.buffer import ranked_exemplars
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.merge import Choice, MergeRules
 from scroll_tactile.persistence.observations import observations
 from scroll_tactile.persistence.packing import pack_memory
+from scroll_tactile.persistence.replaying import ranked_exemplars
 from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches
 from scroll_tactile.prediction.features import Readings
 from scroll_tactile.prediction.model import Model
@@ -80,7 +80,7 @@ class TactileLearner:
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
     any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
     that moment; its repr names the memory that it was taken of. One of a learner that was closed may not know which
-    touches it has: `names_of` then raises StoreClosedError, and so does `observe` without again=True.
+    touches it has: `names_of` and `observe` then raise StoreClosedError.
 
     Raises InputError for unknown settings, and for values that do not fit.
     """
@@ -233,12 +233,11 @@ class TactileLearner:
         values: Mapping[str, float] | None = None,
         labels: Mapping[str, str] | None = None,
         source: str | None = None,
-        again: bool = False,
     ) -> Receipt:
         """Learn that this stream is how the material feels; it is durable when this returns.
 
         One content is one touch: of readings that the memory has under this name nothing is learned a second time, and
-        the receipt is that of the first, `repeated`. again: they count once more all the same.
+        the receipt is that of the first, `repeated`.
 
         material: its name, any; a new one needs no announcement. stream: readings of shape (T, n) in the sensor's
         unit, T of at least two: an array, a tensor, lists, or an iterable of readings; of a camera frames,
@@ -258,7 +257,7 @@ class TactileLearner:
         predictor.extractor.verified()
         touch = predictor.stream(stream)
         learned = predictor.extractor.learned(touch)
-        receipt = predictor.ledger.observe(material, touch, *learned, source, noted, again=again)
+        receipt = predictor.ledger.observe(material, touch, *learned, source, noted)
         predictor.prepare()
         if not self._range_warned and (problem := range_problem(touch)) is not None:
             self._range_warned = True
@@ -318,10 +317,13 @@ class TactileLearner:
     def relabel(self, receipt: Receipt | int, material: str) -> int:
         """Give an observation another name: retract it and observe its readings under the new one, durable as one.
 
-        Returns its new sequence; it keeps its time and source. A description stays with the name that it was given to.
+        Returns its new sequence; it keeps its time and source. Where the memory has these very readings under the new
+        name, it is retracted alone, and the sequence is that of the observation that is there. A description stays with
+        the name that it was given to.
 
         Raises what `retract` raises (nothing was changed), also MaterialError for an invalid name; InputError where
-        it has that name already, and in a batch.
+        it has that name already, and in a batch; AnnotationError where the observation that is there has other values
+        or labels.
         """
         return self._ledger.relabel(receipt, require_name(material))
 
@@ -597,15 +599,15 @@ class TactileLearner:
         self,
         other: TactileLearner | str | os.PathLike[str],
         *,
-        shared: Literal["once", "twice"],
         descriptions: Choice = "same",
         progress: Callable[[str, int, int], object] | None = None,
     ) -> Merged:
         """Add everything that another memory observed; durable, as a whole, when this returns.
 
-        other: a memory with a path, its path, or a file that `pack` wrote; it stays as it is. shared: whether a stream
-        that both observed (one material, one content hash) counts once or twice. Receipts of the other memory are not
-        receipts of this one.
+        It is the union of both: a stream that both observed, of one material with one content, counts once.
+
+        other: a memory with a path, its path, or a file that `pack` wrote; it stays as it is. Receipts of the other
+        memory are not receipts of this one.
         descriptions: which to keep of a material that both describe: "ours", "theirs", or "same", if they must agree.
 
         Raises MismatchError for a memory of another sensor, embedding or grid, or of a quantity with another unit or
@@ -614,9 +616,8 @@ class TactileLearner:
         StoreError. Nothing was changed then.
         """
         path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
-        require_arguments({"other": path, "shared": shared, "descriptions": descriptions}, {"progress": progress})
-        rules = MergeRules(once=shared == "once", descriptions=descriptions)
-        return self._ledger.merge(path, rules, progress or silent)[0]
+        require_arguments({"other": path, "descriptions": descriptions}, {"progress": progress})
+        return self._ledger.merge(path, MergeRules(descriptions=descriptions), progress or silent)[0]
 
     def backup(
         self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None

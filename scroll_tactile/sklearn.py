@@ -97,8 +97,8 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
 
     Touches X: an array (N, T, n) of N touches of T readings of n channels, (N, T) where there is one channel, or a list
     of arrays (T, n), whose lengths may differ. Labels y, (N,): of any kind that numpy can sort; each is the name of a
-    material as its text. For names of another axis, such as the direction of a slip, fit one to these: it answers as
-    `TactileLearner.predict(of=…)` does.
+    material as its text. A touch that comes twice under one label counts once. For names of another axis, such as the
+    direction of a slip, fit one to these: it answers as `TactileLearner.predict(of=…)` does.
 
     sensor: of the readings; None: 100 Hz, and the range of the first touches that are fitted, a tenth wider at both
     ends. embedding, readout, kept_touches: as of the learner.
@@ -134,7 +134,7 @@ class TactileClassifier(ClassifierMixin, _TouchEstimator):  # type: ignore[misc]
         classes_ = _joined(before, labels)
         streams = [validate(touch, learner.sensor) for touch in touches]  # all, before any is observed
         for label, stream in zip(labels, streams, strict=True):
-            learner.observe(str(label), stream, again=True)  # a row that comes twice weighs twice
+            learner.observe(str(label), stream)
         self.learner_, self.classes_ = learner, classes_
         self.n_features_in_ = getattr(self, "n_features_in_", learner.sensor.channels)
         return self
@@ -156,10 +156,9 @@ class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  
     """A quantity of touches, in memory only, behind fit, predict and score, with intervals by predict_interval.
 
     Touches X: as of `TactileClassifier`. Numbers y, (N,), finite. materials: what each touch is of, (N,), passed to
-    `fit`, two or more: intervals for materials that were never felt come from those held out.
-
-    sensor, embedding, readout, kept_touches: as of `TactileClassifier`. It rests on 256 touches at most, drawn by their
-    content (see `TactileLearner.estimate`).
+    `fit`, two or more: intervals for materials that were never felt come from those held out. A touch that comes twice
+    of one material counts once, and with another number it is refused. It rests on 256 touches at most, drawn by their
+    content (see `TactileLearner.estimate`). sensor, embedding, readout, kept_touches: as of `TactileClassifier`.
 
     After fitting: n_features_in_, as of `TactileClassifier`; learner_, the learner, whose quantity is "y", from the
     least y to the most and their difference beyond both.
@@ -182,7 +181,7 @@ class TactileRegressor(RegressorMixin, _TouchEstimator):  # type: ignore[misc]  
         reach = (high - low) or 1.0
         learner.declare(Quantity(name="y", unit="1", low=low - reach, high=high + reach, resolution=reach / 2**18))
         for name, number, touch in zip(names, numbers.tolist(), touches, strict=True):
-            learner.observe(str(name), touch, values={"y": number}, again=True)
+            learner.observe(str(name), touch, values={"y": number})
         self.learner_, self.n_features_in_ = learner, getattr(self, "n_features_in_", learner.sensor.channels)
         return self
 

@@ -33,7 +33,7 @@ def test_paths(tmp_path, monkeypatch, learner, path):
     before = sorted(tmp_path.iterdir())
     calls = [
         lambda: TactileLearner.open(path, **SETTINGS),
-        lambda: learner.merge(path, shared="once"),
+        lambda: learner.merge(path),
         lambda: learner.backup(path),
     ]
     for call in calls:
@@ -118,8 +118,7 @@ def test_names(learner, name):
 
 def test_what_a_learner_is_changed_with(learner, tmp_path):
     calls = {
-        "shared": lambda: learner.merge(tmp_path / "o", shared=["once"]),
-        "descriptions": lambda: learner.merge(tmp_path / "o", shared="once", descriptions=None),
+        "descriptions": lambda: learner.merge(tmp_path / "o", descriptions=None),
         "embedding": lambda: learner.reembed("kernels"),
         "progress": lambda: learner.backup(tmp_path / "b", progress=5),
         "keep": lambda: learner.compact(keep="all"),

@@ -65,7 +65,7 @@ def test_order_merge_retraction_and_restart_give_the_same_bits(tmp_path):
     assert told(fed(observed=shuffled, **few)[0]) == expected
     ours, _ = fed(tmp_path / "ours", OBSERVED[:9], **few)
     fed(tmp_path / "theirs", OBSERVED[9:], **few)[0].close()
-    ours.merge(tmp_path / "theirs", shared="once")
+    ours.merge(tmp_path / "theirs")
     assert told(ours) == expected
     [more] = observe(ours, [("oak", 3)])
     assert told(ours) != expected

@@ -33,20 +33,20 @@ def stream(touch):
     return np.random.default_rng([seed, readings]).uniform(-0.1, 1.1, size=(readings, 2))
 
 
-def fed(observed, described=(), *, again=False, **settings):
-    """A memory without a path that observed these touches; again: also those that come twice."""
+def fed(observed, described=(), **settings):
+    """A memory without a path that observed these touches."""
     learner = TactileLearner(**SETTINGS | settings)
     for material, constituents in dict(described).items():
         learner.describe(material, constituents)
     for material, touch in observed:
-        learner.observe(material, stream(touch), again=again)
+        learner.observe(material, stream(touch))
     return learner
 
 
-def filled(path, observed=OBSERVED, *, again=False, **settings):
-    """A memory in a folder that observed these touches, and its receipts; again: also those that come twice."""
+def filled(path, observed=OBSERVED, **settings):
+    """A memory in a folder that observed these touches, and its receipts."""
     learner = TactileLearner.open(path, **SETTINGS | settings)
-    return learner, [learner.observe(name, stream(touch), again=again) for name, touch in observed]
+    return learner, [learner.observe(name, stream(touch)) for name, touch in observed]
 
 
 def without(*places):
@@ -62,7 +62,7 @@ def kept_of(learner):
 
 def held(learner, *, exemplars=True):
     """All that answers follow from, to the byte: digest, exemplars, pool, kept touches and descriptions."""
-    pool = [(name, key, t.rows.tobytes(), t.pairs.tobytes(), t.copies) for name, key, t in learner.memory.sample]
+    pool = [(name, key, t.rows.tobytes(), t.pairs.tobytes()) for name, key, t in learner.memory.sample]
     chosen = learner.exemplars if exemplars else None
     return learner.digest(), chosen, pool, kept_of(learner), repr(learner.descriptions)
 
@@ -92,7 +92,7 @@ def _expected(observed, described, exemplars, answers, settings):
     """What a memory without a path holds that observed these; one of the same touches and settings is made once."""
     key = repr((observed, described, exemplars, answers, settings, scroll_tactile.memory.state.TouchSample))
     if "embedding" in settings or key not in _EXPECTED:
-        whole = fed(observed, described, again=True, **settings)
+        whole = fed(observed, described, **settings)
         _EXPECTED[key] = (contents if answers else held)(whole, exemplars=exemplars)
     return _EXPECTED[key]
 

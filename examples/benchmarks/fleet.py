@@ -122,7 +122,7 @@ def _merges(folder: Path, paths: list[str], note: Any) -> list[dict[str, Any]]:
         with TactileLearner.open(folder / f"into {touches}") as into:
             into.digest()
             begun, processor = time.perf_counter(), time.process_time()
-            into.merge(folder / f"{touches}.part", shared="once")
+            into.merge(folder / f"{touches}.part")
             took = {"seconds": time.perf_counter() - begun, "processor": time.process_time() - processor}
         size = (folder / f"{touches}.part").stat().st_size
         found.append({"touches": touches, "bytes": size, "pack_seconds": packing, **took})
@@ -169,7 +169,7 @@ def _sound_flips(folder: Path, flips: int, note: Any) -> dict[str, int]:
         (folder / "p").write_bytes(bytes(flipped))
         with TactileLearner.open(folder / f"own {number}", **SMALL) as learner:
             try:
-                learner.merge(folder / "p", shared="once")
+                learner.merge(folder / "p")
                 found["merged"] += learner.digest() == truth
             except (StoreError, MismatchError) as error:
                 found["refused"] += str(folder / "p") in str(error) and not learner.materials

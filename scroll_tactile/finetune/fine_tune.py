@@ -36,7 +36,7 @@ from scroll_tactile.finetune.training import (
 from scroll_tactile.libraries import optional
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.tuned import Tuned, TuneMode, TuneReport
-from scroll_tactile.persistence.buffer import ranked_exemplars
+from scroll_tactile.persistence.replaying import ranked_exemplars
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor

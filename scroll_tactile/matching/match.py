@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from scroll_tactile.matching.likelihood import LEVELS, LevelArray, Likelihood, Noise
 from scroll_tactile.sensors import Sensor
-from scroll_tactile.statistics.annotations import Annotations
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 
 __all__ = [
     "KeptTouch",
@@ -32,7 +32,7 @@ class KeptTouch:
     material: str
     key: bytes
     levels: LevelArray
-    annotations: Annotations = ()
+    annotation: Annotation = NO_ANNOTATION
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from scroll_tactile.memory.state import Memory
+from scroll_tactile.statistics.annotations import NO_ANNOTATION
 
 __all__ = ["axis_memory"]
 
@@ -18,12 +19,10 @@ def axis_memory(memory: Memory, axis: str) -> Memory:
     view.exemplars, view.sequence = None, memory.sequence
     view.statistics = memory.targets.axes.get(axis, view.statistics)
     for _, key, touch in memory.sample:
-        for annotation, copies in touch.annotations:
-            if (label := annotation.label(axis)) is not None:
-                view.sample.add(label, key, replace(touch, copies=copies, annotations=()))
+        if (label := touch.annotation.label(axis)) is not None:
+            view.sample.add(label, key, replace(touch, annotation=NO_ANNOTATION))
     if memory.kept is not None and view.kept is not None:
         for _, key, kept in memory.kept:
-            for annotation, _ in kept.annotations:
-                if (label := annotation.label(axis)) is not None:
-                    view.kept.add(label, key, replace(kept, material=label, annotations=()))
+            if (label := kept.annotation.label(axis)) is not None:
+                view.kept.add(label, key, replace(kept, material=label, annotation=NO_ANNOTATION))
     return view

@@ -13,19 +13,18 @@ import numpy.typing as npt
 from scroll_tactile_store import Head, Record
 from scroll_tactile_store.records import LateArray
 
+from scroll_tactile.matching.likelihood import LevelArray, levels_of
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
-from scroll_tactile.memory.kept_touches import KeptTouches
 from scroll_tactile.memory.touch_rows import (
     Added,
     Arrays,
     Codes,
     Encode,
     Readings,
+    annotated,
     annotation_of,
-    annotations_from,
-    annotations_to_json,
     declaration,
     row_codes,
     unpack_readings,
@@ -33,18 +32,74 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.correction import Correction
-from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, together
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, TargetSums
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
-from scroll_tactile.statistics.targets import TargetSums
 
-__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "Memory"]
+__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "KeptTouches", "Memory"]
 
 LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
 ANNOTATED = "sample-annotations", "kept-annotations"  # attributes: of each of their touches, how it was annotated
+LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
 MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
-Chosen = tuple["TouchSample", "KeptTouches | None", "ExemplarSample | None"]
+Chosen = tuple[TouchSample, "KeptTouches | None", ExemplarSample | None]
+
+
+class KeptTouches(Sample[KeptTouch]):
+    """Kept touches: a bounded sample of what was observed, as levels, to compare others with (see `matching.matcher`).
+
+    A function of the set of touches observed: at most `capacity` of a sensor's. In a checkpoint these are `kept-keys`
+    (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their materials are the attribute `kept`.
+    """
+
+    def __init__(self, sensor: Sensor, capacity: int) -> None:
+        super().__init__(capacity)
+        self.sensor = sensor
+
+    @property
+    def most_columns(self) -> int:
+        """Of a touch that is kept: twice the usual length."""
+        return max(2, round(LONGEST_KEPT * self.sensor.readings))
+
+    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
+        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most `most_columns`."""
+        return levels_of(readings[: self.most_columns], self.sensor)
+
+    def touches(self) -> list[KeptTouch]:
+        """All of them, by material and key."""
+        return [touch for *_, touch in self]
+
+    def take(
+        self,
+        material: str,
+        key: bytes,
+        readings: npt.NDArray[np.floating] | None,
+        annotation: Annotation = NO_ANNOTATION,
+    ) -> None:
+        """Keep a touch where it belongs in, if its readings are there."""
+        if readings is not None and self.wants(material, key):
+            self.add(material, key, KeptTouch(material, key, self.levels(readings), annotation))
+
+    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
+        """What a store keeps: arrays by name, and the material of each touch."""
+        kept = self.touches()
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept)])
+        return {
+            "kept-keys": np.array([list(touch.key) for touch in kept] or [[]], np.uint8)[: len(kept)],
+            "kept-columns": np.array([touch.levels.shape[1] for touch in kept], dtype=np.int64),
+            "kept-levels": np.diff(levels, prepend=np.uint8(0)),
+        }, [touch.material for touch in kept]
+
+    def fill(self, arrays: Arrays, materials: Sequence[str], annotations: Sequence[Annotation] = ()) -> None:
+        """Take in what `to_arrays` described; annotations: of each touch."""
+        noted = annotations or [NO_ANNOTATION] * len(materials)
+        columns, channels = arrays["kept-columns"], self.sensor.channels
+        parts = np.split(np.cumsum(arrays["kept-levels"], dtype=np.uint8), np.cumsum(columns * channels)[:-1])
+        for i, material in enumerate(materials):
+            key, levels = arrays["kept-keys"][i].tobytes(), parts[i].reshape(channels, -1)
+            self.add(material, key, KeptTouch(material, key, levels, noted[i]))
 
 
 class Memory:
@@ -140,7 +195,7 @@ class Memory:
         """
         self.statistics.add(material, codes, columns)
         self.targets.add(material, key, annotation, codes, columns)
-        if self.sample.wants(material, key) or self.sample.holds(material, key):
+        if self.sample.wants(material, key):
             self.sample.add(material, key, self._touch(columns, codes, annotation))
         if self.kept is not None and source is not None:
             self.kept.take(material, key, readings, annotation)
@@ -150,11 +205,7 @@ class Memory:
 
     def undo(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
         """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
-        parts = [
-            sample.undo(material, key)
-            for sample in self._samples()
-            if sample.wants(material, key) or sample.holds(material, key)
-        ]
+        parts = [sample.undo(material, key) for sample in self.samples if sample.wants(material, key)]
         parts += [self.statistics.undo(material, columns), self.targets.undo(annotation, columns)]
         sequence = self.sequence
 
@@ -173,13 +224,15 @@ class Memory:
         self.targets.remove(material, key, annotation, codes, columns)
         self.retracted.add(record.sequence)
         self.retractions += 1
-        if any(sample.holds(material, key) for sample in self._samples()):
+        if any(sample.holds(material, key) for sample in self.samples):
             self.stale = True
         if record.sequence <= self.tuned_last_sequence:
             self.tuned = None
         return Added(material, codes, -1, annotation.labels)
 
-    def _samples(self) -> list[Sample[Any]]:
+    @property
+    def samples(self) -> list[Sample[Any]]:
+        """What was chosen among the observations, as far as the recipe keeps it."""
         return [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
 
     def put_back(self, record: Record) -> None:
@@ -197,30 +250,25 @@ class Memory:
         """
         touches = {(material, key): touch for material, key, touch in made.sample}
 
-        def touch(material: str, key: bytes, sequence: int) -> SampledTouch:
-            own = touches.get((material, key))
-            if own is None:
-                return self._touch(*self.codes(record(sequence)), NO_ANNOTATION)
-            return replace(own, copies=1, annotations=())
+        def touch(head: Head) -> SampledTouch:
+            annotation = annotation_of(head.attributes)  # another one where the touch was retracted in between
+            if (own := touches.get((head.label, head.key))) is not None:
+                return replace(own, annotation=annotation)
+            return self._touch(*self.codes(record(head.sequence)), annotation)
 
-        self.sample.refill(((head.label, head.key, head.sequence) for head in heads), touch)
-        noted = [(head, annotation) for head in heads if (annotation := annotation_of(head.attributes))]
-        for head, annotation in noted:
-            self.sample.note(head.label, head.key, annotation)
+        self.sample.refill(((head.label, head.key, head) for head in heads), touch)
         read = [head for head in heads if head.attributes.get("nbytes")]  # whose rows hold readings
         if self.kept is not None:
             mine, kept = {(material, key): own for material, key, own in made.kept or ()}, self.kept
 
-            def keep(material: str, key: bytes, sequence: int) -> KeptTouch:
-                if (own := mine.get((material, key))) is not None:
-                    return replace(own, annotations=())
-                levels = kept.levels(cast(Readings, unpack_readings(record(sequence).arrays)))
-                return KeptTouch(material, key, levels)
+            def keep(head: Head) -> KeptTouch:
+                annotation = annotation_of(head.attributes)
+                if (own := mine.get((head.label, head.key))) is not None:
+                    return replace(own, annotation=annotation)
+                levels = kept.levels(cast(Readings, unpack_readings(record(head.sequence).arrays)))
+                return KeptTouch(head.label, head.key, levels, annotation)
 
-            self.kept.refill(((head.label, head.key, head.sequence) for head in read), keep)
-            for head, annotation in noted:
-                if head.attributes.get("nbytes"):
-                    self.kept.note(head.label, head.key, annotation)
+            self.kept.refill(((head.label, head.key, head) for head in read), keep)
         if self.exemplars is not None:
             self.exemplars.update((head.label, head.key, head.sequence) for head in read)
 
@@ -238,8 +286,7 @@ class Memory:
         return columns, row_codes(record.arrays, self.encode)
 
     def _touch(self, columns: int, codes: Codes, annotation: Annotation) -> SampledTouch:
-        touch = SampledTouch.of(self.plan.scored_stages(columns), codes)
-        return replace(touch, annotations=together([(annotation, 1)])) if annotation else touch
+        return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation)
 
     @property
     def chosen(self) -> Chosen:
@@ -287,7 +334,6 @@ class Memory:
             "scales": list(map(int, self.statistics.scales)),
             "materials": names,
             "sample": materials,
-            "copies": [touch.copies for *_, touch in self.sample],
             "tuned_last_sequence": self.tuned_last_sequence,
             "descriptions": dict(sorted(self.descriptions.items())),
         }
@@ -304,10 +350,9 @@ class Memory:
         if self.targets:
             sums, attributes["targets"] = self.targets.to_arrays(self.statistics.touches)
             arrays |= sums
-            attributes["sample-annotations"] = [annotations_to_json(touch.annotations) for *_, touch in self.sample]
-            if self.kept is not None:
-                kept = [annotations_to_json(touch.annotations) for *_, touch in self.kept]
-                attributes["kept-annotations"] = kept
+            for which, sample in zip(ANNOTATED, (self.sample, self.kept), strict=True):
+                if sample is not None:
+                    attributes[which] = [annotated(touch.annotation) for *_, touch in sample]
         # The rows after a compaction checkpoint are replayed, and say themselves which of them were retracted.
         retracted = sorted(self.retracted if compaction_at is None else ())
         compacted = self.compacted if compaction_at is None else compaction_at
@@ -343,15 +388,15 @@ class Memory:
         self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names, seconds)
         if "targets" in attributes:
             self.targets = TargetSums.from_arrays(self.statistics, arrays, attributes["targets"])
-        noted = {which: [annotations_from(told) for told in attributes.get(which, ())] for which in ANNOTATED}
-        sampled = attributes["sample"], attributes["copies"], noted[ANNOTATED[0]]
+        noted, kept_noted = ([annotation_of(told) for told in attributes.get(which, ())] for which in ANNOTATED)
+        sampled = attributes["sample"], noted
         if LATE_ROWS in reads:
             small = {name: array for name, array in arrays.items() if name.startswith("sample-")}
             self._sample = partial(_sample_of, reads[LATE_ROWS], small, *sampled)
         else:
             self.sample = TouchSample.from_arrays(arrays, *sampled)
         if self.kept is not None:
-            self.kept.fill(arrays, attributes["kept"], noted[ANNOTATED[1]])
+            self.kept.fill(arrays, attributes["kept"], kept_noted)
         if self.exemplars is not None and "exemplars" in attributes:
             self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.recipe.exemplars, source)
         self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("retracted", "excluded"))

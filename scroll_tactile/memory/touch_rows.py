@@ -13,7 +13,7 @@ from scroll_tactile.errors import MismatchError, StreamError
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Annotations, together
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 
 __all__ = [
     "ADAPT",
@@ -40,8 +40,6 @@ __all__ = [
     "active_rows",
     "annotated",
     "annotation_of",
-    "annotations_from",
-    "annotations_to_json",
     "declaration",
     "declared_by",
     "only_readings",
@@ -179,16 +177,6 @@ def annotation_of(attributes: Mapping[str, Any]) -> Annotation:
     return (
         Annotation(tuple(sorted(values.items())), tuple(sorted(labels.items()))) if values or labels else NO_ANNOTATION
     )
-
-
-def annotations_to_json(annotations: Annotations) -> list[list[Any]]:
-    """The annotations of one content, as a checkpoint has them: the attributes of each, and how often it was so."""
-    return [[annotated(annotation), copies] for annotation, copies in annotations]
-
-
-def annotations_from(told: Any) -> Annotations:
-    """The annotations that `annotations_to_json` told."""
-    return together((annotation_of(attributes), copies) for attributes, copies in told)
 
 
 def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:

@@ -17,7 +17,7 @@ from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, annotation_of
 from scroll_tactile.signals.ranges import CURE
 from scroll_tactile.statistics.annotations import Annotation
 
-__all__ = ["ListedContents", "StoredContents", "refusal"]
+__all__ = ["ListedContents", "Rows", "StoredContents", "refusal"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,39 +37,35 @@ def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str |
     return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
 
 
+Rows = dict[str, tuple[int, Annotation]]
+"""Material → the row that has a content under this name, and its annotation; the oldest first."""
+
+
 class ListedContents:
-    """The touches of a memory by their keys. rows: (material, key, row in the journal, annotation) of each."""
+    """The touches of a memory without a store, by their keys."""
 
     def __init__(self, rows: Iterable[tuple[str, bytes, int, Annotation]] = ()) -> None:
-        self._rows: dict[bytes, tuple[tuple[str, int, Annotation], ...]] = {}
-        for row in rows:
-            self.add(*row)
+        self._rows: dict[bytes, Rows] = {}
+        for material, key, sequence, annotation in rows:
+            self._rows.setdefault(key, {}).setdefault(material, (sequence, annotation))
 
     def copy(self) -> ListedContents:
         """A copy that changes independently."""
         other = ListedContents()
-        other._rows = dict(self._rows)
+        other._rows = {key: dict(rows) for key, rows in self._rows.items()}
         return other
 
     def add(self, material: str, key: bytes, sequence: int, annotation: Annotation) -> None:
-        """Add a touch, also one more of the same content."""
-        self._rows[key] = (*self._rows.get(key, ()), (material, sequence, annotation))
+        """Add a touch that is not there under this name."""
+        self._rows.setdefault(key, {})[material] = sequence, annotation
 
-    def remove(self, material: str, key: bytes, sequence: int) -> None:
+    def remove(self, material: str, key: bytes) -> None:
         """Take a touch out; nothing where it is not there."""
-        left = tuple(row for row in self._rows.get(key, ()) if row[:2] != (material, sequence))
-        if left:
-            self._rows[key] = left
-        else:
-            self._rows.pop(key, None)
+        self._rows.get(key, {}).pop(material, None)
 
-    def names(self, key: bytes) -> list[str]:
-        """The names of a content, oldest first; none where it is not there."""
-        return list(dict.fromkeys(name for name, *_ in self._rows.get(key, ())))
-
-    def rows(self, material: str, key: bytes) -> dict[int, Annotation]:
-        """The rows that have a content under this name, and how it was annotated in each."""
-        return {sequence: noted for name, sequence, noted in self._rows.get(key, ()) if name == material}
+    def rows(self, key: bytes) -> Rows:
+        """The rows of a content; none where it is not there."""
+        return self._rows.get(key, {})
 
 
 class StoredContents:
@@ -87,14 +83,12 @@ class StoredContents:
         heads = self._active(_sound(self._store))
         return ListedContents((head.label, head.key, head.sequence, annotation_of(head.attributes)) for head in heads)
 
-    def names(self, key: bytes) -> list[str]:
-        """As `ListedContents.names`."""
-        return list(dict.fromkeys(head.label for head in self._active(self._store.with_key(key))))
-
-    def rows(self, material: str, key: bytes) -> dict[int, Annotation]:
+    def rows(self, key: bytes) -> Rows:
         """As `ListedContents.rows`."""
-        found = self._active(self._store.with_key(key))
-        return {head.sequence: annotation_of(head.attributes) for head in found if head.label == material}
+        found: Rows = {}
+        for head in self._active(self._store.with_key(key)):
+            found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
+        return found
 
 
 def _sound(store: Store) -> Iterator[Head]:

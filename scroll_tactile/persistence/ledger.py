@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from scroll_tactile_store import Head, Record, Store
+from scroll_tactile_store import Checkpoint, Head, Record, Store
 
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError, ObservationError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
+from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.descriptions import Description, describe, require_units
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
@@ -28,6 +30,7 @@ from scroll_tactile.memory.touch_rows import (
     Added,
     Codes,
     annotated,
+    annotation_of,
     declaration,
     pack_codes,
     pack_readings,
@@ -35,7 +38,6 @@ from scroll_tactile.memory.touch_rows import (
     spans,
 )
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.merge import MergePlan, MergeRules
 from scroll_tactile.persistence.observations import (
     adaptation_of,
@@ -45,7 +47,14 @@ from scroll_tactile.persistence.observations import (
     observations_of,
 )
 from scroll_tactile.persistence.open_memory import OpenMemory, give_back_scratch
-from scroll_tactile.persistence.replaying import apply_correction, apply_description, refill, replay, until
+from scroll_tactile.persistence.replaying import (
+    apply_correction,
+    apply_description,
+    exemplar_candidates,
+    refill,
+    replay,
+    until,
+)
 from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.results import Adaptation, Compacted, Merged, Receipt
 from scroll_tactile.signals.correction import Correction
@@ -53,7 +62,7 @@ from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.validation.gate import MemoryStore
 
-__all__ = ["Ledger"]
+__all__ = ["AxisLedger", "Ledger", "axis_name"]
 
 
 class Ledger(OpenMemory):
@@ -75,19 +84,17 @@ class Ledger(OpenMemory):
         codes: Codes,
         source: str | None = None,
         annotation: Annotation = NO_ANNOTATION,
-        *,
-        again: bool = False,
     ) -> Receipt:
         """Append an observation to the journal, then add it to the memory; durable on return, in a batch at its end.
 
-        again: observe once more a touch that the memory has under this name. Raises AnnotationError for one that it has
+        Of a touch that the memory has under this name nothing is learned. Raises AnnotationError for one that it has
         with another annotation.
         """
         require_row(stream)
         with self.lock:
             self.require_open()
             # A memory opened to read skips this: its journal refuses the row below.
-            if not again and (self.store is None or self.store.mode == "write"):
+            if self.store is None or self.store.mode == "write":
                 known = self._known(material, stream.key, annotation)
                 if known is None and stream.raw is not None:  # learned before the memory was adapted
                     known = self._known(material, stream.raw.key, annotation)
@@ -106,29 +113,27 @@ class Ledger(OpenMemory):
             return self._receipt(sequence, material, stream)
 
     def _known(self, material: str, key: bytes, annotation: Annotation) -> int | None:
-        """The first row that has a touch under this name, and so annotated unless nothing is said; None without any.
+        """The row that has a touch under this name; None where there is none.
 
-        Raises AnnotationError where it has the touch annotated otherwise.
+        Raises AnnotationError where it has the touch annotated otherwise than is said, if anything is.
         """
-        rows = self.contents().rows(material, key)
-        if not rows or not annotation:
-            return min(rows, default=None)
-        if same := [sequence for sequence, there in rows.items() if there == annotation]:
-            return min(same)
-        quantities, first = self.memory.quantities, min(rows)
-        raise AnnotationError(
-            f"observation {first} has this touch of {material!r} with {rows[first].shown(quantities)}; came "
-            f"{annotation.shown(quantities)}. Retract it first, or count the touch once more with again=True"
-        )
+        sequence, there = self.contents().rows(key).get(material, (None, annotation))
+        if annotation and there != annotation:
+            quantities = self.memory.quantities
+            raise AnnotationError(
+                f"observation {sequence} has this touch of {material!r} with {there.shown(quantities)}; came "
+                f"{annotation.shown(quantities)}. Retract it first, which takes a path and a row that was not compacted"
+            )
+        return sequence
 
     def _undo_of(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
         """A function that undoes the next observation, for a memory without a store."""
-        memory, sequence = self._memory.undo(material, key, columns, annotation), self._memory.sequence + 1
+        memory = self._memory.undo(material, key, columns, annotation)
 
         def undo() -> None:
             memory()
             if self._contents is not None:
-                self._contents.remove(material, key, sequence)
+                self._contents.remove(material, key)
 
         return undo
 
@@ -294,6 +299,9 @@ class Ledger(OpenMemory):
             record = observation_of(store, self.memory, receipt)
             if record.label == material:
                 raise InputError(f"observation {record.sequence} of {store.path} is called {material!r} already")
+            if (known := self._known(material, record.key, annotation_of(record.attributes))) is not None:
+                self._retract(store, [record], "")
+                return known
             store.compaction()  # raises where it is damaged: choosing samples again needs it
             memory = self._memory
             with self._mutation(), store.batch():
@@ -392,6 +400,55 @@ class Ledger(OpenMemory):
                 # Ctrl-C may come when the checkpoint is already current: closing writes the earlier tuned model again.
                 (memory.tuned, memory.tuned_last_sequence), self._saved = before, -1
                 raise
+
+
+class AxisLedger(Ledger):
+    """What a memory learned by the labels on one axis, in place of materials; nobody changes it but the memory itself.
+
+    ledger: of the memory, whose lock is held by whoever reads it. axis: its name.
+    """
+
+    def __init__(self, ledger: Ledger, axis: str) -> None:
+        self._of, self._axis = ledger, axis
+        super().__init__(lambda: axis_memory(ledger.memory, axis))
+        self.lock = ledger.lock
+        self._seen = ledger.version
+        ledger.followers.append(self._follow)
+
+    @property
+    def memory(self) -> Memory:
+        """The memory of the axis as it is now."""
+        of = self._of.memory  # reads it again if a change was cut short
+        if self._seen != self._of.version:
+            self._memory, self._seen = axis_memory(of, self._axis), self._of.version
+        return self._memory
+
+    @property
+    def correction(self) -> Correction | None:
+        """As of the memory."""
+        return self._of.correction
+
+    def derived(self, name: str) -> Checkpoint | None:
+        """As of the memory, under the name that `axis_name` gives."""
+        return self._of.derived(axis_name(name, self._axis))
+
+    def saved_since(self, memory: Memory) -> bool:
+        """As of the memory, whose checkpoints have the axis."""
+        del memory
+        return self._of.saved_since(self._of.memory)
+
+    def _follow(self, added: list[Added] | None) -> None:
+        """Note what the memory changed by: of touches without a label that something did."""
+        if added is None:
+            self._changed()
+            return
+        labelled = ((dict(touch.labels).get(self._axis), touch) for touch in added)
+        self._changed([Added(label, touch.codes, touch.sign) for label, touch in labelled if label is not None])
+
+
+def axis_name(name: str, axis: str) -> str:
+    """The name of what is derived from an axis, where that of materials has a name: axes may have any characters."""
+    return f"{name}-{hashlib.sha256(axis.encode()).hexdigest()[:32]}"
 
 
 def _nothing() -> None:

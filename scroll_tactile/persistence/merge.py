@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Self, cast
 
 from pydantic import BaseModel
@@ -27,11 +28,10 @@ from scroll_tactile.memory.touch_rows import (
     annotation_of,
     declaration,
 )
-from scroll_tactile.persistence.contents import ListedContents, StoredContents, refusal
+from scroll_tactile.persistence.contents import ListedContents, Rows, StoredContents, refusal
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import apply_description, replay
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.validation.gate import (
     MemoryStore,
     quantities_of,
@@ -50,13 +50,11 @@ Choice = Literal["same", "ours", "theirs"]
 class MergeRules:
     """How another memory is merged into ours.
 
-    once: leave out streams that both observed, of one material with one content hash. one_name: as in learning from
-    files, a content has one name, the first in either memory: touches under another name are refused, repeats under the
-    same name left out. clipped: contents that clipping produced; their refusals mention it. default_source: for touches
+    one_name: as in learning from files, a content has one name, the first in either memory: touches under another name
+    are refused. clipped: contents that clipping produced; their refusals mention it. default_source: for touches
     without a source. thorough: see `Gate`.
     """
 
-    once: bool = True
     one_name: bool = False
     descriptions: Choice = "same"
     clipped: Collection[bytes] = ()
@@ -70,17 +68,17 @@ class MergePlan:
 
     source: the other memory. rows: heads of its journal that are appended. compaction: its compaction checkpoint, which
     stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
-    rows that are not appended: shared streams that count once, and refused ones. refused: touches that have another
-    name already, each with the reason. descriptions: material → the description that is taken over. quantities: that
-    ours lacks. default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be
-    added in place of its rows.
+    rows that are not appended: shared streams, and refused ones. refused: touches that have another name already, each
+    with the reason. descriptions: material → the description that is taken over. quantities: that ours lacks.
+    default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be added in place
+    of its rows.
     """
 
     source: MemoryStore
     compaction: Checkpoint | None
     rows: list[Head]
     shared: int
-    left_out: list[Head]
+    left_out: set[int]
     refused: list[tuple[Head, str]]
     descriptions: dict[str, Description]
     quantities: list[Quantity]
@@ -98,8 +96,8 @@ class MergePlan:
     ) -> Self:
         """Plan a merge from both journals. contents: which touches ours has.
 
-        Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a stream that
-        counts once, or their descriptions and `descriptions` is "same"; ObservationError where a touch that must be
+        Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a shared
+        stream, or their descriptions and `descriptions` is "same"; ObservationError where a touch that must be
         left out was compacted; DamageError for a damaged row of theirs, and for a shared stream whose readings do not
         hash to its key, in either memory.
         """
@@ -109,23 +107,15 @@ class MergePlan:
         if found is not None:
             require_counted(theirs.path, found, heads)
         incoming = active_rows(heads)
-        both = {head.sequence for head in incoming if head.kind != MERGE and _row(contents, head) is not None}
         declared = memory.quantities | {quantity.name: quantity for quantity in quantities}
-        refused, again = (
-            _by_first_names(incoming, contents, compacted, rules.clipped, declared) if rules.one_name else ([], set())
-        )
-        for head in (head for head in incoming if head.sequence in both and rules.once):
-            why = _annotated_otherwise(head, contents.rows(head.label, head.key).items(), ours.path, declared)
-            if why is not None and not rules.one_name:
-                raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {why}")
-            refused += [] if why is None else [(head, why)]
-        out = {*(both if rules.once else ()), *again, *(head.sequence for head, _ in refused)}
-        if fixed := [
-            head for head in incoming if head.sequence in out and (head.sequence <= compacted or head.kind == MEMBER)
-        ]:
-            raise _cannot_be_left_out(theirs, fixed, refused)
-        rows = [head for head in incoming if head.sequence not in out]
-        left_out = [head for head in incoming if head.sequence in out]
+        known, refused = _already_there(incoming, contents, ours.path, compacted, rules, declared)
+        if refused and not rules.one_name:
+            raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {refused[0][1]}")
+        left_out = {*known, *(head.sequence for head, _ in refused)}
+        out = [head for head in incoming if head.sequence in left_out]
+        if fixed := [head for head in out if head.sequence <= compacted or head.kind == MEMBER]:
+            raise _cannot_be_left_out(ours, theirs, fixed, refused)
+        rows = [head for head in incoming if head.sequence not in left_out]
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
@@ -134,15 +124,12 @@ class MergePlan:
             )
         described = _descriptions(ours, memory, theirs, found, rules.descriptions)
         newest = _require_sound(theirs, heads, coming={head.sequence for head in rows})
-        if rules.once:
-            for head in (head for head in incoming if head.sequence in both):
-                sequence = _row(contents, head) or 0
-                if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
-                    ours.record(sequence)
-        shared = len(both - {head.sequence for head, _ in refused}) + len(again)
+        for sequence in known.values():
+            if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
+                ours.record(sequence)
         summed = newest if theirs.is_packed else None
         source = rules.default_source
-        return cls(theirs, found, rows, shared, left_out, refused, described, quantities, source, summed)
+        return cls(theirs, found, rows, len(known), left_out, refused, described, quantities, source, summed)
 
     def append_to(self, ours: Store, memory: Memory, progress: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; returns the number of observations added.
@@ -184,7 +171,7 @@ class MergePlan:
             return None
         if memory.kept is not None and Identity.read(source).kept_touches != memory.kept.capacity:
             return None
-        return sums_without(source, self.newest, memory, {head.sequence for head in self.left_out})
+        return sums_without(source, self.newest, memory, self.left_out)
 
     def _rows_to_append(
         self, compaction: Checkpoint | None
@@ -209,11 +196,6 @@ class MergePlan:
         return {**({SOURCE: self.default_source} if touch else {}), **head.attributes}
 
 
-def _row(contents: ListedContents | StoredContents, head: Head) -> int | None:
-    """Our row of their touch, under the same name; None where ours has none."""
-    return min(contents.rows(head.label, head.key), default=None)
-
-
 def _quantities(
     ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, heads: Sequence[Head]
 ) -> list[Quantity]:
@@ -231,63 +213,54 @@ def _quantities(
     return [quantity for name, quantity in both.items() if name not in memory.quantities]
 
 
-def _annotated_otherwise(
-    head: Head, rows: Iterable[tuple[int, Annotation]], where: object, declared: Mapping[str, Quantity]
-) -> str | None:
-    """Why their touch, which is in these rows as well, cannot be left out: its values or labels are in none of them."""
-    came, there = annotation_of(head.attributes), dict(rows)
-    if not came or not there or came in there.values():
-        return None
-    first = min(there)
-    return (
-        f"row {first} of {where} has this touch of {head.label!r} with {there[first].shown(declared)}; row "
-        f"{head.sequence} comes with {came.shown(declared)}: retract one of them, or count both with shared='twice'"
-    )
-
-
-def _by_first_names(
+def _already_there(
     incoming: Sequence[Head],
     contents: ListedContents | StoredContents,
+    where: Path,
     compacted: int,
-    clipped: Collection[bytes],
+    rules: MergeRules,
     declared: Mapping[str, Quantity],
-) -> tuple[list[tuple[Head, str]], set[int]]:
-    """The touches that our memory, or an earlier row of theirs, has under another name, each with the reason.
+) -> tuple[dict[int, int], list[tuple[Head, str]]]:
+    """The touches that our memory, or an earlier row of theirs, has under the same name: their row → ours, 0 of theirs.
 
-    Also those that an earlier row of theirs has with other values or labels; and the sequences of repeats: rows of
-    theirs that an earlier one has under the same name, unless compacted.
+    Also those that are refused, each with the reason: these have other values or labels there, or by `one_name`
+    another name. where: our memory. compacted: rows of theirs that cannot be left out.
     """
-    came: dict[bytes, str] = {}
-    noted: dict[bytes, list[tuple[int, Annotation]]] = {}
+    came: dict[bytes, Rows] = {}
+    known: dict[int, int] = {}
     refused: list[tuple[Head, str]] = []
-    again: set[int] = set()
-    for head in incoming:
-        if head.kind == MERGE:
-            continue
-        known, before = contents.names(head.key), head.key in came
-        names = known or [came.setdefault(head.key, head.label)]
-        why = refusal(names, head.label, head.key in clipped)
-        if why is None and not known:
-            why = _annotated_otherwise(head, noted.get(head.key, ()), "the same memory", declared)
-            noted.setdefault(head.key, []).append((head.sequence, annotation_of(head.attributes)))
+    for head in (head for head in incoming if head.kind != MERGE):
+        ours, theirs = contents.rows(head.key), came.setdefault(head.key, {})
+        there, annotation = ours.get(head.label) or theirs.get(head.label), annotation_of(head.attributes)
+        why = refusal(list(ours or theirs), head.label, head.key in rules.clipped) if rules.one_name else None
+        if why is None and annotation and there is not None and annotation != there[1]:
+            why = (
+                f"row {there[0]} of {where if head.label in ours else 'the same memory'} has this touch of "
+                f"{head.label!r} with {there[1].shown(declared)}; row {head.sequence} comes with "
+                f"{annotation.shown(declared)}: retract one of them"
+            )
         if why is not None:
             refused.append((head, why))
-        elif before and head.kind == OBSERVE and head.sequence > compacted:
-            again.add(head.sequence)
-    return refused, again
+        elif head.label in ours:
+            known[head.sequence] = ours[head.label][0]
+        elif there is None:
+            theirs[head.label] = head.sequence, annotation
+        elif head.kind == OBSERVE and head.sequence > compacted:
+            known[head.sequence] = 0
+    return known, refused
 
 
 def _cannot_be_left_out(
-    theirs: MemoryStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
+    ours: Store, theirs: MemoryStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
 ) -> ObservationError:
     named = {head.sequence: why for head, why in refused}
     if why := named.get(fixed[0].sequence):
         more = f" (and {len(fixed) - 1} more of its touches)" if len(fixed) > 1 else ""
         return ObservationError(f"{why}{more}; {theirs.path} was compacted, and none of them can be left out")
     return ObservationError(
-        f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be counted "
-        f"once: {theirs.path} was compacted, and their features given up there. Merge the other way round, "
-        'or count them twice, with shared="twice"'
+        f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be left out: "
+        f"{theirs.path} was compacted, and their features given up there. Merge the other way round, if {ours.path} "
+        "was not compacted"
     )
 
 
@@ -318,7 +291,7 @@ def _descriptions(
 
 def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None:
     if same_folder(ours.path, theirs.path):
-        raise MismatchError(f"{ours.path} cannot be merged into itself: it would only count everything twice")
+        raise MismatchError(f"{ours.path} cannot be merged into itself: it has all of it already")
     mine, other = Identity.read(ours), Identity.read(theirs)
     for part in ("sensor", "embedding", "reading", "views", "grid"):
         own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))

@@ -108,15 +108,15 @@ class OpenMemory:
             return StoredContents(self.store, self._memory)
         if self._contents is None:
             raise StoreClosedError(
-                "this is a snapshot of a memory that was closed, which does not say what touches it has: make it "
-                "before the memory is closed, or observe with again=True"
+                "this is a snapshot of a memory that was closed, which does not say what touches it has: make the "
+                "snapshot before the memory is closed, or open the memory's folder again"
             )
         return self._contents
 
     def names(self, key: bytes) -> list[str]:
         """The names of a touch with this content hash; raises as `contents`."""
         with self.lock:
-            return self.contents().names(key)
+            return list(self.contents().rows(key))
 
     def copied_contents(self) -> ListedContents | None:
         """A copy of `contents` that changes independently; None where they are not known."""

@@ -29,7 +29,7 @@ from scroll_tactile.memory.touch_rows import (
     annotation_of,
     declaration,
 )
-from scroll_tactile.persistence.buffer import exemplar_candidates
+from scroll_tactile.persistence.replaying import exemplar_candidates
 from scroll_tactile.validation.gate import MemoryStore
 
 __all__ = ["pack_memory", "sums_without"]

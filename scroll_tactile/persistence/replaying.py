@@ -1,17 +1,19 @@
-"""Replaying a journal into a memory: at opening, after each new row, and to choose samples again."""
+"""Replaying a journal into a memory: at opening, after each new row, and to choose samples again; and its exemplars."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import takewhile
-from typing import cast
+from typing import Any, cast
 
+import numpy as np
+import numpy.typing as npt
 from scroll_tactile_store import CompactedError, DamageError, Head, Record, Store
 
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import Description, describe
+from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
 from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
@@ -35,7 +37,8 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.correction import Correction
-from scroll_tactile.statistics.annotations import Annotation, Annotations, together
+from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.grid import mean_code
 from scroll_tactile.validation.gate import misdeclared, wrong_values
 
 __all__ = [
@@ -43,7 +46,9 @@ __all__ = [
     "apply_correction",
     "apply_declaration",
     "apply_description",
+    "exemplar_candidates",
     "load",
+    "ranked_exemplars",
     "refill",
     "replay",
     "require_compaction",
@@ -256,39 +261,60 @@ def _compaction_samples(memory: Memory, store: Store) -> Memory:
             "repair)",
             damage,
         )
-        counted = _counted(memory, store)
+        rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
+        # The memory is asked as well: a row that retracts one of them may have been lost to damage.
+        left = {(head.label, head.key) for head in rows if not memory.is_gone(head.sequence)}
         fresh.quantities = dict(memory.quantities)
-        fresh.sample.update(
-            (name, key, replace(touch, copies=count, annotations=noted))
-            for name, key, touch in memory.sample
-            for count, noted in counted.get((name, key), ())
-        )
-        if fresh.kept is not None and memory.kept is not None:
-            fresh.kept.update(
-                (name, key, replace(touch, annotations=noted))
-                for name, key, touch in memory.kept
-                for _, noted in counted.get((name, key), ())
-            )
-        if fresh.exemplars is not None and memory.exemplars is not None:
-            fresh.exemplars.update(item for item in memory.exemplars if item[:2] in counted)
+        for sample, before in zip(fresh.samples, memory.samples, strict=True):
+            sample.update(item for item in before if item[:2] in left)
     return fresh
-
-
-def _counted(memory: Memory, store: Store) -> dict[tuple[str, bytes], list[tuple[int, Annotations]]]:
-    """(material, key) → how often the compacted rows observed the stream, without retracted observations, and how
-    these were annotated: a list of one.
-
-    `memory.is_gone` is asked as well: a row that retracts one of them may have been lost to damage.
-    """
-    rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
-    left = [head for head in rows if head.kind != MERGE and not memory.is_gone(head.sequence)]
-    noted: dict[tuple[str, bytes], list[Annotation]] = {}
-    for head in left:
-        noted.setdefault((head.label, head.key), []).append(annotation_of(head.attributes))
-    return {stream: [(len(own), together((one, 1) for one in own))] for stream, own in noted.items()}
 
 
 def require_compaction(memory: Memory, store: Store) -> None:
     """Raise CompactedError where the store was compacted since this memory was read."""
     if store.compacted != memory.compacted:
         raise CompactedError(f"{store.path} was compacted since it was read: read it again")
+
+
+def ranked_exemplars(memory: Memory, store: Store | None) -> dict[str, list[Exemplar]]:
+    """The buffer, ranked by `rank` against the exact means of all observations. Raises as `exemplar_candidates`."""
+    statistics = memory.statistics
+
+    def mean(material: str, scale: Scale) -> npt.NDArray[np.int64]:
+        return mean_code(statistics.sums(scale, [material])[0], int(statistics.counts(scale, [material])[0]))
+
+    return rank(exemplar_candidates(memory, store), memory.recipe.exemplars, mean)
+
+
+def exemplar_candidates(memory: Memory, store: Store | None) -> list[Exemplar]:
+    """The candidates for the buffer with their readings, by material and key; those lost to damage are left out.
+
+    store: of the memory, None where it has none. Raises CompactedError where it was compacted since the memory was
+    read, DamageError, StoreClosedError.
+    """
+    found: dict[tuple[str, bytes], Exemplar] = {}
+    wanted: dict[int, list[tuple[str, bytes]]] = {}
+    for material, key, source in memory.exemplars or ():
+        if isinstance(source, Exemplar):
+            found[material, key] = source
+        else:  # the compaction checkpoint holds what was compacted
+            wanted.setdefault(source if source > memory.compacted else 0, []).append((material, key))
+    for sequence, streams in sorted(wanted.items()):
+        assert store is not None
+        held = {(exemplar.material, exemplar.key): exemplar for exemplar in _exemplars_in(memory, store, sequence)}
+        found |= {stream: held[stream] for stream in streams if stream in held}
+        if lost := len(set(streams) - set(held)):
+            logger.warning("%s: the readings of %d candidates for exemplars were lost to damage", store.path, lost)
+    return [found[stream] for stream in sorted(found)]
+
+
+def _exemplars_in(memory: Memory, store: Store, sequence: int) -> list[Exemplar]:
+    """The exemplars that a row of the journal holds; 0: those of the compaction checkpoint."""
+    require_compaction(memory, store)
+    row = store.record(sequence) if sequence else store.compaction()
+    if isinstance(row, Record) and row.kind == OBSERVE:
+        steps, codes = memory.codes(row)
+        readings, stages = only_readings(row.arrays), memory.plan.scored_stages(steps)
+        return [Exemplar.of(row.label, row.key, readings, stages, codes)]
+    about = None if row is None else cast(Any, row.attributes.get("exemplars"))
+    return [] if row is None or about is None else exemplars_from_arrays(row.arrays, about)

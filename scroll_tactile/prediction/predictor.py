@@ -19,11 +19,9 @@ from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.persistence.axis_ledger import AxisLedger, axis_name
-from scroll_tactile.persistence.buffer import exemplar_candidates
 from scroll_tactile.persistence.contents import ListedContents
-from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.persistence.replaying import load
+from scroll_tactile.persistence.ledger import AxisLedger, Ledger, axis_name
+from scroll_tactile.persistence.replaying import exemplar_candidates, load
 from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel, FrozenModel

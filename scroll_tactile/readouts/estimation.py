@@ -21,7 +21,6 @@ from scroll_tactile.quantities import Quantity
 from scroll_tactile.readouts.regression import RegressionHead, Spectrum, fit_head
 from scroll_tactile.results import Estimate
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from scroll_tactile.statistics.annotations import Annotations
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
@@ -70,11 +69,7 @@ class Estimator:
         before: Estimator | None = None,
     ) -> Estimator:
         """The estimator of a sample. before: an earlier one, whose heads it takes where they last."""
-        carrying = [
-            (material, key, touch)
-            for material, key, touch in sample
-            if any(annotation.values for annotation, _ in touch.annotations)
-        ]
+        carrying = [(material, key, touch) for material, key, touch in sample if touch.annotation.values]
         made = cls(plan, carrying, dict(quantities), least)
         if before is None or made._state != before._state:
             return made
@@ -83,7 +78,7 @@ class Estimator:
     @cached_property
     def _state(self) -> tuple[object, ...]:
         """What heads are a function of, beside the touches' content."""
-        touches = [(material, key, touch.annotations) for material, key, touch in self.sample]
+        touches = [(material, key, touch.annotation) for material, key, touch in self.sample]
         return touches, self.quantities, self.last
 
     @cached_property
@@ -146,9 +141,8 @@ class Estimator:
         rows = {i: rows for i, (*_, touch) in enumerate(self.sample) if (rows := self._rows(touch, stage))}
         fitted: dict[str, Heads | str] = {}
         for name, quantity in self.quantities.items():
-            values = {
-                i: value for i in rows if (value := value_of(self.sample[i][2].annotations, quantity)) is not None
-            }
+            steps = {i: dict(self.sample[i][2].annotation.values).get(name) for i in rows}
+            values = {i: quantity.value(found) for i, found in steps.items() if found is not None}
             carrying, targets = tuple(values), np.array([*values.values()])
             materials = tuple(self.sample[i][0] for i in carrying)
             if reason := _lacking(targets, materials):
@@ -178,14 +172,6 @@ class Estimator:
         scales = sorted([*self._judging(at), *(self.plan.views if at == own else ())])
         places = zip(touch.pairs.tolist(), touch.rows, strict=True)
         return {scales[place]: row for (number, place, _), row in places if number == at}
-
-
-def value_of(annotations: Annotations, quantity: Quantity) -> float | None:
-    """The value that a touch has of a quantity; the mean where it was observed several times, None without any."""
-    steps_of = [(dict(annotation.values).get(quantity.name), copies) for annotation, copies in annotations]
-    found = [(quantity.value(steps), copies) for steps, copies in steps_of if steps is not None]
-    count = sum(copies for _, copies in found)
-    return math.fsum(value * copies for value, copies in found) / count if found else None
 
 
 def _lacking(targets: FloatArray, materials: Sequence[str]) -> str:

@@ -16,8 +16,7 @@ is expected to be (1 + 1/n) times the scatter for a new touch, and (1 + 1/(n −
 it is multiplied by their ratio, 1 − 1/n²: calibration would otherwise expect new touches to look less like their own
 material than they do.
 
-Where the statistics hold more rows of a touch than the sample does (copies, or one touch observed several times), its
-sampled rows stand for all of them.
+Where the statistics hold more rows of a touch than the sample does (copies), its sampled rows stand for all of them.
 """
 
 from __future__ import annotations
@@ -130,7 +129,7 @@ def held_out_scores(
         judged = rows_at(touch, stages, readout.scale)
         if not judged or material not in own or (queries is not None and not queries.get(number)):
             continue
-        weight = float(max(touch.learned[judged[0]], len(judged)))
+        weight = float(max(touch.pairs[judged[0], 2], len(judged)))
         if readout.counts[own[material]] > weight:
             rows = touch.rows[judged] - readout.origin
             at, scored = touch.pairs[judged, 0].tolist(), rows

@@ -7,9 +7,8 @@ share it evenly. Readouts are calibrated on a `TouchSample`; the candidates for 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.annotations import Annotation, Annotations, together
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.statistics.grid import mean_code
 
 __all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage_rows"]
@@ -25,6 +24,7 @@ __all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage
 CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
 
 T = TypeVar("T")
+U = TypeVar("U")
 Codes = dict[Scale, npt.NDArray[np.int32]]
 
 
@@ -53,22 +53,15 @@ class SampledTouch:
 
     rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
     the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of
-    shape (pairs, 3). copies: how often this very content was observed under this name. annotations: how these were
-    annotated.
+    shape (pairs, 3). annotation: its values and labels.
     """
 
     rows: npt.NDArray[np.int32]
     pairs: npt.NDArray[np.int64]
-    copies: int = 1
-    annotations: Annotations = ()
-
-    @property
-    def learned(self) -> npt.NDArray[np.int64]:
-        """For each pair, the rows that the statistics hold of this content: they leave together, shape (pairs,)."""
-        return self.pairs[:, 2] * self.copies
+    annotation: Annotation = NO_ANNOTATION
 
     @classmethod
-    def of(cls, stages: Stages, codes: Codes) -> SampledTouch:
+    def of(cls, stages: Stages, codes: Codes, annotation: Annotation = NO_ANNOTATION) -> SampledTouch:
         """The sampled touch of some codes, of which its own come first, stage after stage; as `stage_rows` gives."""
         used: dict[Scale, int] = {}
         rows, pairs = [], []
@@ -80,7 +73,7 @@ class SampledTouch:
                 used[scale] = row + count
                 rows.append(mean_code(codes[scale][row : row + count].sum(axis=0, dtype=np.int64), count))
                 pairs.append((stage, place, len(codes[scale])))
-        return cls(np.stack(rows).astype(np.int32), np.array(pairs))
+        return cls(np.stack(rows).astype(np.int32), np.array(pairs), annotation)
 
 
 class Sample(Generic[T]):
@@ -114,17 +107,14 @@ class Sample(Generic[T]):
         return (material, key) in self._items
 
     def wants(self, material: str, key: bytes) -> bool:
-        """Whether `add` would keep this stream; one that is held already changes nothing."""
+        """Whether `add` would keep this stream; not of one that is held already."""
         if self.holds(material, key):
             return False
         rank = bisect_left(self._keys.get(material, []), key)
         return len(self) < self.capacity or (rank, key, material) < self._last()
 
     def add(self, material: str, key: bytes, item: T) -> None:
-        """Add an item where it belongs in, and drop what falls out; one that is held is `joined` by it."""
-        if self.holds(material, key):
-            self._items[material, key] = self.joined(self._items[material, key], item)
-            return
+        """Add an item where it belongs in, and drop what falls out; of a stream that is held nothing changes."""
         if not self.wants(material, key):
             return
         insort(self._keys.setdefault(material, []), key)
@@ -135,16 +125,8 @@ class Sample(Generic[T]):
             del self._items[last, self._keys[last].pop()]
             self._greatest = None
 
-    def joined(self, held: T, item: T) -> T:
-        """What is held of a stream that is added once more."""
-        del item
-        return held
-
     def undo(self, material: str, key: bytes) -> Callable[[], None]:
-        """What takes the next `add` back, of an item that is wanted or held; however much was done, and repeatedly."""
-        if self.holds(material, key):
-            held = self._items[material, key]
-            return lambda: self._items.update({(material, key): held})
+        """What takes the next `add` back, of an item that is wanted; however much was done, and repeatedly."""
         touched = {material, self._last()[2]} if len(self) >= self.capacity else {material}
         keys = {name: list(self._keys.get(name, [])) for name in touched}
         # What falls out is the last of its material.
@@ -158,35 +140,17 @@ class Sample(Generic[T]):
 
         return undo
 
-    def change(self, material: str, key: bytes, changed: Callable[[T], T]) -> None:
-        """Change the item of a stream, if it holds that."""
-        if self.holds(material, key):
-            self._items[material, key] = changed(self._items[material, key])
-
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
-        given = list(items)
-        if not self._items and len(given) <= self.capacity:  # all stay: there is nothing to choose
-            for material, key, item in given:
-                held = self._items.get((material, key))
-                self._items[material, key] = item if held is None else self.joined(held, item)
-            for material, key in self._items:
-                self._keys.setdefault(material, []).append(key)
-            for keys in self._keys.values():
-                keys.sort()
-            self._greatest = None
-            return
-        for material, key, item in given:
+        for material, key, item in items:
             self.add(material, key, item)
 
-    def refill(self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], T]) -> None:
-        """Add all streams (material, key, sequence); `make(material, key, sequence)` makes only those that stay."""
-        places: Sample[int | None] = Sample(self.capacity)
+    def refill(self, streams: Iterable[tuple[str, bytes, U]], make: Callable[[U], T]) -> None:
+        """Add all streams (material, key, what one is made of); `make` makes only those that stay."""
+        places: Sample[U | None] = Sample(self.capacity)
         places.update((material, key, None) for material, key, _ in self)
         places.update(streams)
-        self.update(
-            (material, key, make(material, key, sequence)) for material, key, sequence in places if sequence is not None
-        )
+        self.update((material, key, make(source)) for material, key, source in places if source is not None)
 
     def _last(self) -> tuple[int, bytes, str]:
         """(rank, key, material) of the item that falls out next: most touches are compared with it, and stay out."""
@@ -200,29 +164,6 @@ class TouchSample(Sample[SampledTouch]):
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         super().__init__(capacity)
-
-    def note(self, material: str, key: bytes, annotation: Annotation) -> None:
-        """Note how an observation of a touch that is held was annotated; nothing of another touch."""
-        more = [(annotation, 1)]
-        self.change(material, key, lambda held: replace(held, annotations=together(held.annotations, more)))
-
-    def joined(self, held: SampledTouch, item: SampledTouch) -> SampledTouch:
-        """The touch with the copies of both."""
-        annotations = together(held.annotations, item.annotations)
-        return replace(held, copies=held.copies + item.copies, annotations=annotations)
-
-    def refill(
-        self, streams: Iterable[tuple[str, bytes, int]], make: Callable[[str, bytes, int], SampledTouch]
-    ) -> None:
-        """As `Sample.refill`; a stream that comes several times is made once, and counted."""
-        behind = list(streams)
-        copies = Counter((material, key) for material, key, _ in behind)
-        copies.subtract({stream for stream in copies if not self.holds(*stream)})  # the one that is made
-        super().refill(behind, make)
-        for (material, key), more in copies.items():
-            if more and self.holds(material, key):
-                held = self._items[material, key]
-                self._items[material, key] = replace(held, copies=held.copies + more)
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the material of each touch.
@@ -244,17 +185,16 @@ class TouchSample(Sample[SampledTouch]):
         cls,
         arrays: Mapping[str, npt.NDArray[Any]],
         materials: Sequence[str],
-        copies: Sequence[int],
-        annotations: Sequence[Annotations] = (),
+        annotations: Sequence[Annotation] = (),
     ) -> TouchSample:
-        """The sample that `to_arrays` described; copies, annotations: of each touch."""
-        sample, noted = cls(), annotations or [()] * len(materials)
+        """The sample that `to_arrays` described; annotations: of each touch."""
+        sample, noted = cls(), annotations or [NO_ANNOTATION] * len(materials)
         edges = np.cumsum(arrays["sample-sizes"])[:-1]
-        together = np.empty(arrays["sample-rows"].shape[::-1], np.int32)
-        together[_by_scale(arrays["sample-pairs"])] = arrays["sample-rows"].T
-        rows, pairs = np.split(together, edges), np.split(arrays["sample-pairs"], edges)
+        joined = np.empty(arrays["sample-rows"].shape[::-1], np.int32)
+        joined[_by_scale(arrays["sample-pairs"])] = arrays["sample-rows"].T
+        rows, pairs = np.split(joined, edges), np.split(arrays["sample-pairs"], edges)
         for i, material in enumerate(materials):
-            touch = SampledTouch(rows[i], pairs[i], copies[i], noted[i])
+            touch = SampledTouch(rows[i], pairs[i], noted[i])
             sample.add(material, arrays["sample-keys"][i].tobytes(), touch)
         return sample
 

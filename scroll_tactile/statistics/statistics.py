@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.grid import rows_of, table_of
 from scroll_tactile.statistics.moments import SecondMoment, Sums, require_room
-from scroll_tactile.statistics.tables import rows_of, table_of
 
 __all__ = ["SECOND", "Statistics"]
 
@@ -253,7 +253,7 @@ class Statistics:
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the materials in the order of their first axis.
 
-        Of a second moment whose rows are there these, as `tables.table_of` gives them; of another its triangle.
+        Of a second moment whose rows are there these, as `grid.table_of` gives them; of another its triangle.
         """
         names = sorted(self.materials)
         places = [self._places[name] for name in names]

@@ -116,7 +116,7 @@ def _merging_is_union(bench: _Bench) -> None:
     half = len(bench.touches) // 2
     with bench.learner("a", bench.touches[:half]) as ours, bench.learner("whole", bench.touches) as whole:
         bench.learner("b", bench.touches[half:]).close()
-        ours.merge(bench.root / "b", shared="twice")
+        ours.merge(bench.root / "b")
         bench.require_same("merge", ours, whole)
 
 
@@ -147,7 +147,7 @@ def _what_is_noted_is_exact(bench: _Bench) -> None:
     with learned("a", everything) as ours, learned("b", everything[:0:-1]) as theirs:
         learned("c", everything[:1]).close()
         theirs.retract(theirs.observe(material, readings.copy(), values={"check": 0.5}, labels={"check": "c"}))
-        theirs.merge(bench.root / "c", shared="once")
+        theirs.merge(bench.root / "c")
         bench.require_same("values and labels", ours, theirs)
         if ours.digest() == bench.learner("d", bench.touches).digest():
             raise LearnerError("values and labels: expected another digest with them than without; it is the same")

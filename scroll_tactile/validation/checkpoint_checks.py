@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -10,20 +11,23 @@ import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store.records import LateArray
 
-from scroll_tactile.memory.state import MOST_CORRECTIONS
-from scroll_tactile.memory.touch_rows import Arrays
+from scroll_tactile.memory.state import ANNOTATED, MOST_CORRECTIONS
+from scroll_tactile.memory.touch_rows import LABELS, VALUES, Arrays
+from scroll_tactile.quantities import MOST_QUANTITIES, Quantity
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import Scale, WindowPlan
-from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.annotations import MOST_AXES, axis_arrays
+from scroll_tactile.statistics.grid import BITS, rows_of
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, one_thread, within_scatter
 from scroll_tactile.statistics.statistics import SECOND
-from scroll_tactile.statistics.tables import rows_of
 from scroll_tactile.validation.expected import (
     LONGEST_TOUCH,
     array,
+    check_annotation,
     check_correction,
     check_description,
+    check_quantity,
     check_readings,
     check_values,
     codes,
@@ -33,7 +37,6 @@ from scroll_tactile.validation.expected import (
     name,
     whole,
 )
-from scroll_tactile.validation.target_checks import check_targets
 
 __all__ = ["CheckpointChecks"]
 
@@ -42,7 +45,10 @@ MODES = ("head", "adapters", "network")
 NO_MOMENT = "a second moment of rows with these sums", "one that no rows have"
 AT_ONCE = 1024  # materials
 JITTER = 1e-6  # of the mean variance: readouts are shrunk by a hundred times as much
+TOTAL = re.compile("[0-9a-f]{64}")
+SAMPLES = "sample", "kept"
 IntArray = npt.NDArray[np.int64]
+CheckAxis = Callable[[Arrays, list[str]], None]
 
 
 class CheckpointChecks:
@@ -72,12 +78,8 @@ class CheckpointChecks:
         rows = {scale: dict(zip(materials, total.tolist(), strict=True)) for scale, total in totals.items()}
         sampled = _names("sample", attributes.get("sample"), materials)
         self._check_sample(arrays, sampled)
-        copies: Any = attributes.get("copies")
-        expect(isinstance(copies, list) and len(copies) == len(sampled), "copies", "one of each of sample", copies)
-        for each in copies:
-            whole("copies", each, 1, MOST_ROWS)
         check_axis = partial(self._check_axis, arrays, totals, thorough=thorough)
-        check_targets(arrays, attributes, dict(zip(materials, touches, strict=True)), check_axis)
+        _check_targets(arrays, attributes, dict(zip(materials, touches, strict=True)), check_axis)
         if self._keeps or "kept" in attributes:
             self._check_kept(arrays, _names("kept", attributes.get("kept"), materials))
         if "exemplars" in attributes:
@@ -312,3 +314,83 @@ def _between(rows: IntArray, sums: IntArray) -> npt.NDArray[np.float64]:
         part = sums[first : first + AT_ONCE].astype(np.float64)
         between += (np.square(part, out=part) / rows[first : first + AT_ONCE, None]).sum(axis=0)
     return between
+
+
+def _check_targets(
+    arrays: Arrays, attributes: Mapping[str, Any], touches: Mapping[str, int], check_axis: CheckAxis
+) -> None:
+    """Raise Unexpected for what a checkpoint cannot say of values and labels.
+
+    touches: of each material. check_axis: checks the statistics of an axis, given its arrays and labels.
+    """
+    quantities = _quantities(attributes.get("quantities", {}))
+    if "targets" not in attributes:
+        expect(not any(which in attributes for which in ANNOTATED), "targets", "sums of the annotations", None)
+        return
+    about: Any = attributes["targets"]
+    expect(isinstance(about, dict), "targets", "touches, total, sums and axes", about)
+    whole("targets.touches", about.get("touches"), 1, sum(touches.values()))
+    total = about.get("total")
+    expect(isinstance(total, str) and bool(TOTAL.fullmatch(total)), "targets.total", "64 digits", total)
+    _check_sums(arrays, about.get("sums"), quantities, touches)
+    axes = _axes(about.get("axes"))
+    for number, labels in enumerate(axes.values()):
+        check_axis(axis_arrays(arrays, number), labels)
+    for which, of in zip(ANNOTATED, SAMPLES, strict=True):
+        if of in attributes:
+            noted = _check_annotations(which, attributes.get(which), len(attributes[of]), quantities, axes)
+            expect(noted <= about["touches"], which, f"those of {about['touches']} touches", noted)
+
+
+def _quantities(declared: Any) -> dict[str, Quantity]:
+    expect(
+        isinstance(declared, dict) and len(declared) <= MOST_QUANTITIES, "quantities", "quantities by name", declared
+    )
+    for fields in declared.values():
+        expect(isinstance(fields, dict), "quantities", "a unit, a range and a resolution", fields)
+    return {named: check_quantity("quantities", named, fields) for named, fields in declared.items()}
+
+
+def _check_sums(arrays: Arrays, pairs: Any, quantities: Mapping[str, Quantity], touches: Mapping[str, int]) -> None:
+    """Check the count, the sum and the sum of squares of each quantity and material."""
+    field = "targets.sums"
+    expect(isinstance(pairs, list), field, "quantities and materials", pairs)
+    for pair in pairs:
+        named = isinstance(pair, list) and len(pair) == 2 and all(isinstance(each, str) for each in pair)
+        expect(named and pair[0] in quantities and pair[1] in touches, field, "a declared quantity of a material", pair)
+    expect(len({tuple(pair) for pair in pairs}) == len(pairs), field, "different ones", pairs)
+    sums = array(arrays, "quantity-sums", ("int64",), (len(pairs), 3)).tolist()
+    for (quantity, material), (count, total, squares) in zip(pairs, sums, strict=True):
+        steps, most = quantities[quantity].steps, touches[material]
+        fits = 1 <= count <= most and 0 <= total <= count * steps and 0 <= squares <= count * steps**2
+        sound = fits and total**2 <= count * squares
+        expect(sound, "quantity-sums", f"sums of 1 to {most} values of {quantity!r}", (count, total, squares))
+
+
+def _axes(stored: Any) -> dict[str, list[str]]:
+    """Axis → its labels."""
+    expect(isinstance(stored, list) and len(stored) <= MOST_AXES, "targets.axes", f"at most {MOST_AXES} axes", stored)
+    for each in stored:
+        whole_ = isinstance(each, list) and len(each) == 2 and isinstance(each[1], list)
+        expect(whole_, "targets.axes", "an axis and its labels", each)
+        names = [name("targets.axes", own) for own in (each[0], *each[1])][1:]
+        expect(len(set(names)) == len(names) > 0, "targets.axes", "different labels", names)
+    axes: dict[str, list[str]] = dict(stored)
+    expect(len(axes) == len(stored), "targets.axes", "different axes", stored)
+    return axes
+
+
+def _check_annotations(
+    field: str, stored: Any, count: int, quantities: Mapping[str, Quantity], axes: Mapping[str, list[str]]
+) -> int:
+    """How many of so many touches of a sample are annotated."""
+    expect(isinstance(stored, list) and len(stored) == count, field, "one of each touch", stored)
+    for attributes in stored:
+        expect(isinstance(attributes, dict), field, "values or labels", attributes)
+        check_annotation(f"{field}.", attributes)
+        for quantity, steps in attributes.get(VALUES, {}).items():
+            known = quantity in quantities and steps <= quantities[quantity].steps
+            expect(known, field, "values of declared quantities", attributes)
+        for axis, label in attributes.get(LABELS, {}).items():
+            expect(label in axes.get(axis, ()), field, "labels that touches have", attributes)
+    return sum(map(bool, stored))

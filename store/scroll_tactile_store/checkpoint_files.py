@@ -139,7 +139,7 @@ class CheckpointReader:
     """A checkpoint of a store: how it describes itself, and its arrays, verified. path: its folder.
 
     Every method raises DamageError that names the file or folder, the array and the checkpoint, VersionError
-    for a newer format, and StoreError for a file that cannot be read for a reason that says nothing against it.
+    for another format, and StoreError for a file that cannot be read for a reason that says nothing against it.
     """
 
     def __init__(self, path: Path, files: Files) -> None:
@@ -248,10 +248,10 @@ def _read_description(path: Path, files: Files) -> tuple[dict[str, Any], dict[st
         )
     try:
         described = read_content(known)
-        if known["format"] > GROUP_VERSION:
+        if known["format"] != GROUP_VERSION:
             raise VersionError(
-                f"{path} is written in format {known['format']}; this release reads checkpoints up to format "
-                f"{GROUP_VERSION}: upgrade it; nothing was changed"
+                f"{path} is written in format {known['format']}; this release reads checkpoints of format "
+                f"{GROUP_VERSION}: open it with the release that wrote it; nothing was changed"
             )
         _require_described(known)
     except ValueError as error:

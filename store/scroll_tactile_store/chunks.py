@@ -32,7 +32,7 @@ __all__ = [
     "read_content",
 ]
 
-GROUP_VERSION = 1
+GROUP_VERSION = 2
 
 # Pieces of a large array: small enough to be compressed in cache-sized steps and verified before they are
 # decompressed, large enough that a hundred megabytes are some tens of files to make durable.
@@ -126,14 +126,14 @@ class ArrayContent:
 
 
 def read_content(content: Mapping[str, Any]) -> dict[str, ArrayContent]:
-    """Return what a checkpoint says of its arrays, by name; nothing where its format is newer.
+    """Return what a checkpoint says of its arrays, by name; nothing where it is of another format.
 
     Raises ValueError where it says it in another way than `write_group` has it.
     """
     version, arrays = content.get("format"), content.get("arrays")
     if type(version) is not int or version < 1:
         raise ValueError(f"the format of a checkpoint is {version!r}, not a number")
-    if version > GROUP_VERSION:
+    if version != GROUP_VERSION:
         return {}
     if not isinstance(arrays, dict):
         raise ValueError("a checkpoint does not say what its arrays are")

@@ -4,7 +4,7 @@ Exception
 └── StoreError             anything that the store reports
     ├── LockedError        another writer holds the store: close that one, or open with mode="read"
     ├── NotAStoreError     the path holds no store: give another path, or an identity to create one
-    ├── VersionError       a newer release wrote it: upgrade; nothing was touched
+    ├── VersionError       another release wrote it; nothing was touched
     ├── DamageError        bytes on the disk are not those that were written: repair_store keeps what verifies
     ├── CompactedError     compaction gave up this row's arrays: resume from the compaction checkpoint
     ├── StoreFullError     no space is left: free some and call again; nothing acknowledged is lost
@@ -55,7 +55,7 @@ class NotAStoreError(StoreError):
 
 
 class VersionError(StoreError):
-    """The store was written in a format newer than this release reads; nothing was touched."""
+    """The store was written in a format that this release does not read; nothing was touched."""
 
 
 class DamageError(StoreError):

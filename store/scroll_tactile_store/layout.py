@@ -41,7 +41,7 @@ __all__ = [
     "write_current",
 ]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
@@ -122,7 +122,7 @@ class Current:
 
     @classmethod
     def from_bytes(cls, data: bytes, path: Path) -> Self:
-        """Return what `to_bytes` wrote. Raises VersionError for a newer format, DamageError for anything else."""
+        """Return what `to_bytes` wrote. Raises VersionError for another format, DamageError for anything else."""
         try:
             known: dict[str, Any] = dict(from_json(data.decode("ascii")))
             if known.pop("sha256", None) != json_digest(known):
@@ -132,10 +132,10 @@ class Current:
                     f"{path} is written in format {known['format']}; this release reads format {FORMAT_VERSION}: "
                     "upgrade it, or open the store with the release that wrote it; nothing was changed"
                 )
-            if "base" in known:
+            if known["format"] < FORMAT_VERSION:
                 raise VersionError(
-                    f"{path} was written by a release from 0.8 to 0.10, which this one does not read: learn it again, "
-                    "or open it with that release; nothing was changed"
+                    f"{path} is written in format {known['format']}, by scroll-tactile 0.15 or before; this one reads "
+                    f"format {FORMAT_VERSION}: learn it again from the recordings, or open it with scroll-tactile 0.15"
                 )
             number, identity = known["log"]
             newest, compaction = (
@@ -225,8 +225,8 @@ def _numbers(names: Iterable[str], suffix: str) -> list[int]:
 def holds_store(folder: Path) -> bool:
     """Return whether `folder` holds a store that this release reads; False when one may be made there.
 
-    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for a newer
-    format or one of 0.x, and DamageError where `CURRENT` is damaged, or gone while what it named is still there.
+    Only looks. Raises NotAStoreError for a file and for a folder with other things in it, VersionError for another
+    format, and DamageError where `CURRENT` is damaged, or gone while what it named is still there.
     """
     with reported(folder, "looking for a store"):
         if not folder.exists():

@@ -65,7 +65,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     Readers that have the store open continue with the damaged one until they open it anew.
     `progress` is called with what is being done, how many of it are done, and how many there will be.
 
-    Raises NotAStoreError, LockedError while a writer has it, VersionError for a newer format, DamageError
+    Raises NotAStoreError, LockedError while a writer has it, VersionError for another format, DamageError
     where not even its identity is left or a link is where a file should be, StoreFullError,
     ReadOnlyError and other StoreErrors.
     """

@@ -64,7 +64,7 @@ class Store:
         what is committed at that moment.
 
         Raises NotAStoreError when there is no store and none may be made (no identity, mode "read", a file, a folder of
-        other things), LockedError for a second writer, VersionError for a newer format, DamageError, ReadOnlyError,
+        other things), LockedError for a second writer, VersionError for another format, DamageError, ReadOnlyError,
         StoreFullError, and RecordError for another mode or an identity not in JSON.
         """
         if mode not in ("write", "read"):
@@ -212,7 +212,7 @@ class Store:
         over. With none it is the checkpoint's attributes, in well below a millisecond. late: names of arrays of which
         the files are verified and stay open; they are decompressed when they are needed, whatever happens to the store.
         A logged warning names the file and the array of each checkpoint that it passes over. Raises VersionError for a
-        checkpoint of a newer format.
+        checkpoint of another format.
         """
         self._check_open()
         return self._checkpoints.latest(only, late)
@@ -259,7 +259,7 @@ class Store:
     def compaction(self) -> Checkpoint | None:
         """Return the checkpoint that stands for the compacted records, None when there are none.
 
-        Raises DamageError where it does not verify, and VersionError for a newer format.
+        Raises DamageError where it does not verify, and VersionError for another format.
         """
         self._check_open()
         return self._checkpoints.compaction()

@@ -61,7 +61,7 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
     Where something is a link, a pipe or a device it reads nothing and names these.
     `progress` is called with what is being verified, how many of it are done, and how many there are.
 
-    Raises NotAStoreError where there is no store, VersionError for a newer format, and another StoreError
+    Raises NotAStoreError where there is no store, VersionError for another format, and another StoreError
     where a file cannot be read for a reason that says nothing against it.
     """
     folder = store_folder(path)
@@ -124,7 +124,7 @@ class Survey:
     compaction gave up, whether its checkpoint is sound or not. `sound` are the checkpoints that recovery can resume
     from, the newest first. `last` is the last sequence of which there is any sign; `faults` are
     the rows that do not verify, as (first, last, fault), ascending. A writer may be at work meanwhile. Raises
-    VersionError for a newer format, and StoreError for a file that cannot be read for a reason that says nothing
+    VersionError for another format, and StoreError for a file that cannot be read for a reason that says nothing
     against it.
     """
 

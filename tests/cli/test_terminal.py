@@ -219,7 +219,7 @@ class TestFiles:
         assert refused("observe", path, "felt", tmp_path / "t.npy", "--sensor", long)
         assert refused("memory", "export", path, tmp_path / "t.npy")
         assert refused("memory", "backup", path, tmp_path / "t.npy")
-        assert refused("memory", "merge", path, tmp_path / "t.npy", "--shared", "once")
+        assert refused("memory", "merge", path, tmp_path / "t.npy")
         assert refused("demo", "--memory", tmp_path / long)
 
     def test_paths_that_are_no_text(self, path, tmp_path):

@@ -40,7 +40,7 @@ SOME = 500  # bytes
 HISTORY: tuple[Operation, ...] = (
     ("batch", tuple(("observe", name, (i, 90)) for i in range(3) for name in "abc")),
     ("retract", 2),
-    ("merge", "compacted", "twice"),
+    ("merge", "compacted"),
     ("observe", "ü", (1, 60)),
     ("compact", 4),
     ("observe", "a", (4, 90)),

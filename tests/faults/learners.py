@@ -25,6 +25,7 @@ from faults.model import Operation, Pairs, State, Touch
 from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.persistence.merge import MergeRules
+from scroll_tactile.statistics.annotations import Annotation
 
 FORCE = Quantity(name="force", unit="N", low=0, high=1, resolution=0.01)
 VALUED = 5  # the seed of the touches that have a value
@@ -95,9 +96,18 @@ def fed(pairs: Pairs, embedding: str = "own", **more: Any) -> TactileLearner:
     """A memory without a path of these touches."""
     learner = TactileLearner(**KIT.settings | {"embedding": KIT.embeddings[embedding]} | more)
     learner.declare(FORCE)
-    for material, touch in pairs:
+    for at, (material, touch) in enumerate(pairs):
         _observe(learner, Path(), material, touch)
+        if (material, touch) in pairs[:at]:  # damage hid it, and it was learned again
+            _count_once_more(learner, material, touch)
     return learner
+
+
+def _count_once_more(learner: TactileLearner, material: str, touch: Touch) -> None:
+    stream, memory = learner.stream(KIT.stream(touch)), learner.memory
+    annotation = Annotation.of(learner.quantities, *KIT.noted(touch))
+    learned = learner._predictor.extractor.learned(stream)
+    memory.add(material, stream.key, *learned, memory.sequence, None, None, annotation)
 
 
 def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
@@ -109,13 +119,13 @@ def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
         return type(error).__name__
 
 
-def _observe(learner: TactileLearner, _: Path, material: str, touch: Touch, again: bool = True) -> int:
+def _observe(learner: TactileLearner, _: Path, material: str, touch: Touch) -> int:
     values, labels = KIT.noted(touch)
     if values and not learner.quantities:  # durable together
         with learner.batch():
             learner.declare(FORCE)
-            return _observe(learner, _, material, touch, again)
-    return learner.observe(material, KIT.stream(touch), values=values, labels=labels, again=again).sequence
+            return _observe(learner, _, material, touch)
+    return learner.observe(material, KIT.stream(touch), values=values, labels=labels).sequence
 
 
 def _batch(learner: TactileLearner, home: Path, operations: tuple[Operation, ...]) -> list[Any]:
@@ -124,13 +134,13 @@ def _batch(learner: TactileLearner, home: Path, operations: tuple[Operation, ...
 
 
 def _merge(
-    learner: TactileLearner, home: Path, name: str, shared: Any, descriptions: Any = "same", of_sources: bool = False
+    learner: TactileLearner, home: Path, name: str, descriptions: Any = "same", of_sources: bool = False
 ) -> list[int]:
     if of_sources:
         rules = MergeRules(one_name=True, descriptions=descriptions)
         merged, refused = learner._ledger.merge(home / name, rules, lambda *_: None)
     else:
-        merged, refused = learner.merge(home / name, shared=shared, descriptions=descriptions), []
+        merged, refused = learner.merge(home / name, descriptions=descriptions), []
     return [merged.observations, merged.shared, merged.described, len(refused)]
 
 
@@ -165,10 +175,9 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     memory = learner.memory
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
-        pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.copies)).encode())
-        pool.update(repr(touch.annotations).encode())
+        pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.annotation)).encode())
     arrays, materials = ({}, None) if memory.kept is None else memory.kept.to_arrays()
-    kept = hashlib.sha256(repr((materials, [touch.annotations for *_, touch in memory.kept or ()])).encode())
+    kept = hashlib.sha256(repr((materials, [touch.annotation for *_, touch in memory.kept or ()])).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())
     return {"digest": learner.digest(), "pool": pool.hexdigest(), "kept": kept.hexdigest()}

@@ -2,12 +2,12 @@
 
 A row is ("observe", material, touch), ("retract", sequences, material or ""), ("describe", material, constituents),
 ("merge", pairs), what a compacted memory brought, ("member", material, touch), a touch that it had, or ("declare",), of
-the quantity that some touches have a value of. All in all they are a multiset of (material, touch); what is noted of a
-touch follows from it.
+the quantity that some touches have a value of. All in all they are a set of (material, touch), but where damage hid one
+that was then learned again; what is noted of a touch follows from it.
 
-An operation is a tuple: ("observe", material, touch, again), ("batch", operations), ("retract", sequence),
+An operation is a tuple: ("observe", material, touch), ("batch", operations), ("retract", sequence),
 ("forget", material), ("relabel", sequence, material), ("describe", material, constituents or None),
-("merge", name, shared, descriptions, of sources), ("compact", keep), ("fine_tune",), ("backup",), ("open",),
+("merge", name, descriptions, of sources), ("compact", keep), ("fine_tune",), ("backup",), ("open",),
 ("close",), ("pack", name, rows), ("reembed", embedding), ("fleet", pairs). `after` says what it makes of a `State` and
 what the call returns; `learners.perform` does it.
 """
@@ -109,6 +109,10 @@ class State:
         """The touches that a memory can name, with their rows."""
         return [(sequence, row[1:]) for sequence, row in self.standing if row[0] in LISTED]
 
+    def there(self, material: str, touch: Touch) -> int:
+        """The row that has a touch under this name; 0 without one."""
+        return min((sequence for sequence, pair in self.listed if pair == (material, touch)), default=0)
+
     @property
     def whole(self) -> bool:
         """Whether every touch has its row, with its arrays."""
@@ -147,10 +151,9 @@ def after(state: State, operation: Operation, others: Others) -> Then:
     return _AFTER[kind](state, others, *rest)
 
 
-def _observe(state: State, _: Others, material: str, touch: Touch, again: bool = True) -> Then:
-    there = [sequence for sequence, pair in state.listed if pair == (material, touch)]
-    if there and not again:
-        return state, min(there)
+def _observe(state: State, _: Others, material: str, touch: Touch) -> Then:
+    if there := state.there(material, touch):
+        return state, there
     from faults.learners import KIT
 
     if KIT.noted(touch)[0] and not state.declared:
@@ -188,7 +191,10 @@ def _relabel(state: State, _: Others, sequence: int, material: str) -> Then:
     _, before, touch = state.rows[sequence - 1]
     if before == material:
         return state, "InputError"
-    then = state.plus(("retract", (sequence,), ""), ("observe", material, touch))
+    then = state.plus(("retract", (sequence,), ""))
+    if there := state.there(material, touch):
+        return then, there
+    then = then.plus(("observe", material, touch))
     return then, then.last
 
 
@@ -198,32 +204,32 @@ def _describe(state: State, _: Others, material: str, constituents: Constituents
     return state.plus(("describe", material, constituents)), None
 
 
-def _twice_there(ours: State, theirs: State) -> tuple[set[int], set[int]]:
-    """Rows of a memory of sources that are refused, since a touch has another name, and those of a touch again."""
+def _there(ours: State, theirs: State, *, one_name: bool) -> tuple[set[int], set[int]]:
+    """Rows of theirs that ours, or an earlier row, has; and those that are refused, since a touch has another name."""
     names: dict[Touch, list[str]] = {}
     for _, (material, touch) in ours.listed:
         names.setdefault(touch, []).append(material)
-    refused, again, came = set[int](), set[int](), dict[Touch, str]()
+    known, refused, came = set[int](), set[int](), dict[Touch, list[str]]()
     for sequence, (material, touch) in theirs.listed:
-        before = touch in came
-        if material not in (names.get(touch) or [came.setdefault(touch, material)]):
+        mine, own = names.get(touch, []), came.setdefault(touch, [])
+        if one_name and (mine or own) and material not in (mine or own):
             refused.add(sequence)
-        elif before and sequence > theirs.compacted and theirs.rows[sequence - 1][0] == "observe":
-            again.add(sequence)
-    return refused, again
+        elif material in mine:
+            known.add(sequence)
+        elif material not in own:
+            own.append(material)
+        elif sequence > theirs.compacted and theirs.rows[sequence - 1][0] == "observe":
+            known.add(sequence)
+    return known, refused
 
 
-def _merge(
-    ours: State, others: Others, name: str, shared: str, descriptions: str = "same", of_sources: bool = False
-) -> Then:
-    """of_sources: by the rules for memories of sources, of which a touch has one name and counts once."""
+def _merge(ours: State, others: Others, name: str, descriptions: str = "same", of_sources: bool = False) -> Then:
+    """of_sources: by the rules for memories of sources, of which a touch has one name."""
     theirs = (dict(others) | dict(ours.packed))[name]
     if ours.embedding != theirs.embedding:
         return ours, "MismatchError"
-    have = {pair for _, pair in ours.listed}
-    both = {sequence for sequence, pair in theirs.listed if pair in have}
-    refused, again = _twice_there(ours, theirs) if of_sources else (set(), set())
-    out = (both if shared == "once" else set()) | refused | again
+    known, refused = _there(ours, theirs, one_name=of_sources)
+    out = known | refused
     if any(sequence <= theirs.compacted or theirs.rows[sequence - 1][0] == "member" for sequence in out):
         return ours, "ObservationError"
     new = {name: said for name, said in sorted(theirs.said.items()) if repr(ours.said.get(name)) != repr(said)}
@@ -240,7 +246,7 @@ def _merge(
         elif row[0] != "merge":
             added.append(("member", *row[1:]))
     count = sum(row[0] in LISTED for _, row in coming)
-    return ours.plus(*added), [count, len(both) + len(again), len(new), len(refused)]
+    return ours.plus(*added), [count, len(known), len(new), len(refused)]
 
 
 def _compact(state: State, _: Others, keep: int) -> Then:

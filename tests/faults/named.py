@@ -213,7 +213,7 @@ def untyped() -> dict[str, Named]:
         "deep identity": lambda path, _: set_identity(path, deep),
         **{f"identity: {name}": by_folder(attack) for *_, name, attack in identities()},
         **{f"content: {name}": by_folder(attack) for name, attack in CHECKPOINTS.items()},
-        "content of a newer format": content(format=2),
+        "content of a newer format": content(format=3),
         "no attributes of a checkpoint": content(attributes={}),
         "too many materials": lambda path, _: seal(
             path,

@@ -15,7 +15,6 @@ KINDS = (
     "pack",
 )
 TOGETHER = ("observe", "observe", "observe", "retract", "forget", "describe")  # in a batch
-MOST_TWICE = 16  # observations: a memory that is merged into itself would soon be all that a history does
 SAID = (None, (("silk", 1.0),), (("silk", 0.25), ("wool", 0.75)), (("soft", True), ("wool", None)))
 
 # The memories that are merged: so many observations, and what was done then.
@@ -47,26 +46,19 @@ def touch(rng: random.Random) -> Touch:
 def draw(rng: random.Random, state: State, others: Others, kind: str) -> Operation:
     """A random operation of a kind; now and then one that is refused."""
     drawn: dict[str, Callable[[], tuple[Any, ...]]] = {
-        "observe": lambda: (rng.choice(KIT.materials), touch(rng), rng.random() < 0.5),
+        "observe": lambda: (rng.choice(KIT.materials), touch(rng)),
         "batch": lambda: (tuple(history(rng, state, others, rng.choices(TOGETHER, k=rng.randrange(1, 7)))),),
         "describe": lambda: (rng.choice(KIT.materials), rng.choice(SAID)),
         "retract": lambda: (_row(rng, state),),
         "forget": lambda: (_material(rng, state),),
         "relabel": lambda: (_row(rng, state), rng.choice(KIT.materials)),
-        "merge": lambda: _to_merge(rng, state, others),
+        "merge": lambda: (rng.choice([*sorted(others), *dict(state.packed)]), rng.choice(("same", "ours", "theirs"))),
         "compact": lambda: (rng.choice((0, 1, 2, 4)),),
         "pack": lambda: (f"packed-{len(state.packed)}", rng.random() < 0.7),
         "reembed": lambda: (rng.choice(sorted(KIT.embeddings)),),
         "fleet": lambda: (_of_one_name(rng, state),),
     }
     return kind, *drawn.get(kind, tuple)()
-
-
-def _to_merge(rng: random.Random, state: State, others: Others) -> Operation:
-    """One of the others, or what this memory was packed as."""
-    name = rng.choice([*sorted(others), *dict(state.packed)])
-    shared = rng.choice(("twice", "once")) if name in others or len(state.listed) <= MOST_TWICE else "once"
-    return name, shared, rng.choice(("same", "ours", "theirs"))
 
 
 def _row(rng: random.Random, state: State) -> int:

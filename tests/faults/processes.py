@@ -54,7 +54,7 @@ def race(channel: Connection, path: Path) -> None:
         except Exception as error:
             channel.send(("raised", repr(error)))
             continue
-        channel.send(("won", learner.observe("a", stream((len(learner.materials), 25)), again=True).sequence))
+        channel.send(("won", learner.observe("a", stream((learner.memory.sequence, 25))).sequence))
         channel.recv()
         learner.close()
         channel.send("closed")

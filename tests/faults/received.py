@@ -31,14 +31,14 @@ from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.validation.gate import check_memory
 
 OURS = (ScrollTactileError, StoreError)
-GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
+GOLDEN = Path(__file__).parents[1] / "data" / "format-2.zip"
 TOUCHES: tuple[Operation, ...] = tuple(("observe", name, (i, 30)) for i in range(2) for name in "ab")
 HISTORIES: dict[str, tuple[Operation, ...]] = {
     "rows": TOUCHES,
     "crashed": (*TOUCHES, ("describe", "a", (("x", 0.5), ("y", 0.5))), ("retract", 2)),
     "snapshot": (*TOUCHES, ("describe", "b", (("x", 1.0),))),
     "compacted": (*TOUCHES, ("describe", "a", (("x", True),)), ("compact", 1), ("observe", "c", (3, 40))),
-    "merged": (("observe", "b", (7, 30)), ("merge", "compacted", "twice", "theirs"), ("retract", 1)),
+    "merged": (("observe", "b", (7, 30)), ("merge", "compacted", "theirs"), ("retract", 1)),
     "tuned": (*TOUCHES, ("observe", "a", (5, 40)), ("fine_tune",)),
 }
 WITHOUT_CHECKPOINT = ("rows", "crashed")
@@ -62,7 +62,7 @@ def glance(learner: TactileLearner) -> dict[str, Any]:
 
 
 def corpus(home: Path) -> list[Memory]:
-    """All memories, made in a folder, and the golden one of format 1."""
+    """All memories, made in a folder, and the golden one of format 2."""
     made = []
     for name, history in HISTORIES.items():
         learner = opened(home / name)
@@ -192,7 +192,7 @@ def write(case: Case) -> str:
         with TactileLearner.open(case.path) as learner:
             came = case.judge(learner, warned)
             before, counted = learner.digest(), learner.materials.get("b", 0)
-            receipt = learner.observe("b", touch_of(learner), again=True)
+            receipt = learner.observe("b", touch_of(learner))
         with TactileLearner.open(case.path) as learner:
             if learner.materials.get("b") != counted + 1:
                 raise Wrong(f"an observation was lost: {learner.materials}, and {counted} before it")
@@ -212,10 +212,10 @@ def write(case: Case) -> str:
 def merge(case: Case) -> str:
     """Merge it into a sound memory, which afterwards is as it was, or answers, and can be rid of it again."""
     target = case.target.opened()
-    choices: Any = {"shared": case.rng.choice(("once", "twice")), "descriptions": case.rng.choice(("same", "theirs"))}
+    descriptions: Any = case.rng.choice(("same", "theirs"))
     with heard():
         try:
-            target.merge(case.path, **choices)
+            target.merge(case.path, descriptions=descriptions)
         except OURS:
             if (target.digest(), target._ledger.store.last) != (case.target.digest, case.target.last):
                 case.target.drop().close()

@@ -70,9 +70,8 @@ class System(Rotting):
     def _merge_from(self, machine: Machine, rng: random.Random, path: Path, state: State, *, bad: bool = False) -> None:
         if (learner := self.opened(machine, rng)) is None:
             return
-        once, choice = rng.random() < 0.8, rng.choice(("same", "ours", "theirs", "theirs"))
-        of_sources = once and rng.random() < 0.4
-        operation = "merge", str(path), "once" if once else "twice", choice, of_sources
+        choice, of_sources = rng.choice(("same", "ours", "theirs", "theirs")), rng.random() < 0.3
+        operation = "merge", str(path), choice, of_sources
         if not bad:
             self.do(machine, rng, operation, {str(path): state})
             return
@@ -133,18 +132,15 @@ class System(Rotting):
         embedding = rng.choice(branches)[1].embedding
         branches = [branch for branch in branches if branch[1].embedding == embedding and not branch[1].unlisted]
         rng.shuffle(branches)
-        touches = sorted(pair for _, state in branches for pair in state.pairs)
-        once = rng.random() < 0.5
+        touches, left_out = {pair for _, state in branches for pair in state.pairs}, self.counts["all merged: left out"]
         while len(branches) > 1 or not branches[0][0].is_relative_to(self.trees):
             two = [branches.pop(rng.randrange(len(branches))) for _ in range(min(2, len(branches)))]
-            branches.append(self._branch(two, rng, embedding, once=once))
-        if not once and touches != list(branches[0][1].pairs):
+            branches.append(self._branch(two, rng, embedding))
+        if left_out == self.counts["all merged: left out"] and touches != set(branches[0][1].pairs):
             raise Wrong(f"all merged have {branches[0][1].pairs}, and each had {touches}")
-        self.counts[f"all merged, {'once' if once else 'twice'}"] += 1
+        self.counts["all merged"] += 1
 
-    def _branch(
-        self, parts: list[tuple[Path, State]], rng: random.Random, embedding: str, *, once: bool
-    ) -> tuple[Path, State]:
+    def _branch(self, parts: list[tuple[Path, State]], rng: random.Random, embedding: str) -> tuple[Path, State]:
         """Merge memories into a new one; it goes on as a folder, a compacted folder or a packed memory."""
         path, state = self.trees / f"{len(list(self.trees.iterdir()))}", State(embedding=embedding)
         with self.open(Machine("all", path), path, [state]) as learner:
@@ -158,10 +154,8 @@ class System(Rotting):
 
             for other, theirs in parts:
                 self.say(f"  {path.name} of all: {other.parent.name}/{other.name}")
-                shared, others = "once" if once else "twice", {str(other): theirs}
-                if do("merge", str(other), shared, "theirs", others=others) == "ObservationError":
-                    # It was compacted, and has what is there.
-                    do("merge", str(other), "twice", "theirs", others=others)
+                if do("merge", str(other), "theirs", others={str(other): theirs}) == "ObservationError":
+                    self.counts["all merged: left out"] += 1  # it was compacted, and has what is there
             if (drawn := rng.random()) < 0.3:
                 do("compact", rng.choice((0, 2)), others={})
             self.look(Machine("all", path, [state]), learner, "all merged")

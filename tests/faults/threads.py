@@ -282,7 +282,7 @@ class Worker:
         """Another memory's touches."""
         if not self.full:
             with self.together():
-                self.learner.merge(self.rng.choice(self.round.others), shared="once")
+                self.learner.merge(self.rng.choice(self.round.others))
 
     def compact(self) -> None:
         """Give up what is old."""

@@ -222,14 +222,14 @@ def test_another_robots_adaptation_stays_with_it(path: Path, tmp_path: Path) -> 
         with TactileLearner.open(tmp_path / f"{where}-merged") as learner:
             own = learner.adapt(five(broken))
             kept = correction(learner)
-            learner.merge(tmp_path / where, shared="once")
+            learner.merge(tmp_path / where)
             assert (learner.digest(), correction(learner)) == (digest, kept)
             assert all(learner.names_of(Stream(PAD, readings, raw=validate(readings, PAD))) for readings in read)
             learner.retract(own)
             assert correction(learner) is None
         assert check_memory(tmp_path / f"{where}-merged") == []
     with TactileLearner.open(tmp_path / "empty", sensor=PAD, **HOW) as learner:
-        learner.merge(tmp_path / "small.stm", shared="once")
+        learner.merge(tmp_path / "small.stm")
         assert (learner.digest(), correction(learner)) == (digest, None)
         with pytest.raises(errors.InputError, match="no numbers of the channels"):
             learner.adapt(five())

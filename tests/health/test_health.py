@@ -241,7 +241,7 @@ def test_another_robots_touches_are_a_stream_of_their_own(memory: Path, tmp_path
         learner.backup(tmp_path / "memory")
     with TactileLearner.open(tmp_path / "memory") as learner:
         learner.forget(source="b")
-        learner.merge(tmp_path / "other", shared="once")
+        learner.merge(tmp_path / "other")
         assert learner.health().since is not None  # not the sensor that learned
         assert learner.health(source="other").since is learner.health(source="a").since is None
 

@@ -119,19 +119,8 @@ class TestSameBytes:
             memory_of(tmp_path / f"{name}.memory", part, tmp_path / name, rows=False)
         done = run(tmp_path / "m", [tmp_path / name for name in "xyzw"])
         assert [each.source for each in done.refused] == [str(tmp_path / "z")]
-        assert "cannot be counted once" in done.refused[0].why
+        assert "cannot be left out" in done.refused[0].why
         require_learned(tmp_path / "m")
-
-    def test_a_touch_that_a_memory_has_twice_counts_once(self, tmp_path):
-        with TactileLearner.open(tmp_path / "twice", **SETTINGS) as learner:
-            for _ in range(2):
-                for material, touch in TOUCHES[:3]:
-                    learner.observe(material, stream(touch).astype(np.float32), again=True)
-            learner.pack(tmp_path / "packed")
-        for name in ("twice", "packed"):
-            done = run(tmp_path / f"m {name}", [tmp_path / name])
-            assert (done.observations, done.repeated) == (3, 3)
-            require_learned(tmp_path / f"m {name}", TOUCHES[:3])
 
 
 @pytest.fixture
@@ -300,7 +289,7 @@ class TestForgetting:
             robot.observe("a", stream((0, 60)), source="s3://day/1.npy")
             robot.pack(tmp_path / "p", rows=False)
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-            learner.merge(tmp_path / "p", shared="once")
+            learner.merge(tmp_path / "p")
             with pytest.raises(KeyError, match="were compacted"):
                 learner.forget(source="s3://day")
             for words in ({}, {"material": "a", "source": "x"}):

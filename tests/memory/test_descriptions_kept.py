@@ -61,13 +61,13 @@ def test_of_two_descriptions_one_has_to_be_chosen(path, tmp_path):
     theirs, _ = told(tmp_path / "other", OBSERVED[6:], other)
     with ours, theirs:
         with pytest.raises(MismatchError, match=r"such as 'a': here it is .* there \{'wool': 1.0\}"):
-            ours.merge(theirs, shared="once")
+            ours.merge(theirs)
         with pytest.raises(InputError, match="'same', 'ours' or 'theirs'"):
-            ours.merge(theirs, shared="once", descriptions="both")
+            ours.merge(theirs, descriptions="both")
         require_same(ours, OBSERVED[:6], SAID)
-        ours.merge(theirs, shared="once", descriptions="ours")
+        ours.merge(theirs, descriptions="ours")
         require_same(ours, OBSERVED, SAID)
-        assert ours.merge(theirs, shared="once", descriptions="theirs").described == 1
+        assert ours.merge(theirs, descriptions="theirs").described == 1
         require_same(ours, OBSERVED, other)
 
 
@@ -105,6 +105,6 @@ def test_a_property_has_a_value_and_one_unit_for_all_materials(path, tmp_path):
             learner.compose(stream((7, 25)))  # a property is no constituent
         other, _ = told(tmp_path / "other", [], {"b": {"hardness": (3.5, "MPa")}})
         with other, pytest.raises(MismatchError, match=r"expected it in Shore A, as of 'a'; came 3\.5 MPa"):
-            learner.merge(other, shared="once")
+            learner.merge(other)
         learner.describe("a", {"hardness": (6.2, "MPa")})  # the only one may change its unit
         assert learner.descriptions == {"a": {"hardness": [6.2, "MPa"]}}

@@ -1,11 +1,13 @@
-"""A memory of format 1 opens in every later version: as a test this reads the golden one, as a script it makes it.
+"""A memory of format 2 opens in every later version: as a test this reads the golden one, as a script it makes it.
 
-`python tests/memory/test_golden.py` makes `tests/data/format-1.zip`, a memory that has all kinds of rows and
-checkpoints, and `tests/data/format-1.json`, what is in it. A release from 1.0 on never makes it again.
+`python tests/memory/test_golden.py` makes `tests/data/format-2.zip`, a memory that has all kinds of rows and
+checkpoints, and `tests/data/format-2.json`, what is in it. A release from 1.0 on never makes it again. Of
+`tests/data/format-1.zip`, which 0.15 made, the file is left that says so.
 """
 
 import hashlib
 import json
+import re
 import shutil
 import tempfile
 import zipfile
@@ -14,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scroll_tactile_store.layout
-from scroll_tactile_store import Store, VersionError, check_store
+from commands import refused
+from scroll_tactile_store import Store, VersionError, check_store, repair_store
 from scroll_tactile_store.layout import read_current, write_current
 
 from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
@@ -23,7 +26,7 @@ from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.validation.gate import check_memory
 
-GOLDEN = Path(__file__).parents[1] / "data" / "format-1.zip"
+GOLDEN = Path(__file__).parents[1] / "data" / "format-2.zip"
 EXPECTED = GOLDEN.with_suffix(".json")
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 FORCE = Quantity(name="force", unit="N", low=0, high=4, resolution=0.125)
@@ -74,7 +77,7 @@ def write(target):
         learner.observe("short", stream(1, 8))
         learner.forget("short")
         learner.compact(keep=3)
-        learner.merge(other_path, shared="once")
+        learner.merge(other_path)
         learner.fine_tune(epochs=1)
         learner.observe("cork", stream(20, 40), **noted(20))
         learner.describe("cork", {"soft": False, "natural": None})
@@ -199,14 +202,52 @@ def test_it_is_what_this_version_writes(golden, tmp_path):
 
 
 def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
-    monkeypatch.setattr(scroll_tactile_store.layout, "FORMAT_VERSION", 2)
-    write_current(golden, read_current(golden / "CURRENT"))
+    current = read_current(golden / "CURRENT")
+    monkeypatch.setattr(scroll_tactile_store.layout, "FORMAT_VERSION", 3)
+    write_current(golden, current)
     monkeypatch.undo()
     before = {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()}
     for mode in ("write", "read"):
-        with pytest.raises(VersionError, match="is written in format 2; this release reads format 1: upgrade it"):
+        with pytest.raises(VersionError, match="is written in format 3; this release reads format 2: upgrade it"):
             opened(golden, mode)
     assert {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()} == before
+
+
+@pytest.fixture(params=["0.15", "0.7"])
+def old(request, tmp_path):
+    """What two releases left, and what is said of it."""
+    path = tmp_path / "m"
+    if request.param == "0.15":
+        shutil.unpack_archive(GOLDEN.with_name("format-1.zip"), path)
+        return path, r"in format 1, by scroll-tactile 0\.15 or before; this one reads format 2: learn it again from the"
+    (path / "generations" / "00000001").mkdir(parents=True)
+    (path / "journal.sqlite").write_bytes(b"SQLite format 3\0" + bytes(4080))
+    return path, "was made by a release 0.x, whose memories this one does not read: learn it again from the"
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        TactileLearner.open,
+        opened,
+        lambda path: opened(path, "read"),
+        lambda path: opened(path.parent / "ours").merge(path),
+        check_store,
+        check_memory,
+        repair_store,
+    ],
+    ids=["open", "write", "read", "merge", "check", "check_memory", "repair"],
+)
+def test_a_memory_of_an_older_release_is_refused_by_name_and_left_as_it_is(old, use):
+    path, said = old
+    before = {file: file.is_file() and file.read_bytes() for file in path.rglob("*")}
+    with pytest.raises(VersionError, match=said):
+        use(path)
+    np.save(path.with_name("t.npy"), stream(1))
+    for words in (("memory", "backup", path, path.with_name("copy")), ("predict", path, path.with_name("t.npy"))):
+        assert re.search(said, refused(*words))
+    assert not path.with_name("copy").exists()
+    assert {file: file.is_file() and file.read_bytes() for file in path.rglob("*")} == before
 
 
 def test_a_row_of_an_unknown_kind_is_refused_with_what_to_do(golden):

@@ -154,10 +154,10 @@ def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):
     prepare(tmp_path / "old", Kernels(dimension=64), lambda identity: identity["embedding"].update(configuration=None))
     filled(tmp_path / "old", embedding=Kernels(dimension=64)).close()
     with TactileLearner.open(tmp_path / "new") as learner:
-        assert learner.merge(tmp_path / "old", shared="twice").observations == 6
+        assert learner.merge(tmp_path / "old").shared == 6
     filled(tmp_path / "other", embedding=Kernels(dimension=128)).close()
     with TactileLearner.open(tmp_path / "new") as learner, pytest.raises(MismatchError, match="embeddings differ"):
-        learner.merge(tmp_path / "other", shared="twice")
+        learner.merge(tmp_path / "other")
 
 
 def prepare(path, embedding, change):

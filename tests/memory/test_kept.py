@@ -11,7 +11,7 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, levels_of
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.kept_touches import KeptTouches
+from scroll_tactile.memory.state import KeptTouches
 from scroll_tactile.recipe import default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
 
@@ -75,7 +75,7 @@ def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_p
     ours, _ = filled(tmp_path / "m", kept_touches=FEW)
     other, _ = filled(tmp_path / "other", SPARE, kept_touches=theirs)
     with ours:
-        ours.merge(other, shared="once")
+        ours.merge(other)
         require_same(ours, [*OBSERVED, *SPARE], kept_touches=FEW)
         ours.forget("d")
         other.compact()
@@ -83,7 +83,7 @@ def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_p
         other.close()
         before = held(ours)
         with pytest.raises(MismatchError, match=rf"compacted and keeps {many} touches.*keeps {FEW}"):
-            ours.merge(tmp_path / "other", shared="once")
+            ours.merge(tmp_path / "other")
         assert held(ours) == before
 
 

@@ -1,19 +1,23 @@
-"""One content is one touch, whatever way it comes in; one that is to count again is held out with all its copies."""
+"""One content of one material is one touch, whatever way it comes in, and whoever brings it is told."""
 
 import copy
-import itertools
 import pickle
 
+import numpy as np
 import pytest
+from commands import run
 from forging import spoil_row
-from scroll_tactile_store import StoreClosedError, StoreError, StoreFullError
+from scroll_tactile_store import Store, StoreClosedError, StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
-from touches import fed, filled, held, stream
+from touches import SETTINGS, fed, filled, held, stream
 
-from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.persistence.contents import ListedContents
-from scroll_tactile.simulation.scene import Scene
-from scroll_tactile.statistics.annotations import NO_ANNOTATION
+from scroll_tactile import TactileLearner
+from scroll_tactile.clients.learning.classification import observe_all
+from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.learning.learning import learn_sources
+from scroll_tactile.clients.learning.sources import SourceOptions
+from scroll_tactile.errors import AnnotationError
+from scroll_tactile.quantities import Quantity
 
 OBSERVED = [("abc"[i % 3], (i, 60)) for i in range(12)]  # a content each
 
@@ -53,8 +57,11 @@ class TestOneContent:
             for call in ((other.names_of,), (other.observe, "a")):
                 with pytest.raises(StoreClosedError, match="snapshot of a memory that was closed"):
                     call[0](*call[1:], stream((0, 60)))
-            other.observe("a", stream((50, 60)), again=True)
-            assert other.digest() == fed([*OBSERVED, ("a", (50, 60))]).digest()
+            assert other.digest() == learner.digest()
+        with TactileLearner.open(tmp_path / "m") as again:  # as the error says
+            assert again.observe(*given(OBSERVED[0])).repeated
+            other = copy.deepcopy(again)
+        assert other.observe(*given(OBSERVED[0])).repeated
 
     def test_a_repeated_receipt_equals_the_first(self, learner):
         readings = stream((90, 60))  # some are outside the range
@@ -64,7 +71,6 @@ class TestOneContent:
             again = learner.observe("a", same)
             assert again.repeated and again == first and hash(again) == hash(first)
         assert (first.clipped > 0, again.clipped) == (True, 0)
-        assert learner.observe("a", readings, again=True) != first
 
 
 class TestChanges:
@@ -102,56 +108,164 @@ class TestChanges:
             assert learner.observe(*given(OBSERVED[4])).repeated
 
 
-class TestCopies:
-    """Copies that were meant are held out together, and are a function of what was observed."""
+class TestRelabel:
+    """A touch that gets the name of one with its very readings is that one."""
 
-    def test_one_in_memory_that_is_cut_short_leaves_no_trace(self, monkeypatch):
-        learner = many(OBSERVED)
-        before = _sample(learner)
+    @pytest.mark.parametrize("merged", [False, True])
+    def test_the_row_that_is_there_stays(self, tmp_path, merged):
+        (learner, receipts), twin = filled(tmp_path / "m", OBSERVED[1:]), ("b", OBSERVED[0][1])
+        with learner:
+            if merged:
+                filled(tmp_path / "o", [OBSERVED[0]])[0].close()
+                learner.merge(tmp_path / "o")
+            else:
+                learner.observe(*given(OBSERVED[0]))
+            there, last = learner.observations()[-1].sequence, learner._ledger.store.last
+            other = learner.observe(*given(twin))
+            assert learner.relabel(other, "a") == there and learner._ledger.store.last == last + 2
+            assert held(learner) == held(fed(OBSERVED))
+            assert learner.names_of(stream(twin[1])) == ["a"]
+            learner.retract(there)
+            assert held(learner) == held(fed(OBSERVED[1:]))
+            assert learner.relabel(receipts[0], "c") == learner._ledger.store.last  # and without one it is a new row
+
+    def test_with_other_values_or_labels_it_is_refused_and_nothing_changed(self, tmp_path):
+        learner, _ = filled(tmp_path / "m", [])
+        with learner:
+            learner.declare(FORCE)
+            learner.observe("a", stream((0, 60)), values={"force": 1})
+            bare = learner.observe("b", stream((0, 60)))
+            other = learner.observe("c", stream((0, 60)), values={"force": 2})
+            before = held(learner), learner._ledger.store.last
+            with pytest.raises(AnnotationError, match=r"observation 2 has this touch of 'a' .*'force': 1.* Retract it"):
+                learner.relabel(other, "a")
+            assert (held(learner), learner._ledger.store.last) == before
+            assert learner.relabel(bare, "a") == 2 and learner.materials == {"a": 1, "c": 1}
+
+
+FORCE = Quantity(name="force", unit="N", low=0, high=4, resolution=0.5)
+
+
+def _python(home):
+    with TactileLearner.open(home / "m", **SETTINGS) as learner:
+        receipts = [learner.observe("felt", touch()) for _ in range(2)]
+    assert [receipt.repeated for receipt in receipts] == [False, True]
+
+
+def _batch(home):
+    with TactileLearner.open(home / "m", **SETTINGS) as learner, learner.batch():
+        assert [learner.observe("felt", touch()).repeated for _ in range(2)] == [False, True]
+
+
+def _a_pass(home):
+    with TactileLearner.open(home / "m", **SETTINGS) as learner:
+        assert observe_all(learner, [("felt", learner.stream(touch()))] * 2) == 2
+        assert observe_all(learner, [("felt", learner.stream(touch()))] * 2) == 1  # it looks once more, at one
+
+
+def _observe_command(home):
+    for said in ("kept as observation 1", "learned already, as observation 1"):
+        assert said in run("observe", home / "m", "felt", home / "felt" / "0.npy").output
+
+
+def _learn_command(home):
+    assert "1 touch that it had already" in run("learn", home / "m", home / "felt", "--label-by", "folder").output
+
+
+def _learn(home):
+    with TactileLearner.open(home / "m", **SETTINGS) as learner:
+        done = learn_sources(learner, [str(path) for path in sorted((home / "felt").iterdir())], BY_FOLDER)
+    assert (done.learned["felt"], done.skipped, done.refused) == (1, 1, [])
+
+
+def _fleet(home):
+    done = learn(home / "m", [home / "felt"], BY_FOLDER, workers=2, **SETTINGS)
+    assert (done.observations, done.repeated, done.refused) == (1, 1, [])
+
+
+def _fleet_of_memories(home):
+    for name in "op":
+        with TactileLearner.open(home / name, **SETTINGS) as other:
+            other.observe("felt", touch())
+    done = learn(home / "m", [home / "o", home / "p"], BY_FOLDER, workers=1, **SETTINGS)
+    assert (done.observations, done.repeated, done.refused) == (1, 1, [])
+
+
+def _merge(home):
+    for name in "mo":
+        with TactileLearner.open(home / name, **SETTINGS) as learner:
+            learner.observe("felt", touch())
+            if name == "m":
+                learner.pack(home / "packed")
+    with TactileLearner.open(home / "m") as learner:
+        for other in ("o", "packed"):
+            assert (merged := learner.merge(home / other)).observations == 0 and merged.shared == 1
+
+
+def _merge_of_a_forged_memory(home):
+    """Another program wrote a row of it a second time."""
+    filled(home / "o", [])[0].close()
+    with TactileLearner.open(home / "o") as other:
+        other.observe("felt", touch())
+    with Store.open(home / "o") as store:
+        row = store.record(1)
+        store.append(row.kind, row.label, row.key, attributes=row.attributes, arrays=row.arrays)
+    with TactileLearner.open(home / "m", **SETTINGS) as learner:
+        merged = learner.merge(home / "o")
+    assert (merged.observations, merged.shared) == (1, 1)
+
+
+BY_FOLDER = SourceOptions(by="folder")
+
+
+@pytest.mark.parametrize(
+    "learned",
+    [
+        _python,
+        _batch,
+        _a_pass,
+        _observe_command,
+        _learn_command,
+        _learn,
+        _fleet,
+        _fleet_of_memories,
+        _merge,
+        _merge_of_a_forged_memory,
+    ],
+    ids=lambda way: way.__name__.strip("_"),
+)
+def test_a_touch_that_comes_twice_is_one_and_it_is_said(tmp_path, learned):
+    (tmp_path / "felt").mkdir()
+    for name in ("0.npy", "1.npy"):
+        np.save(tmp_path / "felt" / name, touch())
+    if "command" in learned.__name__:
+        TactileLearner.open(tmp_path / "m", **SETTINGS).close()
+    learned(tmp_path)
+    with TactileLearner.open(tmp_path / "m") as learner:
+        assert learner.materials == {"felt": 1}
+        assert held(learner) == held(fed([("felt", (7, 60))]))
+
+
+def touch():
+    return stream((7, 60)).astype(np.float32)
+
+
+class TestInMemory:
+    def test_one_that_is_cut_short_leaves_no_trace(self, monkeypatch):
+        learner = fed(OBSERVED)
+        before = held(learner)
 
         def cut(*_):
             raise KeyboardInterrupt
 
         monkeypatch.setattr(learner._ledger, "_changed", cut)
         with pytest.raises(KeyboardInterrupt):
-            learner.observe(*given(OBSERVED[0]), again=True)
-        with pytest.raises(KeyboardInterrupt):
             learner.observe("a", stream((90, 60)))
         monkeypatch.undo()
-        assert _sample(learner) == before
+        assert held(learner) == before
         assert not learner.observe("a", stream((90, 60))).repeated
-
-
-def test_three_times_everything_is_calibrated_as_once():
-    pad = Sensor(name="pad", channels=6, rate=100.0, duration=1.0, low=0.0, high=1.0, unit="V")
-    scene, answers = Scene(sensor=pad), []
-    names = scene.materials[:4]
-    for times in (1, 3):
-        learner = TactileLearner(sensor=pad, embedding=Kernels(seed=0, dimension=128))
-        for _, name, i in itertools.product(range(times), names, range(6)):
-            learner.observe(name, scene.touch(name, i), again=True)
-        answers.append(
-            sum(learner.predict(scene.touch(name, 40 + i)).known is True for name in names for i in range(3))
-        )
-    assert min(answers) >= 11  # of twelve
-
-
-def many(touches, **settings):
-    """A memory without a path that observed these touches, each as often as it comes."""
-    return fed(touches, again=True, **settings)
-
-
-def test_a_row_that_is_not_there_is_no_error():
-    held = ListedContents([("a", b"1", 1, NO_ANNOTATION)])
-    held.remove("a", b"1", 2)
-    held.remove("b", b"2", 1)
-    assert held.names(b"1") == ["a"] and [*held.rows("a", b"1")] == [1] and not held.rows("a", b"3")
 
 
 def given(pair):
     name, touch = pair
     return name, stream(touch)
-
-
-def _sample(learner):
-    return [(name, key, t.rows.tobytes(), t.pairs.tobytes(), t.copies) for name, key, t in learner.memory.sample]

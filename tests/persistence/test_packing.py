@@ -47,7 +47,7 @@ class TestMerging:
             robot.pack(tmp_path / "p", source="robot 7")
             before = [(row.material, row.time) for row in robot.observations()][:2]
         with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
-            assert learner.merge(tmp_path / "p", shared="once").described == 1
+            assert learner.merge(tmp_path / "p").described == 1
             rows = learner.observations()
             assert [(row.material, row.time) for row in rows] == before
             assert [row.source for row in rows] == ["félt.npy[0:60]", "robot 7"]
@@ -63,11 +63,11 @@ class TestMerging:
         shown = [stream(touch).astype(np.float32).tobytes()[:64] for _, touch in OBSERVED]
         assert not any(part in file.read_bytes() for part in shown)
         with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": 0, "kept_touches": 0}) as learner:
-            learner.merge(file, shared="once")
+            learner.merge(file)
             require_same(learner, OBSERVED, exemplars=False, kept_touches=0)
         with TactileLearner.open(tmp_path / "other", **SETTINGS) as learner:
             with pytest.raises(MismatchError, match="keeps exemplars"):
-                learner.merge(file, shared="once")
+                learner.merge(file)
             assert learner.materials == {}
 
 
@@ -121,7 +121,7 @@ REFUSED = DamageError, NotAStoreError, MismatchError, VersionError
 def require_refused(learner, file, match=None):
     """Merging and opening a file are refused by its name, within seconds, and change nothing."""
     before, begun = learner.digest(), time.monotonic()
-    for use in (lambda: learner.merge(file, shared="once"), lambda: TactileLearner.open(file, mode="read").close()):
+    for use in (lambda: learner.merge(file), lambda: TactileLearner.open(file, mode="read").close()):
         with pytest.raises(REFUSED, match=match) as raised:
             use()
         assert str(file) in str(raised.value)
@@ -153,7 +153,7 @@ class TestDamage:
             file.write_bytes(bytes(flipped))
             try:
                 with TactileLearner.open(tmp_path / f"m{place}", **SETTINGS) as learner:
-                    learner.merge(file, shared="once")
+                    learner.merge(file)
                     assert learner.digest() == digest, place
                     assert place not in within, place
             except REFUSED as error:
@@ -172,7 +172,7 @@ class TestDamage:
         monkeypatch.setattr("scroll_tactile_store.layout.FORMAT_VERSION", 9)
         file = packed(tmp_path, OBSERVED[:2])
         monkeypatch.undo()
-        require_refused(other, file, "format 9; this release reads format 1: upgrade it")
+        require_refused(other, file, "format 9; this release reads format 2: upgrade it")
 
     def test_sums_of_other_touches_than_its_rows(self, tmp_path, other):
         """Rows of one memory, the checkpoint of another, and right checksums."""
@@ -185,7 +185,7 @@ class TestDamage:
         archive.write_archive(tmp_path / "one.memory", tmp_path / "forged")
         before = other.digest()
         with pytest.raises(DamageError, match=r"forged counts other touches than it names|forged counts \d touches of"):
-            other.merge(tmp_path / "forged", shared="once")
+            other.merge(tmp_path / "forged")
         assert other.digest() == before
 
     def test_a_full_disk_leaves_nothing_behind(self, tmp_path, monkeypatch):

@@ -199,7 +199,7 @@ class TestRefused:
         theirs, _ = filled(tmp_path / "other", OBSERVED[4:])
         with ours, theirs:
             theirs.compact()
-            ours.merge(theirs, shared="once")
+            ours.merge(theirs)
             with pytest.raises(MismatchError, match=r"row 5 brought in a compacted memory"):
                 ours.reembed()
 

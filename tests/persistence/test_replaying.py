@@ -59,7 +59,7 @@ def test_replayed_retracted_merged_and_compacted_it_is_what_observing_gives(made
         learner.retract(receipts[5])
         with TactileLearner.open(tmp_path / "other", **made) as other:
             observe(other, OBSERVED[6:])
-        learner.merge(tmp_path / "other", shared="once")
+        learner.merge(tmp_path / "other")
         assert held(learner) == fresh(made, without(2, 5))
         learner.compact(keep=5)
         assert held(learner) == fresh(made, without(2, 5))

@@ -136,7 +136,7 @@ class TestBatch:
                     with pytest.raises(InputError, match="end it first"):
                         call()
                 with pytest.raises(InputError, match="end the batch"):
-                    learner.merge(path, shared="once")
+                    learner.merge(path)
                 with learner.batch():  # a batch in a batch is the same batch
                     learner.observe("a", stream((9, 60)))
             require_same(learner, [*OBSERVED, ("a", (9, 60))])
@@ -159,7 +159,7 @@ class TestMerge:
         theirs, _ = filled(tmp_path / "other", OBSERVED[:3], **settings)
         with ours, theirs:
             with pytest.raises(MismatchError, match=said) as caught:
-                ours.merge(theirs, shared="twice")
+                ours.merge(theirs)
             assert str(path) in str(caught.value)
             assert str(tmp_path / "other") in str(caught.value)
             require_same(ours, OBSERVED)
@@ -167,28 +167,26 @@ class TestMerge:
     def test_without_readings_its_exemplars_cannot_be_had(self, path, tmp_path):
         own = OwnKernels(seed=0, dimension=64)
         ours, _ = filled(path, embedding=own)
-        theirs, _ = filled(tmp_path / "other", OBSERVED[:3], embedding=own, exemplars=0)
+        theirs, _ = filled(tmp_path / "other", [("d", (9, 60))], embedding=own, exemplars=0)
         with ours, theirs:
             with pytest.raises(MismatchError, match="kept no readings"):
-                ours.merge(theirs, shared="twice")
-            theirs.merge(ours, shared="once")  # the other way round nothing is missing
-            assert theirs.digest() == fed(OBSERVED, embedding=own).digest()
+                ours.merge(theirs)
+            theirs.merge(ours)  # the other way round nothing is missing
+            assert theirs.digest() == fed([*OBSERVED, ("d", (9, 60))], embedding=own).digest()
             theirs.compact()
             with pytest.raises(MismatchError, match="was compacted and keeps exemplars"):
-                ours.merge(theirs, shared="twice")
+                ours.merge(theirs)
             require_same(ours, OBSERVED, embedding=own)
 
     def test_itself_nothing_and_one_without_a_path_are_refused(self, path, tmp_path):
         ours, _ = filled(path)
         with ours:
             with pytest.raises(MismatchError, match="into itself"):
-                ours.merge(path, shared="twice")
+                ours.merge(path)
             with pytest.raises(StoreError, match="holds no store"):
-                ours.merge(tmp_path / "none", shared="twice")
+                ours.merge(tmp_path / "none")
             with pytest.raises(InputError, match="without a path"):
-                ours.merge(fed(OBSERVED), shared="twice")
-            with pytest.raises(InputError, match="'once' or 'twice'"):
-                ours.merge(path, shared="thrice")
+                ours.merge(fed(OBSERVED))
             require_same(ours, OBSERVED)
 
     def test_cut_off_in_the_middle_it_never_began(self, path, tmp_path):
@@ -201,10 +199,10 @@ class TestMerge:
 
         with ours, theirs:
             with pytest.raises(KeyboardInterrupt):
-                ours.merge(theirs, shared="once", progress=stop)
+                ours.merge(theirs, progress=stop)
             require_same(ours, OBSERVED[:4])
             steps = []
-            ours.merge(theirs, shared="once", progress=lambda *step: steps.append(step))
+            ours.merge(theirs, progress=lambda *step: steps.append(step))
             assert steps[-1] == ("merging", 8, 8)
             require_same(ours, OBSERVED)
 
@@ -214,7 +212,7 @@ class TestMerge:
         theirs.close()
         ours, steps = TactileLearner.open(path, **SETTINGS), []
         with ours:
-            ours.merge(tmp_path / "other", shared="once", progress=lambda *step: steps.append(step))
+            ours.merge(tmp_path / "other", progress=lambda *step: steps.append(step))
         assert steps[-1][1] == steps[-1][2] == len(OBSERVED) + 1  # what it was compacted to, and a row for each stream
 
 

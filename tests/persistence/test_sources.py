@@ -28,11 +28,11 @@ class TestSource:
             learner.reembed()
             assert sources(learner) == expected
             with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
-                other.merge(learner, shared="once")
+                other.merge(learner)
                 assert sources(other) == expected
             learner.compact()
             with TactileLearner.open(tmp_path / "third", **SETTINGS) as third:
-                third.merge(learner, shared="once")
+                third.merge(learner)
                 kept = [(material, state, source) for _, material, state, source in sources(third)]
                 assert kept == [("a", "compacted", expected[0][3]), ("b", "compacted", None)]
 
@@ -68,11 +68,11 @@ class TestRelabel:
             for i, (material, touch) in enumerate(OBSERVED):
                 learner.observe(material, stream(touch), source=f"{i}.npy")
             learner.predict(stream((7, 25)))
-            learner.relabel(2, "a")
+            learner.relabel(2, "d")
             assert sources(learner)[1] == (2, "b", "retracted", "1.npy")
-            assert sources(learner)[-1] == (14, "a", "kept", "1.npy")
-            assert dict(learner.predict(stream((7, 25))).ranking).keys() == {"a", "b", "c"}
-            require_same(learner, [*without(1), ("a", OBSERVED[1][1])])
+            assert sources(learner)[-1] == (14, "d", "kept", "1.npy")
+            assert dict(learner.predict(stream((7, 25))).ranking).keys() == {"a", "b", "c", "d"}
+            require_same(learner, [*without(1), ("d", OBSERVED[1][1])])
 
     def test_what_cannot_be_relabelled_is_refused_and_nothing_changed(self, path):
         learner, _ = filled(path)
@@ -108,7 +108,7 @@ class TestRelabel:
             before = held(learner)
             monkeypatch.setattr(Store, "append", full)
             with pytest.raises(StoreFullError):
-                learner.relabel(2, "a")
+                learner.relabel(2, "d")
             monkeypatch.undo()
             assert held(learner) == before
             require_same(learner, OBSERVED)

@@ -66,7 +66,7 @@ def test_whatever_was_done_it_is_settled_to_the_same_bits(tmp_path, oracle, how)
         if how == "merged":
             with TactileLearner.open(tmp_path / "o", **SETTINGS) as other:
                 felt(other, 9)
-                learner.merge(other, shared="once")
+                learner.merge(other)
         if how == "retracted":
             receipts = [
                 learner.observe(name, stream((40, 60)), labels=labels)
@@ -107,8 +107,8 @@ def test_a_touch_without_a_label_that_moves_the_samples_is_settled_too(monkeypat
 def test_a_touch_with_one_label_and_then_another_counts_once_for_each():
     ours, theirs = TactileLearner(**SETTINGS), by_labels()
     felt(ours)
-    for label in "ns":
-        ours.observe("a", stream((30, 60)), labels={"slip": label}, again=True)
+    for name, label in zip("ad", "ns", strict=True):
+        ours.observe(name, stream((30, 60)), labels={"slip": label})
         theirs.observe(label, stream((30, 60)))
     for learner in (ours, theirs):
         learner.settle()

@@ -16,7 +16,7 @@ from scroll_tactile_store.layout import read_current
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError
 from scroll_tactile.memory.identity import FingerprintCheck
-from scroll_tactile.persistence.axis_ledger import axis_name
+from scroll_tactile.persistence.ledger import axis_name
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.stored import MAPPED, NAME
 from scroll_tactile.statistics.sample import TouchSample

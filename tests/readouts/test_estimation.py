@@ -9,7 +9,7 @@ from scroll_tactile import Kernels, Scene, Sensor
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.readouts.estimation import Estimator, value_of
+from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.signals.windows import SHAPE
 from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.statistics.sample import SampledTouch
@@ -39,7 +39,7 @@ def valued(name, repetition, seconds=2.0, quantity=FORCE, value=None):
 def with_value(sampled, quantity, value):
     name, key, touch = sampled
     annotation = Annotation(((quantity.name, quantity.integer(value)),))
-    return name, key, dataclasses.replace(touch, annotations=((annotation, 1),))
+    return name, key, dataclasses.replace(touch, annotation=annotation)
 
 
 LEARNED = [valued(name, repetition) for name in NAMES[:3] for repetition in range(20)]
@@ -145,10 +145,3 @@ def test_heads_last_as_long_as_their_touches(estimator):
     assert Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 100, estimator) is estimator
     fewer = Estimator.of(PLAN, LEARNED[1:], {"force": FORCE}, 100, estimator)
     assert fewer.heads(0)["force"].known.weights.tobytes() != estimator.heads(0)["force"].known.weights.tobytes()
-
-
-def test_a_touch_that_was_observed_twice_has_the_mean_of_its_values():
-    one, other = Annotation((("force", 1000),)), Annotation((("force", 2500),), (("slip", "north"),))
-    assert value_of(((one, 2), (other, 1)), FORCE) == 1.5
-    assert value_of(((Annotation((), (("slip", "north"),)), 1),), FORCE) is None
-    assert value_of(((Annotation((("force", 0),)), 1),), FORCE) == 0.0

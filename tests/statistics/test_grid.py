@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from scroll_tactile.statistics.grid import BITS, to_codes
-from scroll_tactile.statistics.tables import rows_of, table_of
+from scroll_tactile.statistics.grid import BITS, rows_of, table_of, to_codes
 
 
 @given(st.lists(st.floats(-1, 1), min_size=1), st.sampled_from([1.0, 2.0, 0.5, 3.0, 100.0]))

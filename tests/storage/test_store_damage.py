@@ -107,7 +107,7 @@ SPOIL = {
     ),
     "no group": (lambda folder: (folder / "zarr.json").unlink(), "zarr.json cannot be read"),
     "the group's format": (
-        lambda folder: rewrite(folder / "zarr.json", lambda data: data.replace(b'"format": 1', b'"format": 9')),
+        lambda folder: rewrite(folder / "zarr.json", lambda data: data.replace(b'"format": 2', b'"format": 9')),
         "its sha256 differs",
     ),
     "the group's last row": (

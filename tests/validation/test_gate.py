@@ -80,7 +80,7 @@ def require_refused(path, match, expected=DamageError, others=None, modes=("read
         target_path, before = others
         with opened(target_path) as target:
             with pytest.raises(expected, match=match) as error:
-                target.merge(path, shared="twice")
+                target.merge(path)
             assert str(path) in str(error.value)
             assert held(target) == before
     assert any(found for found in check_memory(path))
@@ -253,7 +253,6 @@ ABOUT = {
     "scales": [[], [15], [15, 15], "x", [-1], [15, 37, 2**20], [15.0, 37, 2**20, 2**20 + 1]],
     "materials": [["a", "a", "b"], ["a", "b", "\n"], ["a", "b", 3], "abc", None],
     "sample": [[], ["a"], ["z"] * 12, None],
-    "copies": [None, [1], [0] * 12, [True] * 12],
     "kept": [[], ["z"] * 12, None],
     "exemplars": [None, [], {}, {"materials": ["z"] * 12}],
     "descriptions": [None, [], {"a": None}, {"a": {"wool": "x"}}, {"": {"wool": 1.0}}],
@@ -274,7 +273,7 @@ AXIS = {
         lambda a: a * [1, 2, 1],
     ],
 }
-NOTED = [[{"values": {"force": 50}, "labels": {"slip": "north"}}, 1]]
+NOTED = {"values": {"force": 50}, "labels": {"slip": "north"}}
 TOLD = {
     "quantities": [None, [], {"force": 3}, {"speed": QUANTITY}, {"force": QUANTITY | {"low": 0}}],
     "targets": [None, [], {}, {"touches": 1}],
@@ -297,10 +296,10 @@ TOLD = {
         {},
         [3] * 14,
         [NOTED] * 14,
-        [[[{}, 1]]] * 14,
-        [[[{"labels": {"slip": "x"}}, 1]]] * 14,
+        [[NOTED, 1]] * 14,
+        [{"labels": {"slip": "x"}}] * 14,
     ],
-    "kept-annotations": [None, [[[{"values": {"force": 101}}, 1]]] * 14, [[[NOTED[0][0], 0]]] * 14, [NOTED * 20] * 14],
+    "kept-annotations": [None, [{"values": {"force": 101}}] * 14, [{"values": {}}] * 14],
 }
 IN_GENERATIONS = (
     "axis|quantity|observations|lengths|rows|sums|second|values|places|sample|kept|exemplar|retracted|excluded"
@@ -407,7 +406,7 @@ def test_what_is_left_out_as_shared_must_be_there(path, tmp_path, where):
     with opened(ours) as learner:
         before = learner.digest(), len(learner.observations())
         with pytest.raises(DamageError, match=f"row 1 of {path} .* content hash"):
-            learner.merge(theirs, shared="once")
+            learner.merge(theirs)
         assert (learner.digest(), len(learner.observations())) == before
 
 
@@ -455,7 +454,7 @@ def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
     with opened(others) as target:
         before = held(target)
         with pytest.raises(DamageError, match="second-15"):
-            target.merge(path, shared="twice")
+            target.merge(path)
         assert held(target) == before
     assert any("second-15" in found for found in check_memory(path))
     with opened(path) as learner, pytest.raises(ScrollTactileError, match="no readout"):
@@ -474,13 +473,13 @@ def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):
     put_checkpoint(path, attributes, arrays, compaction=True)
     assert any("its journal names 4" in found for found in check_memory(path))
     with opened(copied(made / "other", tmp_path / "other")) as target, pytest.raises(DamageError, match="names 4"):
-        target.merge(path, shared="twice")
+        target.merge(path)
 
 
 def test_what_a_compaction_checkpoint_brings_is_looked_at_again_when_it_is_read(made, tmp_path):
     others = copied(made / "other", tmp_path / "other")
     with opened(others) as target:
-        target.merge(made / "compacted", shared="twice")
+        target.merge(made / "compacted")
     assert check_memory(others) == []
     with opened(others, mode="read") as learner:
         assert learner.materials == {"a": 4, "b": 4, "c": 4, "d": 2, "e": 1}

@@ -7,7 +7,7 @@ scikit-learn's ridge on the same features with the intervals of MAPIE (CV+) and 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -115,9 +115,7 @@ class Quantities:
             parts = {name: extractor.image(stream)[:, :most] for name, most in MOMENTS.items()}
             means = {name: extractor.means(image, plan.scales) for name, image in parts.items()}
             values = ((of, QUANTITIES[of].integer(own[place])) for of, own in sorted(self._targets.items()))
-            touch = replace(
-                SampledTouch.of(plan.scored_stages(steps), codes), annotations=((Annotation(tuple(values)), 1),)
-            )
+            touch = SampledTouch.of(plan.scored_stages(steps), codes, Annotation(tuple(values)))
             return EncodedSlide(material, stream.key, touch, {name: i.shape[1] for name, i in parts.items()}, means)
 
         recordings = self.slides.recordings

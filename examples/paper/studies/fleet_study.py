@@ -155,7 +155,7 @@ class Fleet:
                     progress("robots", done, len(dealt))
                     with self._open(folder / "robot") as robot:
                         learn(robot, [self._train[i] for i in own])
-                    joint.merge(folder / "robot", shared="once")
+                    joint.merge(folder / "robot")
                     shutil.rmtree(folder / "robot")
                 return joint.digest(), self._answers(joint)
 

@@ -75,9 +75,6 @@ def observe(
     axis: Annotated[
         list[str] | None, typer.Option(help="What else it is, as axis=label, such as slip=north; several times.")
     ] = None,
-    again: Annotated[
-        bool, typer.Option("--again", help="Learn it also where the memory has this very touch already.")
-    ] = False,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
     from scroll_tactile.learner import TactileLearner
@@ -97,7 +94,7 @@ def observe(
         source = printable(str(file))[-LONGEST_SOURCE:]
         stream = learner.stream(recording.stream(learner.sensor))
         others = [name for name in learner.names_of(stream) if name != material]
-        receipt = learner.observe(material, stream, values=values, labels=labels, source=source, again=again)
+        receipt = learner.observe(material, stream, values=values, labels=labels, source=source)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     if receipt.repeated:

@@ -20,13 +20,6 @@ __all__ = ["memory"]
 memory = typer.Typer(cls=Commands, no_args_is_help=True, help="Look after a memory on disk.")
 
 
-class Shared(StrEnum):
-    """How streams that both memories observed are counted."""
-
-    ONCE = "once"
-    TWICE = "twice"
-
-
 class ExportForm(StrEnum):
     """As what a memory is written."""
 
@@ -320,20 +313,12 @@ def merge(
         Path,
         typer.Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
     ],
-    shared: Annotated[
-        Shared | None, typer.Option(help="How a stream that both observed is counted.", show_default=False)
-    ] = None,
 ) -> None:
-    """Make a memory the one that observed all that both did, exactly."""
+    """Make a memory the one that observed all that both did, exactly; what both observed counts once."""
     from scroll_tactile.clients.learning.learning import store_model
 
-    if shared is None:
-        raise InputError(
-            "say how a stream that both memories observed is counted: --shared once as one touch, such as of two "
-            "copies of a memory that both went on; --shared twice as two, if it was observed again on purpose"
-        )
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
-        done = learner.merge(other, shared=shared.value, progress=progress)
+        done = learner.merge(other, progress=progress)
         store_model(learner, progress)
         digest, count = learner.digest(), sum(learner.materials.values())
     say(

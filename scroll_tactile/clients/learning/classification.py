@@ -86,6 +86,6 @@ def observe_all(learner: TactileLearner, touches: Sequence[Labelled], each: Call
     for _ in range(len(touches) - len(remaining)):
         each()
     for name, stream in remaining:
-        learner.observe(name, stream, again=True)  # a set is taken as its publishers made it
+        learner.observe(name, stream)
         each()
     return len(remaining)

@@ -205,6 +205,7 @@ class _Run:
             return False
         refusals = [Refused(str(head.attributes[SOURCE]), why) for head, why in refused]
         self._report.refused += [*made.refused, *refusals]
+        self._report.repeated += made.repeated
         step.failed = {*made.failed, *(step.source_of(head.sequence) for head, _ in refused)}
         return True
 

@@ -60,7 +60,7 @@ def learn_sources(
     """Observe the touches in sources, each once: a pass that was cut short is continued by the same call.
 
     At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
-    has under another name is refused. every: learn also what came before, under any name: whoever merges it decides.
+    has under another name is refused. every: learn it under that name, too: whoever merges the memory decides.
     progress: called with (what is being done, files done, files in all).
 
     Raises AnnotationError for a quantity that the memory has with another unit or range (nothing was learned);
@@ -144,7 +144,7 @@ class _Batch:
         """The receipt of a touch; or why it cannot be observed, such as one that is too long."""
         noted: dict[str, Any] = {"values": touch.values, "labels": touch.labels}
         try:
-            return self._learner.observe(material, touch.stream, **noted, source=touch.source, again=self._every)
+            return self._learner.observe(material, touch.stream, **noted, source=touch.source)
         except InputError as error:
             return str(error)
         except EmbeddingError as error:

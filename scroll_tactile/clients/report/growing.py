@@ -165,7 +165,7 @@ def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:
     for scale, readout in model.readouts.items():
         if own := rows_at(sampled, stages, scale):
             # As many rows as it added: of windows that are learned one by one the sample has the mean.
-            times = max(1, round(sampled.learned[own[0]] / len(own)))
+            times = max(1, round(sampled.pairs[own[0], 2] / len(own)))
             readouts[scale] = readout.without(material, np.repeat(sampled.rows[own], times, axis=0))
     return replace(model, readouts=readouts)
 

@@ -124,7 +124,13 @@ class Destination:
         try:
             ledger = self.opened()._ledger
             # What our own workers made is taken as what this memory holds itself.
-            rules = MergeRules(True, True, self._descriptions, clipped, source, thorough=source is not None)
+            rules = MergeRules(
+                one_name=True,
+                descriptions=self._descriptions,
+                clipped=clipped,
+                default_source=source,
+                thorough=source is not None,
+            )
             merged, refused = ledger.merge(path, rules, progress)
             self._save()
         finally:

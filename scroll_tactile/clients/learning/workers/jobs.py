@@ -79,14 +79,15 @@ class Made:
     """What a job made: a packed memory; path: "" where no touch was learned.
 
     identity: of its log, by which it is known again. rows: of each source of the job how many touches it has, which
-    follow each other in it. refused: what was not learned, and why; failed: the sources of that. clipped: in
-    hexadecimal the contents of touches all of whose values lay outside the sensor's range. range_problem: of the first
-    touch that does not fit it. processor: seconds that it took.
+    follow each other in it. repeated: how many others came twice under one name. refused: what was not learned, and
+    why; failed: the sources of that. clipped: in hexadecimal the contents of touches all of whose values lay outside
+    the sensor's range. range_problem: of the first touch that does not fit it. processor: seconds that it took.
     """
 
     path: str
     identity: str = ""
     rows: list[int] = field(default_factory=list)
+    repeated: int = 0
     refused: list[Refused] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     clipped: list[str] = field(default_factory=list)
@@ -110,8 +111,9 @@ class Made:
         failed = _is_list(self.failed, str) and set(self.failed) <= set(job.sources)
         rows = _is_list(self.rows, int) and len(self.rows) == count and min(self.rows, default=0) >= 0
         clipped = _is_list(self.clipped, str) and all(map(CONTENT.fullmatch, self.clipped))
+        repeated = type(self.repeated) is int and self.repeated >= 0
         texts = isinstance(self.identity, str) and isinstance(self.range_problem, str | None)
-        if not (refused and failed and rows and clipped and texts and isinstance(self.processor, float)):
+        if not (refused and failed and rows and repeated and clipped and texts and isinstance(self.processor, float)):
             raise MismatchError(f"expected what a job learned and refused; came {self!r:.200}")
         if self.path != (str(job.target) if any(self.rows) else ""):
             raise MismatchError(f"expected the packed memory of a job in {job.target}; came {self.path!r:.200}")
@@ -147,8 +149,8 @@ def _within(patience: float | None) -> Iterator[None]:
 def learn_job(job: LearnJob) -> Made:
     """Learn the sources of a job; what cannot be read is listed. The packed memory appears whole, or not at all.
 
-    It has a row for each touch, also for those that come twice, or under two names: only the memory that it is merged
-    into tells which come first. Raises CapacityError; StoreFullError, StoreError where it cannot be written.
+    It has a row for each touch, also for those that come under two names: only the memory that it is merged into tells
+    which come first. Raises CapacityError; StoreFullError, StoreError where it cannot be written.
     """
     begun, folder = time.process_time(), Path(job.folder)
     with _within(job.making.patience), ExitStack() as stack:
@@ -169,6 +171,7 @@ def learn_job(job: LearnJob) -> Made:
         str(job.target) if done.learned else "",
         identity,
         [done.rows[source] for source in job.sources],
+        done.skipped,
         done.refused,
         sorted(done.failed),
         sorted(content.hex() for content in done.clipped),

@@ -37,11 +37,11 @@ def _is_embedding(value: Any) -> bool:
 
 
 def _is_probability(value: Any) -> bool:
-    return isinstance(value, Real) and bool(0 <= float(value) <= 1)
+    return isinstance(value, Real) and bool(0 <= value <= 1)
 
 
 def _is_share(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < float(value) < 1)
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < value < 1)
 
 
 def _is_row(value: Any) -> bool:

@@ -12,10 +12,9 @@ from touches import SETTINGS, SmallSample, require_same, stream
 import scroll_tactile.memory.state
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
-from scroll_tactile.clients.learning import learning
+from scroll_tactile.clients.learning import learning, steps
 from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.learning.sources import find_sources
-from scroll_tactile.clients.learning.workers import steps
 
 __all__ = ["full"]  # a fixture
 

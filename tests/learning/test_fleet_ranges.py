@@ -11,9 +11,8 @@ from test_fleet import BY_FOLDER, TOUCHES, full, run, touch_files
 from touches import PAD, SETTINGS
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.clients.learning import learning
+from scroll_tactile.clients.learning import learning, steps
 from scroll_tactile.clients.learning.sources import find_sources
-from scroll_tactile.clients.learning.workers import steps
 from scroll_tactile.errors import RangeWarning
 
 __all__ = ["full"]  # a fixture

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile import Kernels
-from scroll_tactile.clients.learning.classification import Answers, Labelled, evaluate, observe_all
+from scroll_tactile.clients.learning.metrics import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor

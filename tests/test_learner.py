@@ -37,17 +37,8 @@ SMALL = Kernels(seed=0, dimension=64)
 PAD = Sensor(name="pad", channels=3, rate=100.0, low=-1.0, high=1.0, unit="N", duration=1.0)
 ONE = Sensor(name="one", channels=1, rate=50.0, low=0.0, high=4095.0, unit="counts", duration=2.0)
 SLOW = Sensor(name="slow", channels=4, rate=10.0, low=0.0, high=1.0, unit="N", duration=3.0)
-CAMERA = Sensor(
-    name="eye",
-    channels=24 * 32 * 3,
-    rate=25.0,
-    low=0.0,
-    high=255.0,
-    unit="counts",
-    duration=0.2,
-    layout=(24, 32, 3),
-    camera=True,
-)
+BYTES = {"low": 0.0, "high": 255.0, "unit": "counts", "duration": 0.2}
+CAMERA = Sensor(name="eye", channels=24 * 32 * 3, rate=25.0, layout=(24, 32, 3), camera=True, **BYTES)
 NAMES = ["cork", "felt", "silk", "wool"]
 KEPT = 8  # touches: so many are held out of a fit, which takes as much less time
 

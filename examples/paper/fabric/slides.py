@@ -26,7 +26,7 @@ from scroll_tactile import Embedding
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 
 __all__ = ["SlideTransfer", "directions", "slide"]

@@ -33,7 +33,7 @@ from examples.paper.runs.study import OwnEmbeddings, OwnSystems, Systems, System
 from examples.paper.systems.catalogue import EPOCHAL, SYSTEMS, name_of
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.clients.learning.metrics import Labelled, accuracy
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 
 __all__ = ["STREAMS", "Efficiency", "curves", "efficiency", "first_touches"]
 

@@ -16,7 +16,7 @@ from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.embeddings.runtimes import full_float32
 from scroll_tactile.embeddings.vision import Vision
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["PENALTIES", "LeastSquares", "Ridge", "ridge"]

@@ -10,7 +10,7 @@ from examples.paper.systems.system_protocol import Watch, require_touches, silen
 from scroll_tactile import Embedding
 from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.signals.stream import Stream

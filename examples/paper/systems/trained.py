@@ -16,7 +16,7 @@ from examples.paper.systems.networks import ResNetClassifier
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.signals.stream import Stream
 

@@ -130,7 +130,8 @@ def learn(
     CapacityError beyond what exact sums hold; LockedError while another fleet is at work for this destination;
     ScrollTactileError where nobody runs the jobs; StoreFullError and other StoreErrors: call again to go on.
     """
-    require_workers(workers)
+    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
+        raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
     begun = time.perf_counter()
     place = Path(destination).absolute()
     found, missing = find_sources([os.fspath(source) for source in sources], memories=True, patience=patience)
@@ -150,7 +151,12 @@ def learn(
         steps = Steps(folder, into.making, afresh=not into.learned)
         stack.callback(steps.leave)
         report.refused += steps.begin(found)
-        _work(_Run(steps, report, into, progress, found), workers, client, patience)
+        running = _Run(steps, report, into, progress, found)
+        if client is None and workers == 1 and patience is None:
+            running.work_here()
+        else:
+            with engine(client, workers) as chosen:
+                running.work(chosen)
         into.close(progress)
         report.range_problem = steps.range_problem
         steps.end()
@@ -160,25 +166,11 @@ def learn(
     return report
 
 
-def _work(run: _Run, workers: int | None, client: Any, patience: float | None) -> None:
-    """Have a run's steps learned, by this process where it is the only one, and nobody has a patience."""
-    if client is None and workers == 1 and patience is None:
-        run.work_here()
-        return
-    with engine(client, workers) as chosen:
-        run.work(chosen)
-
-
 class _Run:
     """One run: who learns its steps, and what came of them."""
 
     def __init__(
-        self,
-        steps: Steps,
-        report: FleetReport,
-        into: Destination,
-        progress: Progress,
-        found: Sequence[str],
+        self, steps: Steps, report: FleetReport, into: Destination, progress: Progress, found: Sequence[str]
     ) -> None:
         self._steps, self._report, self._into, self._progress = steps, report, into, progress
         self._patience, self._total = into.making.patience, len(found)
@@ -354,7 +346,11 @@ class Destination:
         if place.exists():
             self.learner = stack.enter_context(TactileLearner.open(place, **requested.arguments))
             hush(self.learner)
-            _require_own_skin(self.learner)
+            if adaptations := self.learner.memory.corrections:  # workers learn apart from it
+                raise InputError(
+                    f"{place} was adapted to a changed skin by row {max(adaptations)}, of which the workers of a fleet "
+                    "know nothing: learn with scroll-tactile learn, or retract that row first"
+                )
         there = {} if self.learner is None else self.learner.quantities
         for quantity in options.declared:
             require_declarable(there, quantity)
@@ -424,15 +420,6 @@ class Destination:
         self.learner._ledger.saves = True
         store_model(self.learner, progress)
         self.learner.close()
-
-
-def _require_own_skin(learner: TactileLearner) -> None:
-    """Raise InputError for a memory that reads through an adaptation: workers learn apart from it."""
-    if learner.memory.corrections:
-        raise InputError(
-            f"{learner.path} was adapted to a changed skin by row {max(learner.memory.corrections)}, of which the "
-            "workers of a fleet know nothing: learn with scroll-tactile learn, or retract that row first"
-        )
 
 
 class Engine:
@@ -543,12 +530,6 @@ def _begin(environment: dict[str, str]) -> None:
     parent = parent_process()
     if parent is not None:
         threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
-
-
-def require_workers(workers: object) -> None:
-    """Raise InputError for workers that are no number."""
-    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
-        raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
 
 
 def engine(client: Any, workers: int | None) -> Engine:

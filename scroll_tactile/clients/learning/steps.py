@@ -60,11 +60,6 @@ class Making:
     patience: float | None = None
     quantities: tuple[Quantity, ...] = ()
 
-    @property
-    def identity(self) -> Identity:
-        """That of the memory that comes out."""
-        return Identity.of(self.recipe)
-
     def open(self, path: Path) -> TactileLearner:
         """A learner of this recipe, in a folder."""
         return TactileLearner.open(path, **self.recipe.arguments)
@@ -83,12 +78,6 @@ class LearnJob:
         """The file: of these sources, and no others."""
         digest = hashlib.sha256(json.dumps(self.sources).encode()).hexdigest()
         return Path(self.folder) / f"learned-{digest[:24]}.part"
-
-    def halves(self) -> list[LearnJob]:
-        """Two jobs in place of this one; none of a single source."""
-        middle = len(self.sources) // 2
-        parts = (self.sources[:middle], self.sources[middle:])
-        return [LearnJob(self.making, part, self.folder) for part in parts] if middle else []
 
 
 @dataclass
@@ -109,10 +98,6 @@ class Made:
     clipped: list[str] = field(default_factory=list)
     range_problem: str | None = None
     processor: float = 0.0
-
-    def to_json(self) -> dict[str, Any]:
-        """As a run notes it."""
-        return asdict(self)
 
     @classmethod
     def from_json(cls, noted: Any) -> Made:
@@ -230,7 +215,7 @@ class Steps:
 
     def __init__(self, folder: Path, making: Making, *, afresh: bool) -> None:
         self.folder, self._making = folder, making
-        plan = {"run": "fleet", "identity": making.identity.to_json(), "options": repr(making.options)}
+        plan = {"run": "fleet", "identity": Identity.of(making.recipe).to_json(), "options": repr(making.options)}
         self._notes = RunFile(folder / NOTES, plan)
         self._made: dict[tuple[str, ...], Made] = {}
         self._noted_at, self._noting, self._unnoted = 0.0, 0.0, False
@@ -337,12 +322,12 @@ class Steps:
         """Have a step learned again, by halves where it has several sources; False where it was tried too often."""
         self._made.pop(step.sources, None)
         step.made = None
-        if halves := self.job(step.sources).halves():
-            place, parts = self.steps.index(step), [Step(half.sources) for half in halves]
+        if middle := len(step.sources) // 2:
+            place, halves = self.steps.index(step), (Step(step.sources[:middle]), Step(step.sources[middle:]))
             del self.steps[place]
-            for part in reversed(parts):
-                self.steps.insert(place, part)
-            self.waiting.extendleft(reversed(parts))
+            for half in reversed(halves):
+                self.steps.insert(place, half)
+            self.waiting.extendleft(reversed(halves))
             return True
         step.tries += tries
         if step.tries < MOST_TRIES:
@@ -357,7 +342,7 @@ class Steps:
             return
         self._notes.notes |= {
             "learned": sorted(self.learned),
-            "made": [{"sources": sources, "made": made.to_json()} for sources, made in self._made.items()],
+            "made": [{"sources": sources, "made": asdict(made)} for sources, made in self._made.items()],
         }
         self._notes.note("range_problem", self.range_problem)
         self._noted_at = time.monotonic()

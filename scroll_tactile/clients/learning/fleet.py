@@ -467,7 +467,7 @@ class Processes(Engine):
         method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
         self._context: Any = get_context(method)
         if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
-            self._context.set_forkserver_preload([learn_job.__module__])
+            self._context.set_forkserver_preload([__name__])
 
     def submit(self, what: Callable[[Any], Made], job: LearnJob) -> Future[Made]:
         """As `Engine.submit`, by a process that has nothing else to do."""

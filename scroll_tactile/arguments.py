@@ -35,12 +35,12 @@ def _is_embedding(value: Any) -> bool:
     return not isinstance(value, type) and callable(getattr(value, "embed", None))
 
 
-def _is_probability(value: Any) -> bool:
-    return isinstance(value, Real) and bool(0 <= float(value) <= 1)
+def _is_probability(value: float) -> bool:
+    return isinstance(value, Real) and bool(0 <= value <= 1)
 
 
-def _is_share(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < float(value) < 1)
+def _is_share(value: float) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(0 < value < 1)
 
 
 def _is_row(value: Any) -> bool:

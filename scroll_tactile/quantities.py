@@ -95,7 +95,7 @@ class Quantity(ValidatedFields):
 
         Raises AnnotationError for what is no number, NaN, or outside of the range.
         """
-        if isinstance(value, bool) or not isinstance(value, Real) or not self.low <= float(value) <= self.high:
+        if isinstance(value, bool) or not isinstance(value, Real) or not self.low <= value <= self.high:
             raise AnnotationError(
                 f"expected {self.name!r} as a number {self._range}; came {value!r:.60}. Correct it, or leave it out: "
                 "the range stays, and a wider one takes another name"

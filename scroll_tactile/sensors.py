@@ -21,6 +21,9 @@ from scroll_tactile.errors import InputError
 
 __all__ = ["BIOTAC", "BIOTAC_ALL", "CONTACTILE", "GELSIGHT", "ROBOSKIN", "Sensor", "known", "read_sensor"]
 
+MOST_RATE = 1e6  # Hz: a window is of a third of a second, and has to fit in memory
+MOST_READINGS = 2**40  # of a touch: products of two lengths fit in 64 bits
+
 _Positive = Annotated[FiniteFloat, Field(gt=0)]
 
 
@@ -29,7 +32,7 @@ class Sensor(BaseModel):
 
     name: what streams of this sensor are known by, non-empty.
     channels: how many values a reading has, n ≥ 1.
-    rate: readings per second, in Hz.
+    rate: readings per second, in Hz; at most 1 000 000.
     low, high: the range of a valid value, in `unit`; what lies outside is clipped to it. A number means all channels;
         a sequence has one for each, as for electrodes beside pressure, or a gyroscope beside an accelerometer.
     unit: the unit of the values, such as "counts" or "N"; likewise one for all channels, or one for each.
@@ -46,7 +49,7 @@ class Sensor(BaseModel):
 
     name: Annotated[str, Field(min_length=1)]
     channels: Annotated[int, Field(ge=1)]
-    rate: _Positive
+    rate: Annotated[_Positive, Field(le=MOST_RATE)]
     low: FiniteFloat | tuple[FiniteFloat, ...]
     high: FiniteFloat | tuple[FiniteFloat, ...]
     unit: str | tuple[str, ...]
@@ -96,7 +99,7 @@ class Sensor(BaseModel):
 
     @model_validator(mode="after")
     def _touch_holds_a_reading(self) -> Self:
-        if not math.isfinite(self.rate * self.duration):
+        if self.rate * self.duration > MOST_READINGS:
             raise ValueError(f"{self.duration:g} s at {self.rate:g} Hz holds more readings than can be counted")
         if self.readings < 1:
             raise ValueError(f"{self.duration:g} s at {self.rate:g} Hz holds no reading")

@@ -8,8 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from scroll_tactile import Sensor, TactileLearner
-from scroll_tactile.errors import NotFiniteError, StreamError, StreamTooShortError
+from scroll_tactile import Quantity, Sensor, TactileLearner
+from scroll_tactile.errors import (
+    AnnotationError,
+    InputError,
+    NotFiniteError,
+    ReadingsTypeError,
+    StreamError,
+    StreamTooShortError,
+)
 from scroll_tactile.simulation.scene import Scene
 
 LOW, HIGH = (0.0, -10.0, 0.0, 100.0, 0.0), (255.0, 10.0, 1.0, 900.0, 4095.0)
@@ -199,3 +206,53 @@ def test_a_touch_of_hours_is_refused_before_it_is_kept(tmp_path, monkeypatch):
         with pytest.raises(StreamError, match="at most 200 readings of sensor 'pad', 256 MiB; came 201"):
             learner.observe("felt", np.zeros((201, 1)))
         assert learner.observe("felt", np.zeros((200, 1))).sequence == 1
+
+
+TOUCH = np.random.default_rng(0).uniform(0, 255, (60, 5))
+HUGE = 10**400
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (
+            lambda one: one.observe("oak", TOUCH, values={"f": HUGE}),
+            AnnotationError,
+            "'f' as a number .* came 1",
+        ),
+        (
+            lambda one: one.observe("oak", TOUCH, values={"f": -HUGE}),
+            AnnotationError,
+            "from 0 to 10 N; came -1000",
+        ),
+        (
+            lambda one: one.compose(TOUCH, unfamiliar=HUGE),
+            InputError,
+            "unfamiliar as .* came int 1",
+        ),
+        (lambda one: one.estimate(TOUCH, risk=HUGE), InputError, "risk as a share .* came int 1000"),
+        (lambda one: one.observe("oak", np.asarray(one.stream(TOUCH))), ReadingsTypeError, r"is Stream\(.*, a Stream"),
+        (
+            lambda one: one.observe("oak", np.asarray(iter(TOUCH))),
+            ReadingsTypeError,
+            "the only item is <",
+        ),
+        (lambda one: one.live().push(np.asarray(one.stream(TOUCH))), ReadingsTypeError, "the only item is Stream"),
+    ],
+)
+def test_what_overflows_or_hides_in_an_array_is_refused_by_name(call, error, message):
+    learner = TactileLearner(sensor=PLAIN)
+    learner.declare(Quantity(name="f", unit="N", low=0.0, high=10.0, resolution=0.01))
+    with pytest.raises(error, match=message):
+        call(learner)
+    assert learner.materials == {}
+
+
+@pytest.mark.filterwarnings("ignore:the matrix subclass")
+def test_a_matrix_is_an_array():
+    learner = TactileLearner(sensor=PLAIN)
+    with learner.live() as one, learner.live() as other:
+        one.push(TOUCH)
+        other.push(np.asmatrix(TOUCH))
+        other.push(np.asmatrix(TOUCH)[0])
+        assert (one.report.readings, other.report.readings) == (60, 61)

@@ -1,8 +1,10 @@
 import inspect
 import pickle
 import re
+from pathlib import Path
 
 import pytest
+from scroll_tactile_store import exceptions
 
 from scroll_tactile import errors
 from scroll_tactile.errors import ScrollTactileError, UnknownMaterialError
@@ -44,6 +46,16 @@ def test_messages_read_as_written_and_survive_pickling(error):
     again = pickle.loads(pickle.dumps(error(message)))
     assert type(again) is error
     assert str(again) == message
+
+
+OF_DAMAGE = {"path": Path("log"), "sequence": 7, "offset": 4096, "frame": 3}
+
+
+@pytest.mark.parametrize("error", [getattr(exceptions, name) for name in exceptions.__all__ if name.endswith("Error")])
+def test_an_error_of_the_store_comes_whole_from_another_process(error):
+    fields = OF_DAMAGE if error is exceptions.DamageError else {}
+    again = pickle.loads(pickle.dumps(error("row 7 is damaged", **fields)))
+    assert (type(again), again.args, vars(again)) == (error, ("row 7 is damaged",), fields)
 
 
 def test_an_unknown_material_is_caught_as_key_error_and_as_value_error():

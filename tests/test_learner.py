@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import random
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -35,17 +37,8 @@ SMALL = Kernels(seed=0, dimension=64)
 PAD = Sensor(name="pad", channels=3, rate=100.0, low=-1.0, high=1.0, unit="N", duration=1.0)
 ONE = Sensor(name="one", channels=1, rate=50.0, low=0.0, high=4095.0, unit="counts", duration=2.0)
 SLOW = Sensor(name="slow", channels=4, rate=10.0, low=0.0, high=1.0, unit="N", duration=3.0)
-CAMERA = Sensor(
-    name="eye",
-    channels=24 * 32 * 3,
-    rate=25.0,
-    low=0.0,
-    high=255.0,
-    unit="counts",
-    duration=0.2,
-    layout=(24, 32, 3),
-    camera=True,
-)
+BYTES = {"low": 0.0, "high": 255.0, "unit": "counts", "duration": 0.2}
+CAMERA = Sensor(name="eye", channels=24 * 32 * 3, rate=25.0, layout=(24, 32, 3), camera=True, **BYTES)
 NAMES = ["cork", "felt", "silk", "wool"]
 KEPT = 8  # touches: so many are held out of a fit, which takes as much less time
 
@@ -593,3 +586,24 @@ def test_a_name_of_numpys_is_the_name():
         learner.observe(name, touch)
         digests.append(learner.digest())
     assert digests[0] == digests[1]
+
+
+FORGETFUL = """
+import sys, numpy
+from scroll_tactile import Kernels, Sensor, TactileLearner
+pad = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
+learner = TactileLearner.open(sys.argv[1], sensor=pad, embedding=Kernels(dimension=64))
+draw = numpy.random.default_rng(0)
+for i in range(128):  # now a checkpoint is due
+    learner.observe("ab"[i % 2], draw.random((30, 2)))
+"""
+
+
+def test_a_script_that_ends_without_close_says_nothing_and_loses_nothing(tmp_path):
+    for again in range(3):  # whether the checkpoint is written in time is a race
+        ended = subprocess.run(
+            [sys.executable, "-c", FORGETFUL, tmp_path / str(again)], capture_output=True, check=True
+        )
+        assert (ended.stdout, ended.stderr) == (b"", b"")
+        with TactileLearner.open(tmp_path / str(again)) as learner:
+            assert learner.materials == {"a": 64, "b": 64}

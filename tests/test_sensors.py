@@ -68,6 +68,8 @@ def test_a_sensor_is_frozen():
         ({"camera": True}, r"a camera needs layout=\(height, width, 3\); it is None"),
         ({"camera": True, "layout": (3, 2, 1)}, r"it is \(3, 2, 1\)"),
         ({"duration": 0.001}, "0.001 s at 50 Hz holds no reading"),
+        ({"rate": 1e300, "duration": 1e-298}, "less than or equal to 1000000"),
+        ({"duration": 1e300}, r"1e\+300 s at 50 Hz holds more readings than can be counted"),
         ({"duration": 1e308}, r"1e\+308 s at 50 Hz holds more readings than can be counted"),
         ({"colour": "red"}, "Extra inputs"),
         ({"low": (0.0,) * 5}, "low has 5 entries for 6 channels: give one, or one each"),

@@ -90,6 +90,8 @@ class Reembedding:
             if memory.sequence - memory.saved >= CHECKPOINT_EVERY:
                 self._write_checkpoint()
             progress("embedding", draft.last, self._source.last)
+        if memory.sequence > memory.saved:  # here, and not when both are exchanged: a full disk stops it before that
+            self._write_checkpoint()
 
     def _carry(self, record: Record) -> None:
         attributes, arrays = dict(record.attributes), dict(record.arrays)
@@ -116,7 +118,6 @@ class Reembedding:
 
         The caller has copied all rows. Raises StoreError where another process has written to the old one since.
         """
-        self._write_checkpoint()
         folder = self._source.path.resolve()  # a link to the memory stays one
         last_sequence = self._draft.last
         for store in (self._draft, self._source):

@@ -52,6 +52,7 @@ def embed_again(
         with ledger.lock:
             ledger.require_writing()
             carried.copy(progress)
+            ledger.saves = False  # nothing more is written to the old one, which a full disk could stop half-way
             predictor.close()
             before = carried.put_in_place()
             predictor.replace()

@@ -230,7 +230,7 @@ def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:
         masked = np.ma.is_masked(readings)
         return np.ma.filled(readings.astype(np.float64), np.nan) if masked else readings.data
     if isinstance(readings, np.ndarray):
-        return readings
+        return np.asarray(readings)  # a matrix would stay one, and multiply as one
     torch = sys.modules.get("torch")  # whoever passes a tensor has imported torch
     if torch is not None and isinstance(readings, torch.Tensor):
         return _from_torch(readings)
@@ -371,6 +371,8 @@ def _require_any(mask: npt.NDArray[np.bool_], sensor: Sensor) -> None:
 
 
 def _place(index: tuple[Any, ...]) -> str:
+    if not index:
+        return "the only item"
     channel = ", ".join(str(int(axis)) for axis in index[1:])
     return f"reading {int(index[0])}, channel {channel}" if len(index) > 1 else f"item {int(index[0])}"
 

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -177,14 +178,13 @@ class Checkpoints:
     def commit_later(self, draft: CheckpointDraft) -> None:
         """Do `commit` in a background thread; a newer one takes the place of one that still waits.
 
-        Logs a failure and keeps it until `raise_failure`.
+        Logs a failure and keeps it until `raise_failure`. While the interpreter ends nothing is written, and nothing
+        said: the journal holds the rows.
         """
         with self._queue:
             self._waiting = draft
-        try:
+        with suppress(RuntimeError):  # it starts no job any more
             self._submitted = self._worker.submit(self._commit_newest)
-        except RuntimeError:  # the interpreter is shutting down, and starts no job any more
-            self._commit_newest()
 
     def _commit_newest(self) -> None:
         with self._queue:
@@ -194,6 +194,8 @@ class Checkpoints:
         try:
             self.commit(draft)
         except Exception as error:
+            if isinstance(error, RuntimeError) and "interpreter shutdown" in str(error):
+                return  # no thread starts a job any more, without which zarr writes nothing
             logger.exception("%s: a background commit failed; the journal still holds its rows", self._folder)
             self._failure = error
 

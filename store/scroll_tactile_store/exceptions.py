@@ -84,7 +84,8 @@ class DamageError(StoreError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A worker's error reaches whoever waits for it."""
-        return partial(type(self), path=self.path, sequence=self.sequence), self.args
+        made_of: dict[str, Any] = {"sequence": self.sequence, "offset": self.offset, "frame": self.frame}
+        return partial(type(self), path=self.path, **made_of), self.args
 
 
 class CompactedError(StoreError):

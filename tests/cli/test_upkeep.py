@@ -17,7 +17,7 @@ from forging import log_of
 from scroll_tactile_store import Store, StoreError
 from touches import PAD, SETTINGS, fed, require_same, stream
 
-from scroll_tactile import Kernels, ModuleEmbedding, TactileLearner
+from scroll_tactile import Kernels, ModuleEmbedding, Quantity, TactileLearner
 from scroll_tactile.clients.cli.terminal import opened_for_upkeep
 from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import InputError, MismatchError
@@ -265,8 +265,9 @@ class TestExport:
             "ü - c",
         ]
         with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": len(names)}) as learner:
+            learner.declare(Quantity(name="=q", unit="N", low=0.0, high=1.0, resolution=0.1))
             for i, name in enumerate(names):
-                learner.observe(name, stream((i, 60)), source=name)
+                learner.observe(name, stream((i, 60)), source=name, values={"=q": 0.5}, labels={name: name})
                 learner.describe(name, {name: 1.0})
             export_plain(learner, tmp_path / "out")
         for table, column in (("observations", "source"), ("exemplars", "material"), ("descriptions", "constituent")):

@@ -13,7 +13,6 @@ from touches import Windowed
 from scroll_tactile import Joined, Kernels, TactileLearner, Vision, errors
 from scroll_tactile.embeddings.protocol import TOGETHER, window_plan
 from scroll_tactile.finetune import fine_tune as finetune
-from scroll_tactile.finetune import training
 from scroll_tactile.finetune.network import TouchFeatures, TrainingSample, TunedReader, adapted
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import tactile_image
@@ -153,7 +152,7 @@ def test_interrupted_or_refused_the_f_star_before_stays(tmp_path, monkeypatch):
 def test_a_loss_that_is_not_finite_stops_and_says_where(monkeypatch):
     learner = learned("kernels")
     before = learner.fine_tune(epochs=1).digest
-    monkeypatch.setattr(training, "HEAD_RATE", float("inf"))
+    monkeypatch.setattr(finetune, "HEAD_RATE", float("inf"))
     for epochs, where in (
         (8, r"loss became nan in held out 1/3, epoch 2"),
         (1, "weights .* not finite after held out 1/3"),
@@ -169,7 +168,7 @@ def test_a_device_without_memory_left_is_named_as_such(monkeypatch):
     def full(*args, **kwargs):
         raise torch.OutOfMemoryError("tried to allocate 2 GiB")
 
-    monkeypatch.setattr(training.functional, "cross_entropy", full)
+    monkeypatch.setattr(finetune.functional, "cross_entropy", full)
     with pytest.raises(errors.FineTuneError, match=r"cpu is out of memory.*device='cpu'"):
         learner.fine_tune(epochs=1)
     assert learner.tuned_digest() is None
@@ -246,7 +245,7 @@ def test_the_start_is_f_itself_as_its_windows_judge():
     for readout in ("lda", "ridge"):
         learner = learned("kernels", readout=readout, embedding=Windowed(dimension=64))
         model = learner.model()
-        start = training.start_of(model, model.names)
+        start = finetune.start_of(model, model.names)
         features = TouchFeatures(learner.embedding, learner.plan)
         image = tactile_image(SCENE.touch(NAMES[3], 40))
         frozen = features.frozen(image)
@@ -268,10 +267,10 @@ def test_a_fold_held_out_starts_as_a_memory_that_never_observed_it(readout):
     for name, stream in held:
         image = extractor.image(stream)
         samples.append(TrainingSample(name, stream.key, image, {}, extractor.codes(image)))
-    start = training.start_without(model, statistics, samples, model.names)
+    start = finetune.start_without(model, statistics, samples, model.names)
     assert statistics == learner.memory.statistics
     others = learned("kernels", [*range(4), *range(14, len(touches))], readout=readout).model()
-    expected = training.start_of(model, others.names, others.readouts)
+    expected = finetune.start_of(model, others.names, others.readouts)
     assert start.names == expected.names
     assert start.bias == pytest.approx(expected.bias)
     for width, head in expected.heads.items():
@@ -285,7 +284,7 @@ def test_a_material_of_which_all_is_held_out_is_not_compared():
     stream = extractor.stream(SCENE.touch(SCENE.materials[6], 0))
     image = extractor.image(stream)
     sample = TrainingSample("once", stream.key, image, {}, extractor.codes(image))
-    start = training.start_without(learner.model(), learner.memory.statistics, [sample], [*model.names, "once"])
+    start = finetune.start_without(learner.model(), learner.memory.statistics, [sample], [*model.names, "once"])
     assert start.names == model.names
 
 

@@ -15,10 +15,10 @@ from touches import PAD, SETTINGS, fed, require_same, stream
 
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile.clients.learning import fleet, steps
 from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.learning.learning import learn_sources
 from scroll_tactile.clients.learning.sources import SourceOptions
-from scroll_tactile.clients.learning.workers import destination, engines, jobs, steps
 from scroll_tactile.errors import InputError
 from scroll_tactile.persistence.ledger import Ledger
 
@@ -143,7 +143,7 @@ def full(monkeypatch):
 @pytest.fixture
 def jobs_here(monkeypatch):
     """Jobs that an executor runs in this process do not end it where they take longer than a run has patience."""
-    monkeypatch.setattr(jobs, "_within", lambda patience: nullcontext())
+    monkeypatch.setattr(steps, "_within", lambda patience: nullcontext())
 
 
 @pytest.fixture
@@ -155,7 +155,7 @@ def learned(monkeypatch):
         begun.extend(sources)
         return learn_sources(learner, sources, *words, **named)
 
-    monkeypatch.setattr(jobs, "learn_sources", learning)
+    monkeypatch.setattr(steps, "learn_sources", learning)
     return begun
 
 
@@ -233,7 +233,7 @@ class TestGoingOn:
 
     @pytest.mark.parametrize("workers", [1, 2])
     def test_a_run_that_was_cut_short_replays_little(self, tmp_path, monkeypatch, workers):
-        monkeypatch.setattr(destination, "SAVED_EVERY", 4)
+        monkeypatch.setattr(fleet, "SAVED_EVERY", 4)
         monkeypatch.setattr(steps, "MOST_SOURCES", 2)
         paths = touch_files(tmp_path / "in", TOUCHES)
 
@@ -389,8 +389,8 @@ class TestProcesses:
                         os.kill(workers[0].pid, signal.SIGKILL)
 
         running = []
-        made = engines.Processes.__init__
-        monkeypatch.setattr(engines.Processes, "__init__", lambda self, n: running.append(self) or made(self, n))
+        made = fleet.Processes.__init__
+        monkeypatch.setattr(fleet.Processes, "__init__", lambda self, n: running.append(self) or made(self, n))
         done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=2, progress=kill, **SETTINGS)
         assert len(killed) == 3 and done.observations == 12
         require_learned(tmp_path / "m")

@@ -3,7 +3,6 @@
 import json
 import multiprocessing.forkserver
 import os
-import pickle
 import signal
 import threading
 from concurrent.futures import Executor, Future
@@ -11,17 +10,16 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from scroll_tactile_store import DamageError, LockedError
+from scroll_tactile_store import LockedError
 from test_fleet import BY_FOLDER, TOUCHES, expected, jobs_here, require_learned, run, touch_files
 from touches import SETTINGS, stream
 
 from examples.benchmarks.fleet import DyingExecutor
 from scroll_tactile import TactileLearner
-from scroll_tactile.clients.learning import fleet, runfile
+from scroll_tactile.clients.learning import fleet, runfile, steps
 from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.learning.sources import Refused
-from scroll_tactile.clients.learning.workers import engines, steps
-from scroll_tactile.clients.learning.workers.jobs import Made
+from scroll_tactile.clients.learning.steps import Made
 from scroll_tactile.errors import InputError, ScrollTactileError
 
 __all__ = ["jobs_here"]  # a fixture
@@ -95,7 +93,7 @@ class TestPatience:
     def test_a_worker_that_is_stopped_is_ended_and_its_job_done_by_another(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(fleet, "GRACE", 0.5)
         stopped = []
-        submit = engines.Processes.submit
+        submit = fleet.Processes.submit
 
         def stopping(self, what, job):
             future = submit(self, what, job)
@@ -105,7 +103,7 @@ class TestPatience:
                 os.kill(process.pid, signal.SIGSTOP)
             return future
 
-        monkeypatch.setattr(engines.Processes, "submit", stopping)
+        monkeypatch.setattr(fleet.Processes, "submit", stopping)
         done = learn(tmp_path / "m", sources[:4], BY_FOLDER, workers=1, patience=3, **SETTINGS)
         assert done.deaths and done.observations == 4
         with pytest.raises(ProcessLookupError):
@@ -201,10 +199,6 @@ class TestSpoilt:
         done = run(tmp_path / "m", [tmp_path / "in"], client=Then(spoil))
         assert done.observations == 12 and not done.refused and done.sources == 12
         require_learned(tmp_path / "m")
-
-    def test_errors_of_workers_reach_who_waits_for_them(self):
-        error = pickle.loads(pickle.dumps(DamageError("spoilt", path=Path("x"), sequence=3)))
-        assert (str(error), error.path, error.sequence) == ("spoilt", Path("x"), 3)
 
 
 class TestNotes:
@@ -302,7 +296,7 @@ def test_processes_are_waited_for_unless_an_error_ends_the_block_whatever_the_ca
     try:
         raise ValueError("the caller's own")
     except ValueError:
-        with suppress(KeyError), engines.Processes(1) as processes:
+        with suppress(KeyError), fleet.Processes(1) as processes:
             processes._all.add(Pool())
             if error is not None:
                 raise error from None
@@ -313,7 +307,7 @@ def test_processes_are_waited_for_unless_an_error_ends_the_block_whatever_the_ca
 def test_a_fork_server_that_is_killed_is_begun_again(tmp_path, sources, monkeypatch):
     monkeypatch.setattr(steps, "MOST_SOURCES", 3)
     killed = []
-    submit = engines.Processes.submit
+    submit = fleet.Processes.submit
 
     def killing(self, what, job):
         server = multiprocessing.forkserver._forkserver._forkserver_pid
@@ -323,6 +317,6 @@ def test_a_fork_server_that_is_killed_is_begun_again(tmp_path, sources, monkeypa
                 os.kill(server, signal.SIGKILL)
         return submit(self, what, job)
 
-    monkeypatch.setattr(engines.Processes, "submit", killing)
+    monkeypatch.setattr(fleet.Processes, "submit", killing)
     done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=2, **SETTINGS)
     assert killed and done.observations == 12 and done.digest == expected().digest()

@@ -6,9 +6,14 @@ from pathlib import Path
 import pytest
 
 from scroll_tactile import sensors
-from scroll_tactile.clients.learning.classification import missing
 from scroll_tactile.clients.learning.demo import Demo, pull_the_plug
-from scroll_tactile.clients.learning.metrics import accuracy, calibration_error, confusion_counts, mean_and_spread
+from scroll_tactile.clients.learning.metrics import (
+    accuracy,
+    calibration_error,
+    confusion_counts,
+    mean_and_spread,
+    missing,
+)
 from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.errors import InputError
 from scroll_tactile.simulation.scene import Scene

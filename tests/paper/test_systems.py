@@ -23,7 +23,7 @@ from examples.paper.systems.svm import Svm
 from examples.paper.systems.system_protocol import System, silent, unwatched
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile import Vision
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor

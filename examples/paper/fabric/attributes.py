@@ -29,7 +29,7 @@ from scroll_tactile import Embedding, Kernels
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.clients.learning.metrics import mean_and_spread
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 from scroll_tactile.results import Composition

@@ -45,7 +45,7 @@ from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import require_device
 from scroll_tactile.clients.cli.terminal import progress_bar, say
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 
 __all__ = ["HAND", "HELD_OUT", "PARTS", "Contactile", "contactile", "rows"]
 

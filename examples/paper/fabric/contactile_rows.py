@@ -32,7 +32,7 @@ from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.augmentation import Augmentation
 from scroll_tactile.signals.stream import Stream
 

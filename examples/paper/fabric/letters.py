@@ -28,7 +28,7 @@ from examples.paper.transfer.maps import Maps
 from scroll_tactile import Embedding
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.clients.learning.metrics import accuracy
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 
 __all__ = ["FIGURES", "Letters", "letters", "summary"]

@@ -31,7 +31,7 @@ from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 from scroll_tactile.results import Composition

@@ -25,7 +25,7 @@ from scroll_tactile import Kernels
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.embeddings.protocol import window_plan
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.libraries import optional
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.quantities import Quantity

@@ -24,9 +24,9 @@ from examples.paper.runs.results import show, write
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Embedding
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 
 __all__ = ["SlideTransfer", "directions", "slide"]

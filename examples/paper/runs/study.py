@@ -33,7 +33,7 @@ from examples.paper.systems.trained import require_device
 from scroll_tactile.clients.cli.terminal import say
 from scroll_tactile.embeddings.weights import PUBLISHED
 from scroll_tactile.errors import InputError, WeightsError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.sensors import Sensor
 
 __all__ = [

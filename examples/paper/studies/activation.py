@@ -44,7 +44,7 @@ from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.embeddings.weights import load_network
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.image import tactile_image
 
 __all__ = [

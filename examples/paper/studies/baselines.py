@@ -14,9 +14,9 @@ from examples.paper.studies.perturbations import changed
 from examples.paper.systems.catalogue import CONTROLS, EPOCHAL, OURS, SYSTEMS, Catalogue
 from examples.paper.systems.own import code_digest, is_own
 from examples.paper.systems.system_protocol import System
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.augmentation import Augmentation, Change, Image, fit
 from scroll_tactile.signals.stream import fewest_readings
 

@@ -41,9 +41,9 @@ from examples.paper.systems.coming import Coming, code_of, require_systems
 from examples.paper.systems.own import frozen_embedding, is_own
 from scroll_tactile import Embedding
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import ReadoutName
 

@@ -32,9 +32,8 @@ from examples.paper.runs.results import show
 from examples.paper.runs.study import OwnEmbeddings, OwnSystems, Systems, SystemStudy, choose_systems, close
 from examples.paper.systems.catalogue import EPOCHAL, SYSTEMS, name_of
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.learning.classification import Labelled
-from scroll_tactile.clients.learning.metrics import accuracy
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.clients.learning.metrics import Labelled, accuracy
+from scroll_tactile.finetune.fine_tune import Progress
 
 __all__ = ["STREAMS", "Efficiency", "curves", "efficiency", "first_touches"]
 

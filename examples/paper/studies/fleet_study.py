@@ -20,10 +20,9 @@ from torch import nn
 from examples.paper.runs.cells import Figures, learn
 from examples.paper.systems.descent import seeded
 from scroll_tactile import Embedding
-from scroll_tactile.clients.learning.classification import Labelled
-from scroll_tactile.clients.learning.metrics import accuracy
+from scroll_tactile.clients.learning.metrics import Labelled, accuracy
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.results import Prediction
 from scroll_tactile.sensors import Sensor

@@ -17,9 +17,8 @@ from examples.paper.runs.results import show, write
 from examples.paper.runs.study import sensors_of
 from examples.paper.studies.schedules import SCHEDULES, arrange
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.learning.classification import Answers, Labelled, evaluate
-from scroll_tactile.clients.learning.metrics import calibration_error
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.clients.learning.metrics import Answers, Labelled, calibration_error, evaluate
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.settings import Settings
 

@@ -28,10 +28,9 @@ from examples.paper.studies.strengths import require_channels
 from examples.paper.systems.coming import answering, code_of, require_systems
 from examples.paper.systems.own import is_own
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.learning.classification import Labelled
-from scroll_tactile.clients.learning.metrics import accuracy, calibration_error
+from scroll_tactile.clients.learning.metrics import Labelled, accuracy, calibration_error
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.simulation.scene import EVENT_SKIN, LIGHT_PAD, Response, Scene

@@ -55,10 +55,9 @@ from examples.paper.systems.catalogue import NEED_WEIGHTS, Catalogue
 from examples.paper.systems.descent import Course
 from examples.paper.systems.trained import require_device
 from scroll_tactile.clients.cli.terminal import progress_bar, say
-from scroll_tactile.clients.learning.classification import Labelled
-from scroll_tactile.clients.learning.metrics import accuracy
+from scroll_tactile.clients.learning.metrics import Labelled, accuracy
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream

@@ -31,7 +31,7 @@ from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile.clients.cli.terminal import progress_bar, say
 from scroll_tactile.clients.learning.metrics import accuracy
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 
 __all__ = ["PAPER", "Table1", "rows", "table1"]
 

@@ -31,9 +31,9 @@ from examples.paper.studies.recursive_ridge import RecursiveRidge
 from examples.paper.systems.coming import Coming, code_of, require_systems
 from scroll_tactile import Embedding, Kernels
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.results import Receipt
 from scroll_tactile.statistics.statistics import Statistics

@@ -11,7 +11,7 @@ from typing import Any
 
 from examples.paper.studies.default_learner import Answering, Answers, Progress, Readings, Touch
 from examples.paper.systems.own import code_digest, is_own_embedding, own_system
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream, validate

@@ -23,9 +23,9 @@ from examples.paper.systems.one_pass import OneByOne
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile import Embedding
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.results import Composition
 from scroll_tactile.signals.stream import Stream

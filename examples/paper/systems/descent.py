@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from scroll_tactile.embeddings.steady import full_float32
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 
 __all__ = [
     "AT_ONCE",

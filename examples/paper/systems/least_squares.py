@@ -12,11 +12,11 @@ import torch
 from examples.benchmarks.solvers.floating import Gram64
 from examples.paper.systems.inputs import Image, picture
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.embeddings.steady import full_float32
 from scroll_tactile.embeddings.vision import Vision
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["PENALTIES", "LeastSquares", "Ridge", "ridge"]

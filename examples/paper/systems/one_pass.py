@@ -8,9 +8,9 @@ from typing import Generic, TypeVar
 from examples.paper.studies.peers import ContinualPeer, touch_features
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
 from scroll_tactile import Embedding
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.signals.stream import Stream

@@ -9,9 +9,9 @@ import numpy as np
 
 from examples.paper.systems.inputs import Image, one_width, picture, usual_columns
 from examples.paper.systems.system_protocol import Watch, require_touches, silent, unwatched
-from scroll_tactile.clients.learning.classification import Labelled
+from scroll_tactile.clients.learning.metrics import Labelled
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.libraries import optional
 from scroll_tactile.signals.stream import Stream
 

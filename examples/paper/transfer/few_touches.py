@@ -12,7 +12,7 @@ from examples.paper.readers.labelled import Recordings
 from examples.paper.runs.cells import Cell, Figures, over_folds
 from scroll_tactile.embeddings.protocol import Embedding, window_plan
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.readouts.readout import Readout

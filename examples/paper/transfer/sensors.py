@@ -28,7 +28,7 @@ from examples.paper.transfer.shared_features import Features, SharedFeatures
 from scroll_tactile import Kernels
 from scroll_tactile.clients.cli.terminal import percent, progress_bar, say
 from scroll_tactile.errors import InputError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["ALONE", "COUNTS", "WAYS", "SensorTransfer", "rows", "sensors"]

@@ -45,7 +45,7 @@ from scroll_tactile import Embedding, Kernels, Vision
 from scroll_tactile.clients.cli.terminal import percent, progress_bar, say
 from scroll_tactile.embeddings.weights import load_network, read_tensors
 from scroll_tactile.errors import InputError, WeightsError
-from scroll_tactile.finetune.training import Progress
+from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.signals.image import tactile_image
 
 __all__ = ["TRAINING", "TUNED", "TaskTransfer", "rows", "some_frames", "tasks"]

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile import Kernels
-from scroll_tactile.clients.learning.classification import Answers, Labelled, evaluate, observe_all
+from scroll_tactile.clients.learning.metrics import Answers, Labelled, evaluate, observe_all
 from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
@@ -99,12 +99,7 @@ class Demo:
         Raises InputError for a folder of something else, and what the learner and the store raise.
         """
         plan: dict[str, Any] = {"run": "demo", "sensor": self.sensor.model_dump(mode="json"), "seed": self.seed}
-        plan |= {
-            "materials": self.materials,
-            "touches": self.touches,
-            "held_out": self.held_out,
-            "features": self.features,
-        }
+        plan |= {name: getattr(self, name) for name in ("materials", "touches", "held_out", "features")}
         notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
         with self._open() as learner:
             return self._learn(learner, notes, report)
@@ -128,7 +123,9 @@ class Demo:
                 notes.note(name, self.touches)
             report(name)
         answers = evaluate(learner, self._held_out(names))
-        short = evaluate(learner, [(name, self._extra(name)) for name in names], seconds=0.3)
+        short = evaluate(
+            learner, [(name, self.scene.touch(name, self.touches + self.held_out)) for name in names], seconds=0.3
+        )
         first = middle * self.held_out
         return Outcome(Half(**notes.notes["half"]), answers, first, short, observed, learner.digest())
 
@@ -145,9 +142,6 @@ class Demo:
 
     def _touches(self, name: str, first: int, count: int) -> list[Labelled]:
         return [(name, self.scene.touch(name, i)) for i in range(first, first + count)]
-
-    def _extra(self, name: str) -> Any:
-        return self.scene.touch(name, self.touches + self.held_out)
 
 
 @dataclass(frozen=True)

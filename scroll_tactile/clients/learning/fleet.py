@@ -1,7 +1,7 @@
 """Many recordings and memories become one memory, to the same bytes, whoever learns them and in how many processes.
 
 Sources are cut into steps, in their order: some recordings, or a memory (see `steps`). A worker learns the recordings
-of a step by the same loop as one process does, into a packed memory of its own (see `jobs`); steps are merged one after
+of a step by the same loop as one process does, into a packed memory of its own; steps are merged one after
 another, in order. With one process the loop writes into the memory itself. Sums of whole numbers are equal in any
 order, so the digest is that of one process which observed each touch once, whatever the workers, their number and their
 ends.
@@ -14,33 +14,39 @@ from __future__ import annotations
 import logging
 import math
 import os
+import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
+from dataclasses import dataclass, field
+from multiprocessing import get_all_start_methods, get_context, parent_process
+from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
 
-from scroll_tactile_store import DamageError, NotAStoreError, StoreError, StoreFullError, VersionError
+from scroll_tactile_store import DamageError, Head, NotAStoreError, StoreError, StoreFullError, VersionError
+from scroll_tactile_store.files import remove_tree
 
-from scroll_tactile.clients.learning.addresses import expand, fetched
+from scroll_tactile.clients.learning.learning import learn_sources, store_model
 from scroll_tactile.clients.learning.runfile import alone_in
-from scroll_tactile.clients.learning.sources import Refused, SourceOptions, stored_source
-from scroll_tactile.clients.learning.workers.destination import Destination, FleetReport
-from scroll_tactile.clients.learning.workers.engines import Engine, engine, require_workers
-from scroll_tactile.clients.learning.workers.jobs import Made, learn_job
-from scroll_tactile.clients.learning.workers.steps import NOTES, Step, Steps
-from scroll_tactile.embeddings.protocol import Embedding
-from scroll_tactile.errors import (
-    CapacityError,
-    InputError,
-    MismatchError,
-    RangeWarning,
-    ScrollTactileError,
+from scroll_tactile.clients.learning.sources import (
+    Refused,
+    SourceOptions,
+    fetched,
+    find_sources,
+    has_touches,
+    stored_source,
 )
+from scroll_tactile.clients.learning.steps import NOTES, LearnJob, Made, Making, Step, Steps, hush, learn_job
+from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.errors import CapacityError, InputError, MismatchError, RangeWarning, ScrollTactileError
+from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.touch_rows import SOURCE
-from scroll_tactile.persistence.merge import Choice
+from scroll_tactile.persistence.merge import Choice, MergeRules
+from scroll_tactile.quantities import require_declarable
 from scroll_tactile.recipe import RecipeRequest
 from scroll_tactile.sensors import Sensor
 
@@ -51,8 +57,36 @@ logger = logging.getLogger(__name__)
 SLOW = 5  # tries that one counts for which took all the patience that there is
 QUEUED = 2  # times its patience, and GRACE seconds: so long may a job be under way, for it may wait behind another, and
 GRACE = 10.0  # a worker takes a moment to begin
+SAVED_EVERY = 4096  # touches: what opening replays where a run was cut short; a checkpoint costs what 100 do
+STARTS = 5  # of a worker: what starts it may have been killed as well, and takes a moment to be noticed
+PAUSE = 0.1
 
 Progress = Callable[[str, int, int], object]
+
+
+@dataclass
+class FleetReport:
+    """What a run did.
+
+    sources: how many were read, now or before the run was cut short. observations: touches that came in. repeated:
+    those that had come before, by their names and contents. refused: what was not learned, and why; of touches that
+    came under two names the first counts, of the destination and then of the sources in their order. deaths: jobs whose
+    worker ended before them, or did not answer. seconds: of all, and of merging. processor: seconds of the workers,
+    and of this process. held, digest: of the memory that came out. range_problem: where touches do not fit the
+    sensor's range, what is wrong with the first, and what to do.
+    """
+
+    sources: int = 0
+    observations: int = 0
+    repeated: int = 0
+    refused: list[Refused] = field(default_factory=list)
+    deaths: int = 0
+    seconds: float = 0.0
+    merging: float = 0.0
+    held: int = 0
+    digest: str = ""
+    range_problem: str | None = None
+    processor: dict[str, float] = field(default_factory=lambda: {"learning": 0.0, "merging": 0.0})
 
 
 def learn(
@@ -93,10 +127,11 @@ def learn(
     CapacityError beyond what exact sums hold; LockedError while another fleet is at work for this destination;
     ScrollTactileError where nobody runs the jobs; StoreFullError and other StoreErrors: call again to go on.
     """
-    require_workers(workers)
+    if workers is not None and (isinstance(workers, bool) or not isinstance(workers, int) or workers < 1):
+        raise InputError(f"expected workers as a whole number of 1 or more; came {workers!r}")
     begun = time.perf_counter()
     place = Path(destination).absolute()
-    found, missing = expand([os.fspath(source) for source in sources], patience)
+    found, missing = find_sources([os.fspath(source) for source in sources], memories=True, patience=patience)
     report = FleetReport(refused=missing)
     requested = RecipeRequest.of(sensor, embedding, {"exemplars": exemplars, "kept_touches": kept_touches})
     folder = place.with_name(place.name + ".fleet")
@@ -111,7 +146,12 @@ def learn(
         steps = Steps(folder, into.making, afresh=not into.learned)
         stack.callback(steps.leave)
         report.refused += steps.begin(found)
-        _work(_Run(steps, report, into, progress, found), workers, client, patience)
+        running = _Run(steps, report, into, progress, found)
+        if client is None and workers == 1 and patience is None:
+            running.work_here()
+        else:
+            with engine(client, workers) as chosen:
+                running.work(chosen)
         into.close(progress)
         report.range_problem = steps.range_problem
         steps.end()
@@ -121,25 +161,11 @@ def learn(
     return report
 
 
-def _work(run: _Run, workers: int | None, client: Any, patience: float | None) -> None:
-    """Have a run's steps learned, by this process where it is the only one, and nobody has a patience."""
-    if client is None and workers == 1 and patience is None:
-        run.work_here()
-        return
-    with engine(client, workers) as chosen:
-        run.work(chosen)
-
-
 class _Run:
     """One run: who learns its steps, and what came of them."""
 
     def __init__(
-        self,
-        steps: Steps,
-        report: FleetReport,
-        into: Destination,
-        progress: Progress,
-        found: Sequence[str],
+        self, steps: Steps, report: FleetReport, into: Destination, progress: Progress, found: Sequence[str]
     ) -> None:
         self._steps, self._report, self._into, self._progress = steps, report, into, progress
         self._patience, self._total = into.making.patience, len(found)
@@ -291,3 +317,230 @@ def _is_of(error: Exception, path: Path) -> bool:
     if isinstance(error, DamageError):
         return error.path == path or path in error.path.parents
     return isinstance(error, MismatchError | NotAStoreError | VersionError)
+
+
+class Destination:
+    """The memory that comes out: made when the first touches come in.
+
+    making: what it is made with. learned: whether it was there before the run, with touches.
+
+    Raises AnnotationError where it has another quantity than is declared for it, under one name.
+    """
+
+    def __init__(
+        self,
+        place: Path,
+        requested: RecipeRequest,
+        options: SourceOptions,
+        patience: float | None,
+        stack: ExitStack,
+        report: FleetReport,
+        descriptions: Choice,
+    ) -> None:
+        self._place, self._stack, self._report, self._descriptions = place, stack, report, descriptions
+        self.learner: TactileLearner | None = None
+        if place.exists():
+            self.learner = stack.enter_context(TactileLearner.open(place, **requested.arguments))
+            hush(self.learner)
+            if adaptations := self.learner.memory.corrections:  # workers learn apart from it
+                raise InputError(
+                    f"{place} was adapted to a changed skin by row {max(adaptations)}, of which the workers of a fleet "
+                    "know nothing: learn with scroll-tactile learn, or retract that row first"
+                )
+        there = {} if self.learner is None else self.learner.quantities
+        for quantity in options.declared:
+            require_declarable(there, quantity)
+        recipe = requested.recipe() if self.learner is None else self.learner._recipe
+        self.making = Making(recipe, options, patience, tuple(there.values()))
+        self.learned = self.learner is not None and bool(self.learner.observations())
+        self._made = self.learner is None
+
+    def opened(self) -> TactileLearner:
+        """The memory, made where there is none."""
+        if self.learner is None:
+            self.learner = self._stack.enter_context(self.making.open(self._place))
+            hush(self.learner)
+        return self.learner
+
+    def learn(self, step: Step, progress: Progress) -> None:
+        """Learn the recordings of a step. Raises StoreError, CapacityError."""
+        options, recipe = self.making.options, self.making.recipe
+        if self.learner is None and not has_touches(recipe.sensor, step.sources, options, recipe.embedding):
+            learner = TactileLearner(sensor=recipe.sensor, embedding=recipe.embedding)  # for what is refused
+            hush(learner)
+        else:
+            learner = self.opened()
+        done = learn_sources(learner, step.sources, options, progress)
+        step.made, step.failed = Made("", range_problem=done.range_problem), done.failed
+        self._report.observations += done.learned.total()
+        self._report.repeated += done.skipped
+        self._report.refused += done.refused
+        self._save()
+
+    def merge(
+        self, path: Path, progress: Progress, clipped: Collection[bytes] = (), source: str | None = None
+    ) -> list[tuple[Head, str]]:
+        """Merge a memory, each touch once; its rows that are refused, and why. Raises as `Ledger.merge`."""
+        begun, processor = time.perf_counter(), time.process_time()
+        try:
+            ledger = self.opened()._ledger
+            # What our own workers made is taken as what this memory holds itself.
+            rules = MergeRules(
+                one_name=True,
+                descriptions=self._descriptions,
+                clipped=clipped,
+                default_source=source,
+                thorough=source is not None,
+            )
+            merged, refused = ledger.merge(path, rules, progress)
+            self._save()
+        finally:
+            self._report.merging += time.perf_counter() - begun
+            self._report.processor["merging"] += time.process_time() - processor
+        self._report.observations += merged.observations
+        self._report.repeated += merged.shared
+        return refused
+
+    def _save(self) -> None:
+        ledger = None if self.learner is None else self.learner._ledger
+        if ledger is not None:
+            ledger.checkpoint_in_background(SAVED_EVERY)
+
+    def close(self, progress: Progress) -> None:
+        """Write a checkpoint and a fitted model, and close it.
+
+        Raises InputError where nothing was learned; it is not there then.
+        """
+        if self.learner is None or (self._made and not self.learner.memory.sequence):
+            if self.learner is not None:
+                self.learner.close()
+                remove_tree(self._place)
+            refused = self._report.refused
+            first = f", such as {refused[0].source}: {refused[0].why}" if refused else ""
+            raise InputError(f"nothing was learned, and no memory made: {len(refused)} sources were refused{first}")
+        self._report.held, self._report.digest = sum(self.learner.materials.values()), self.learner.digest()
+        self.learner._ledger.saves = True
+        store_model(self.learner, progress)
+        self.learner.close()
+
+
+class Engine:
+    """Who runs the jobs: an Executor of the caller's.
+
+    workers: how many jobs run at once, as far as is known. room: how many are handed over at once. own: whether they
+    are processes of ours, which can be ended.
+    """
+
+    own = False
+
+    def __init__(self, executor: Executor, workers: int) -> None:
+        self._executor, self.workers, self.room = executor, workers, 2 * workers
+
+    def submit(self, what: Callable[[Any], Made], job: LearnJob) -> Future[Made]:
+        """Have a job done; the future raises where it could not be."""
+        return self._executor.submit(what, job)
+
+    def abandon(self, future: Future[Made]) -> None:
+        """Wait no longer for a job."""
+        future.cancel()
+
+    @property
+    def name(self) -> str:
+        """What runs the jobs."""
+        return type(self._executor).__name__
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """The executor is the caller's."""
+
+
+class Processes(Engine):
+    """So many processes, each a pool of its own: one that dies takes nobody else's job with it."""
+
+    own = True
+
+    def __init__(self, workers: int) -> None:
+        self.workers = self.room = workers
+        self._free: list[ProcessPoolExecutor] = []
+        self._all: set[ProcessPoolExecutor] = set()
+        self._busy: dict[Future[Made], ProcessPoolExecutor] = {}
+        method = "forkserver" if "forkserver" in get_all_start_methods() else "spawn"
+        self._context: Any = get_context(method)
+        if method == "forkserver":  # whoever comes after a worker that died need not import all of it again
+            self._context.set_forkserver_preload([__name__])
+
+    def submit(self, what: Callable[[Any], Made], job: LearnJob) -> Future[Made]:
+        """As `Engine.submit`, by a process that has nothing else to do."""
+        for left in range(STARTS, 0, -1):
+            pool = self._free.pop() if self._free else self._new()
+            try:
+                future = pool.submit(what, job)
+            except (BrokenProcessPool, EOFError, OSError) as error:  # it died while it waited, or its fork server did
+                self._drop(pool)
+                if left == 1:
+                    why = f"{type(error).__name__}: {error}"
+                    raise ScrollTactileError(f"no worker can be started ({why}). Call again to go on") from error
+                time.sleep(PAUSE)
+            else:
+                break
+        self._busy[future] = pool
+        future.add_done_callback(lambda done: self._back(pool, done))
+        return future
+
+    def abandon(self, future: Future[Made]) -> None:
+        """End the process that does a job, however it is held."""
+        pool = self._busy.pop(future, None)
+        if pool is not None:
+            processes = list((pool._processes or {}).values())  # none after its end
+            self._drop(pool)
+            for process in processes:
+                process.kill()
+
+    def _drop(self, pool: ProcessPoolExecutor) -> None:
+        self._all.discard(pool)
+        pool.shutdown(wait=False)
+
+    def _new(self) -> ProcessPoolExecutor:
+        pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_begin, initargs=(dict(os.environ),))
+        self._all.add(pool)
+        return pool
+
+    def _back(self, pool: ProcessPoolExecutor, done: Future[Made]) -> None:
+        broken = not done.cancelled() and isinstance(done.exception(), BrokenProcessPool)
+        if self._busy.pop(done, None) is None or broken:  # it was abandoned, or died
+            self._drop(pool)
+        else:
+            self._free.append(pool)
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        for pool in list(self._all):
+            pool.shutdown(wait=kind is None, cancel_futures=True)
+
+
+def _begin(environment: dict[str, str]) -> None:
+    """Make a worker: of the environment that its parent has now, for a fork server keeps the one that it began with.
+
+    One whose parent was killed ends, too, and it leaves arithmetic to one thread: there are others beside it.
+    """
+    os.environ.clear()
+    os.environ.update(environment)
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    parent = parent_process()
+    if parent is not None:
+        threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
+
+
+def engine(client: Any, workers: int | None) -> Engine:
+    """Who runs the jobs: the caller's client or Executor, or so many processes. Raises InputError for what is none."""
+    if client is None:
+        return Processes(workers or os.cpu_count() or 1)
+    executor = client.get_executor() if hasattr(client, "get_executor") else client
+    if not isinstance(executor, Executor):
+        raise InputError(f"expected a dask.distributed.Client or an Executor; came {type(client).__name__}")
+    cores = getattr(client, "ncores", None)
+    known = sum(cores().values()) if callable(cores) else getattr(executor, "_max_workers", 0)
+    return Engine(executor, workers or known or os.cpu_count() or 1)

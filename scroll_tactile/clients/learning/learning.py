@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from scroll_tactile.clients.learning.classification import Answers
-from scroll_tactile.clients.learning.metrics import calibration_error, interval_figures
+from scroll_tactile.clients.learning.metrics import Answers, calibration_error, interval_figures
 from scroll_tactile.clients.learning.sources import Refused, SourceOptions, SourceTouch, source_touches
 from scroll_tactile.errors import EmbeddingError, InputError, printable
 from scroll_tactile.learner import TactileLearner

@@ -45,8 +45,8 @@ def export_plain(
     - `exemplars.csv`: material, rank, key, file; and `exemplars/`, their readings as .npy, (T, n) in the sensor's unit.
     - `descriptions.csv`: material, constituent, present (yes, no, unknown), share by mass where it was given; and
       `properties.csv`: material, property, value, unit. Only where anything was described.
-    - In the tables a name or source that a spreadsheet would compute, for it begins with = + - @, has an apostrophe in
-      front, also behind a semicolon within (see `errors.plain_cell`).
+    - In the tables a name, source or heading that a spreadsheet would compute, for it begins with = + - @, has an
+      apostrophe in front, also behind a semicolon within (see `errors.plain_cell`).
     - `memory.json`: format 2, sensor, embedding, digest, date, and the number of touches. It is written last.
 
     The classifier of a scale follows with NumPy alone. With means m_y = sums / counts, N rows and n touches,
@@ -169,6 +169,6 @@ def _arrays(statistics: Statistics) -> dict[str, npt.NDArray[Any]]:
 
 def _rows(path: Path, header: list[str], rows: list[list[Any]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows([plain_cell(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
+        csv.writer(file).writerows(
+            [plain_cell(cell) if isinstance(cell, str) else cell for cell in row] for row in [header, *rows]
+        )

@@ -100,7 +100,7 @@ class RecipeRequest:
     def recipe(self) -> Recipe:
         """The recipe of a new memory. Raises InputError without a sensor, or for an augmentation that is not for it."""
         if self.sensor is None:
-            raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
+            raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are", argument="sensor")
         require_augmentable(self.sensor, self.augmentation)
         embedding = default_embedding(self.sensor) if self.embedding is None else self.embedding
         return Recipe.of(self.sensor, embedding, self.augmentation, self.settings)

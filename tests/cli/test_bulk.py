@@ -64,7 +64,7 @@ def test_what_learns_many_touches_leaves_a_model_that_a_reader_answers_by(
     folder, sensor = tmp_path / "m", ("--sensor", "roboskin", "--label-by", "folder")
     if command == "merge":
         TactileLearner.open(folder, sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64)).close()
-        done = run("memory", "merge", folder, of_six, "--shared", "once")
+        done = run("memory", "merge", folder, of_six)
     else:
         done = run(command, folder, data, *sensor, *(("--workers", 1) if command == "fleet" else ()))
     assert done.exit_code == 0, done.output
@@ -279,13 +279,12 @@ class TestList:
         assert (row["sequence"], row["material"], row["state"]) == (1, "silk", "kept")
         assert row["source"] == str(data / "silk" / "0.npy")
 
-    def test_the_same_touch_is_told_and_learned_again_by_who_means_it(self, memory: Path, data: Path) -> None:
+    def test_the_same_touch_is_told_and_learned_once(self, memory: Path, data: Path) -> None:
         words = ("observe", memory, "silk", data / "silk" / "0.npy")
         run(*words)
         again = run(*words)
         assert again.exit_code == 0 and "observed 1 time" in again.stdout
         assert "this touch was learned already, as observation 1" in again.stdout
-        assert "observed 2 times" in run(*words, "--again").stdout
         other = run("observe", memory, "wool", words[-1]).stdout
         assert "is there as silk, too: relabel or retract one of them" in other and "observed 1 time" in other
 

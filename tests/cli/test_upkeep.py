@@ -101,7 +101,7 @@ class TestCheckAndRepair:
             "backup": [tmp_path / "copy"],
             "retract": [1],
             "forget": ["a"],
-            "merge": [tmp_path, "--shared", "once"],
+            "merge": [tmp_path],
         }
         opens = command in ("compact", "export", "retract", "forget", "merge")  # the others look at what may be damaged
         expected = "there is no memory in" if opens else "holds no store"
@@ -116,8 +116,7 @@ class TestRetracting:
         with TactileLearner.open(tmp_path / "other", **SETTINGS) as learner:
             learner.observe("d", stream((9, 60)))
             before = learner.digest()
-        assert "--shared once as one touch" in refused("memory", "merge", tmp_path / "other", tmp_path / "p")
-        merged = run("memory", "merge", tmp_path / "other", tmp_path / "p", "--shared", "once")
+        merged = run("memory", "merge", tmp_path / "other", tmp_path / "p")
         assert merged.exit_code == 0 and "12 observations came in" in merged.output
         assert "no observation" in refused("memory", "forget", tmp_path / "other", "--source", "robot")
         forgotten = run("memory", "forget", tmp_path / "other", "--source", "robot 7")
@@ -145,7 +144,7 @@ class TestRetracting:
         with TactileLearner.open(tmp_path / "other", **SETTINGS) as other:
             for name, touch in [("a", (0, 60)), ("d", (1, 60))]:
                 other.observe(name, stream(touch))
-        result = words(run("memory", "merge", path, tmp_path / "other", "--shared", "once"))
+        result = words(run("memory", "merge", path, tmp_path / "other"))
         assert "1 observation came in, 1 stream observed by both; 13 are there now" in result
         with TactileLearner.open(path, **SETTINGS) as learner:
             require_same(learner, [*OBSERVED, ("d", (1, 60))])

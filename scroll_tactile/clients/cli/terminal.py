@@ -9,8 +9,9 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -20,10 +21,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from scroll_tactile_store import NotAStoreError, StoreError
 from typer.core import TyperGroup
 
+from scroll_tactile import __version__, native
 from scroll_tactile.clients.cli import INTERRUPTED
-from scroll_tactile.clients.cli.wording import has_option, in_options, typed
 from scroll_tactile.errors import InputError, RangeWarning, ScrollTactileError, plain_cell, printable
 from scroll_tactile.results import Estimate, Prediction
+from scroll_tactile.settings import GONE
 
 if TYPE_CHECKING:
     from scroll_tactile.clients.learning.sources import Refused
@@ -34,6 +36,7 @@ __all__ = [
     "Commands",
     "confusion_text",
     "console",
+    "counted",
     "estimate_text",
     "opened",
     "opened_for_upkeep",
@@ -45,10 +48,13 @@ __all__ = [
     "say_refused",
     "shown",
     "verdict",
+    "version",
 ]
 
 
 MOST_REFUSED = 20
+
+_options: ContextVar[dict[str, str]] = ContextVar("_options")  # of the command that was typed, by their names in Python
 
 
 def console(*, error: bool = False) -> Console:
@@ -78,7 +84,7 @@ def say_refused(refused: Sequence[Refused]) -> None:
     """Print on the standard error what could not be taken, and why; at most 20, and one list of what a file has."""
     listed = False
     for each in refused[:MOST_REFUSED]:
-        first, *others = in_options(each.why).splitlines() or [""]
+        first, *others = in_options(each.why, each.argument).splitlines() or [""]
         _warn(f"[yellow]refused:[/] {shown(each.source)}: {shown(first)}")
         for line in [] if listed else others:
             _warn(f"  {shown(line)}")
@@ -92,6 +98,26 @@ def shown(text: object) -> str:
     return escape(printable(str(text)))
 
 
+def counted(number: int, what: str) -> str:
+    """A number and what it counts, given in the singular: "1 touch", "2 touches"."""
+    plural = "es" if what.endswith("ch") else "s"
+    return f"{number} {what}{'' if number == 1 else plural}"
+
+
+def _show_version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"scroll-tactile {__version__}, kernels {native.described()}")
+        raise typer.Exit
+
+
+def version(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version, and exit.")
+    ] = False,
+) -> None:
+    """Take the options that belong to no command."""
+
+
 class Commands(TyperGroup):
     """Commands that end with one red line and exit code 1 on an expected error, and with 130 on ctrl-C.
 
@@ -100,9 +126,14 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that was typed, whose options errors name."""
-        found = super().resolve_command(ctx, args)
+        try:
+            found = super().resolve_command(ctx, args)
+        except Exception as error:
+            _say_what_replaces(error, args[0])
+            raise
         if found[1] is not None:
-            typed(found[1].params)
+            own = [each for each in found[1].params if each.opts[0].startswith("-")]
+            _options.set({each.name: max(each.opts, key=len) for each in own})
         return found
 
     def invoke(self, ctx: Any) -> Any:
@@ -112,13 +143,40 @@ class Commands(TyperGroup):
                 return super().invoke(ctx)
         except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
             if not isinstance(error, BrokenPipeError):  # whoever read the output has enough of it
-                message = in_options(str(error)) or "no memory is left"
+                message = in_options(str(error), getattr(error, "argument", None)) or "no memory is left"
                 text = " ".join([*message.split(), *getattr(error, "__notes__", [])])
                 _warn(f"[bold red]Error:[/] [red]{shown(text)}[/]")
             raise typer.Exit(1) from error
         except KeyboardInterrupt:
             _warn("[yellow]Interrupted.[/] What was observed is kept where there is a memory; start again to go on.")
             raise typer.Exit(INTERRUPTED) from None
+        except Exception as error:
+            if hasattr(error, "possibilities"):  # of an option that there is not
+                _say_what_replaces(error, error.option_name)
+            raise
+
+
+def _say_what_replaces(error: Any, name: str) -> None:
+    """Add to the error of a command or an option that there is not what replaces it, where it is one that is gone."""
+    if (instead := GONE.get(name.lstrip("-"))) is not None:
+        error.message = f"{error.message.rstrip('.')}: it is gone. {instead}"
+
+
+def in_options(text: str, argument: str | None) -> str:
+    """An error's message, with the arguments that the error names as options of the command that was typed.
+
+    `cut='none'` is `--cut 'none'` there; an argument that the command has no option for is said to be Python's.
+    """
+    text, absent = f" {text}", []
+    for name in argument.split() if argument else ():
+        option = _options.get({}).get(name)
+        if option is None:
+            absent += [f"{name}="] * (f"{name}=" in text)
+            continue
+        for before in " (":
+            for value, after in (("True", ""), ("'", " '"), ('"', ' "'), ("", "")):
+                text = text.replace(f"{before}{name}={value}", f"{before}{option}{after}")
+    return text[1:] + f" ({', '.join(absent)}: from Python alone)" * bool(absent)
 
 
 @contextmanager
@@ -130,7 +188,7 @@ def _warnings_as_lines() -> Iterator[None]:
 
         def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
             if issubclass(category, RangeWarning):
-                _warn(f"[yellow]Warning:[/] {shown(in_options(str(message)))}")
+                _warn(f"[yellow]Warning:[/] {shown(message)}")
             else:
                 others(message, category, *where, **more)
 
@@ -143,8 +201,13 @@ def _warn(text: str) -> None:
         Console(stderr=True, highlight=False, soft_wrap=True).print(text)
 
 
-def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "read"] = "write") -> TactileLearner:
-    """A memory, or a new one where there is nothing and a sensor is given. Raises what `TactileLearner.open` raises."""
+def opened(
+    path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "read"] = "write", new: bool = False
+) -> TactileLearner:
+    """A memory, or a new one where there is nothing and a sensor is given. Raises what `TactileLearner.open` raises.
+
+    new: whether the command makes a memory, which takes a sensor or a preset.
+    """
     from scroll_tactile.learner import TactileLearner
 
     try:
@@ -152,15 +215,13 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Literal["write", "
     except (InputError, NotAStoreError) as error:
         if path.is_file() or sensor is not None or (mode == "read" and path.exists()):
             raise
-        raise _no_memory(path) from error
+        raise _no_memory(path, new=new) from error
 
 
-def _no_memory(path: Path) -> InputError:
+def _no_memory(path: Path, *, new: bool = False) -> InputError:
     """The error of a command whose memory is not there, with how this or another command makes one."""
-    how = "scroll-tactile observe or learn makes one"
-    if has_option("sensor"):
-        how = "to make one, say which sensor it is for: sensor=" + " or preset=" * has_option("preset")
-    return InputError(f"there is no memory in {path}; {how}")
+    how = "to make one, say which sensor it is for: --sensor or --preset"
+    return InputError(f"there is no memory in {path}; {how if new else 'scroll-tactile observe or learn makes one'}")
 
 
 def opened_for_upkeep(path: Path, *, mode: Literal["write", "read"] = "write") -> TactileLearner:

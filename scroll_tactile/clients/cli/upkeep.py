@@ -1,30 +1,46 @@
-"""`scroll-tactile memory …`: checking, repairing, copying, compacting, merging and retracting."""
+"""`scroll-tactile memory …`, `ros2` and `mcp`: what looks after a memory on disk, and what serves one."""
 
 from __future__ import annotations
 
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from scroll_tactile_store import Store, StoreError, repair_store
 
-from scroll_tactile.clients.cli.options import MemoryFolder, materials_of
-from scroll_tactile.clients.cli.terminal import Commands, opened, opened_for_upkeep, progress_bar, say, say_json, shown
-from scroll_tactile.clients.cli.wording import counted
+from scroll_tactile.clients.cli.options import (
+    AsJson,
+    Axis,
+    MemoryFolder,
+    Named,
+    Risk,
+    Scene,
+    Sources,
+    materials_of,
+    with_options,
+)
+from scroll_tactile.clients.cli.terminal import (
+    Commands,
+    counted,
+    opened,
+    opened_for_upkeep,
+    progress_bar,
+    say,
+    say_json,
+    say_refused,
+    shown,
+)
 from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.settings import GONE
 
-__all__ = ["memory"]
+__all__ = ["PASSED_ON", "mcp", "memory", "ros2"]
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""What `ros2` is made with, so that --ros-args and what follows reach ROS."""
 
 memory = typer.Typer(cls=Commands, no_args_is_help=True, help="Look after a memory on disk.")
-
-
-class Shared(StrEnum):
-    """How streams that both memories observed are counted."""
-
-    ONCE = "once"
-    TWICE = "twice"
 
 
 class ExportForm(StrEnum):
@@ -57,7 +73,7 @@ def reembed(
 
 
 @memory.command()
-def check(folder: MemoryFolder, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
+def check(folder: MemoryFolder, as_json: AsJson = False) -> None:
     """Verify all that is in a memory, in a process that may die of it; change nothing.
 
     The exit code is 1 where something is damaged.
@@ -96,7 +112,7 @@ def health(
     source: Annotated[str | None, typer.Option(help="Only touches from there, such as one robot's.")] = None,
     after: Annotated[int, typer.Option(min=0, help="Only touches behind this observation.")] = 0,
     bound: Annotated[float, typer.Option(help="Of the probability of a false alarm, over all time.")] = 0.01,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Tell whether the sensor is still the one that learned, since when not, which channels, and what to do.
 
@@ -320,20 +336,12 @@ def merge(
         Path,
         typer.Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
     ],
-    shared: Annotated[
-        Shared | None, typer.Option(help="How a stream that both observed is counted.", show_default=False)
-    ] = None,
 ) -> None:
     """Make a memory the one that observed all that both did, exactly."""
     from scroll_tactile.clients.learning.learning import store_model
 
-    if shared is None:
-        raise InputError(
-            "say how a stream that both memories observed is counted: --shared once as one touch, such as of two "
-            "copies of a memory that both went on; --shared twice as two, if it was observed again on purpose"
-        )
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
-        done = learner.merge(other, shared=shared.value, progress=progress)
+        done = learner.merge(other, shared="once", progress=progress)
         store_model(learner, progress)
         digest, count = learner.digest(), sum(learner.materials.values())
     say(
@@ -341,3 +349,118 @@ def merge(
         f"{count} are there now"
     )
     say(f"[bold]digest:[/] {digest}")
+
+
+@memory.command()
+@with_options
+def adapt(
+    folder: MemoryFolder,
+    sources: Sources,
+    *,
+    until: Annotated[
+        int | None, typer.Option(min=0, help="The last observation of the skin before; health says since when.")
+    ] = None,
+    how: Named,
+    as_json: AsJson = False,
+) -> None:
+    """Take over a changed skin, from about five touches of known materials felt with it; nothing is learned of them.
+
+    Later touches are read through what was found; `memory retract` takes it back. The exit code is 1 where it was not
+    kept, or a source was refused, which is named then.
+    """
+    from scroll_tactile.clients.learning.sources import Refused, find_sources, source_touches
+
+    found, missing = find_sources(sources)
+    options = how.of(found)
+    with opened_for_upkeep(folder) as learner, progress_bar() as progress:
+        touches = [touch for address in found for touch in source_touches(learner, address, options)]
+        refused = missing + [touch for touch in touches if isinstance(touch, Refused)]
+        progress("adapting", 0, 1)
+        known = [(str(touch.material), touch.stream) for touch in touches if not isinstance(touch, Refused)]
+        done = learner.adapt(known, until=until)
+    if as_json:
+        say_json(vars(done))
+    else:
+        say((f"[green]adapted:[/] by row {done.sequence}; " if done.kept else "[yellow]not adapted:[/] ") + done.why)
+        say(f"the touches lie {done.before:.2f} from what was learned, corrected {done.after:.2f}; 1 is usual")
+    say_refused(refused)
+    if refused or not done.kept:
+        raise typer.Exit(1)
+
+
+def ros2(
+    context: typer.Context,
+    memory: Annotated[
+        Path | None, typer.Option(help="The folder of the memory; here or as the parameter memory.")
+    ] = None,
+    topic: Annotated[str, typer.Option(help="Where the readings are sent; a preset may know it.")] = "",
+    field: Annotated[
+        str, typer.Option(help="The path to a message's numbers, such as tactiles[0].electrodes; a preset may know it.")
+    ] = "",
+    preset: Annotated[
+        str | None,
+        typer.Option(help="A known sensor, which gives sensor, topic and field: biotac, xela-uskin, anyskin, …"),
+    ] = None,
+    kind: Annotated[
+        str | None, typer.Option("--type", help="The messages' type, as package/msg/Name; else what the topic says.")
+    ] = None,
+    risk: Risk = 0.05,
+    scene: Scene = None,
+    contact: Annotated[
+        str, typer.Option(help="auto finds touches, after 2 s at rest; manual waits for the services begin and end.")
+    ] = "auto",
+    of: Axis = None,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="Note rest and known touches for the sensor's health, some hundred bytes each."),
+    ] = False,
+    sensor: Annotated[
+        str | None, typer.Option(help="As for observe: whose readings they are. Needed only to make a new memory.")
+    ] = None,
+) -> None:
+    """Run the ROS 2 lifecycle node scroll_tactile until ctrl-C: readings from a topic, answers on ~/answer.
+
+    It comes up active. What follows --ros-args is ROS': --params-file FILE, -p autostart:=false. Each
+    option is a parameter, too, and so are mode, qos.reliability, qos.durability and qos.depth; `ros2 param describe`
+    explains them. risk, scene and health_after can be set while it runs, the others before it is configured.
+
+    Topics, of which late subscribers get the last: ~/answer (JSON), ~/status (by name, with a header), ~/material,
+    ~/probability, ~/novelty and ~/known (plain numbers, for plots), ~/tactile_answer (where scroll_tactile_msgs is
+    built), and /diagnostics. Several fingers are several nodes, each in a namespace of its own: -r __ns:=/left
+
+    Services that take a name, as load_namespace of diagnostic_msgs/srv/AddDiagnostics: ~/learn, ~/forget, ~/retract
+    (an observation's number), ~/save (a file beside the memory). Services of std_srvs/srv/Trigger: ~/undo, ~/materials,
+    ~/predict, ~/again (before another touch of the same thing), ~/begin and ~/end (with --contact manual).
+
+    ros2 service call /scroll_tactile/learn diagnostic_msgs/srv/AddDiagnostics "{load_namespace: silk}"
+    """
+    if context.args and (first := context.args[0]) != "--ros-args":
+        how = GONE.get(first.lstrip("-"), "see --help. Options of ROS follow --ros-args")
+        raise InputError(f"there is no option {first!r}: {how}")
+    from scroll_tactile.clients.ros2.serving import serve
+
+    parameters: dict[str, Any] = {"preset": preset, "type": kind, "risk": risk, "scene": scene, "contact": contact}
+    parameters |= {"of": of, "watch": watch, "sensor": sensor}
+    met = serve(memory, topic, field, arguments=context.args, **parameters)
+    count = met.pop("materials", 0)
+    met_in_words = ", ".join(f"{name.replace('_', ' ')}: {value}" for name, value in met.items() if value)
+    say(f"{shown(memory or 'the memory')}: {counted(count, 'material')}. {met_in_words}")
+
+
+def mcp(
+    memory: MemoryFolder,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="Let it observe and retract, too; without it the memory stays as it is.")
+    ] = False,
+    files: Annotated[
+        Path | None, typer.Option(help="A folder whose recordings it may name in place of readings.")
+    ] = None,
+) -> None:
+    """Serve a memory to a planner over standard input and output, by the Model Context Protocol, until it hangs up.
+
+    Its tools: what_is_felt, what_is_known, what_to_touch_again; with --learn observe and retract.
+    """
+    from scroll_tactile.clients.planner.server import serve
+
+    with opened(memory, mode="write" if learn else "read") as learner:
+        serve(learner, learn=learn, files=files)

@@ -96,14 +96,14 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     assert "(T, 60)" in refused("live", memory / "memory", memory / "narrow.npy")
     monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,x\n"))
     with pytest.raises(touches.InputError, match="line 2"):
-        list(touches._rows(touches.Path("-")))
+        list(touches._rows(touches.Path("-"), False, touches.Reading()))
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"1,2\n\xff\xfe,1\n"), encoding="utf-8"))
     with pytest.raises(touches.InputError, match=r"line 2.*xff"):
-        list(touches._rows(touches.Path("-")))
+        list(touches._rows(touches.Path("-"), False, touches.Reading()))
     monkeypatch.setattr(touches, "LONGEST_LINE", 8)
     monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,456789\n"))
     with pytest.raises(touches.InputError, match="a line a reading, of less than 8 characters"):
-        list(touches._rows(touches.Path("-")))
+        list(touches._rows(touches.Path("-"), False, touches.Reading()))
 
 
 @pytest.mark.parametrize("option", ["--topic", "--field", "--preset", "--clock"])

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from scroll_tactile_store import NotAStoreError
+from typer import Argument, Option
 
 from scroll_tactile.clients.cli.options import (
+    AsCsv,
     AsJson,
     Axis,
     MemoryFolder,
@@ -55,12 +57,7 @@ SECONDS = 20  # in which a scheduler answers
 
 @with_options
 def learn(
-    memory: MemoryFolder,
-    sources: Sources,
-    *,
-    sensor: SensorName = None,
-    how: Noted,
-    as_json: AsJson = False,
+    memory: MemoryFolder, sources: Sources, *, sensor: SensorName = None, how: Noted, as_json: AsJson = False
 ) -> None:
     """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
 
@@ -92,15 +89,9 @@ def learn(
 def _report_learned(done: Learned, held: int, as_json: bool) -> None:
     count = done.learned.total()
     if as_json:
-        found = {
-            "files": done.files,
-            "touches": count,
-            "learned": dict(sorted(done.learned.items())),
-            "skipped": done.skipped,
-            "refused": _refusals(done.refused),
-            "observations": held,
-        }
-        say_json(found)
+        learned = {"files": done.files, "touches": count, "learned": dict(sorted(done.learned.items()))}
+        left = {"skipped": done.skipped, "refused": _refusals(done.refused)}
+        say_json({**learned, **left, "observations": held})
         return
     of = f" of {counted(len(done.learned), 'material')}" if count else ""
     say(
@@ -118,13 +109,13 @@ def fleet(
     destination: MemoryFolder,
     sources: Sources,
     *,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as there are cores.")] = None,
+    workers: Annotated[int | None, Option(min=1, help="Processes; as many as there are cores.")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
+        str | None, Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
     ] = None,
-    add: Annotated[bool, typer.Option("--add", help="Add to a memory that was made in another way.")] = False,
+    add: Annotated[bool, Option("--add", help="Add to a memory that was made in another way.")] = False,
     patience: Annotated[
-        float | None, typer.Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
+        float | None, Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
     ] = None,
     sensor: SensorName = None,
     how: Noted,
@@ -139,21 +130,12 @@ def fleet(
 
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
-    chosen = sensor_for(destination, sensor, how.preset)
+    options, chosen = how.of(sources), sensor_for(destination, sensor, how.preset)
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(_connected(scheduler))
         progress = stack.enter_context(progress_bar())
-        done = learn(
-            destination,
-            sources,
-            how.of(sources),
-            sensor=chosen,
-            workers=workers,
-            client=client,
-            add=add,
-            patience=patience,
-            progress=progress,
-        )
+        running: dict[str, Any] = {"workers": workers, "client": client, "patience": patience, "progress": progress}
+        done = learn(destination, sources, options, sensor=chosen, add=add, **running)
     _report_fleet(done, as_json)
     if done.refused:
         raise typer.Exit(1)
@@ -171,18 +153,8 @@ def _connected(scheduler: str) -> Any:
 
 def _report_fleet(done: FleetReport, as_json: bool) -> None:
     if as_json:
-        say_json(
-            {
-                "sources": done.sources,
-                "observations": done.observations,
-                "repeated": done.repeated,
-                "refused": _refusals(done.refused),
-                "deaths": done.deaths,
-                "seconds": done.seconds,
-                "held": done.held,
-                "digest": done.digest,
-            }
-        )
+        names = ("sources", "observations", "repeated", "refused", "deaths", "seconds", "held", "digest")
+        say_json({name: getattr(done, name) for name in names} | {"refused": _refusals(done.refused)})
         return
     rate = done.observations / done.seconds if done.seconds else 0.0
     say(
@@ -205,10 +177,10 @@ def evaluate(
     how: Noted,
     of: Axis = None,
     with_learned: Annotated[
-        bool, typer.Option("--with-learned", help="Answer also the touches that the memory has learned.")
+        bool, Option("--with-learned", help="Answer also the touches that the memory has learned.")
     ] = False,
     as_json: AsJson = False,
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
+    as_csv: AsCsv = False,
 ) -> None:
     """Answer all touches in files and folders, and compare with what they are: accuracy, confusions, calibration.
 
@@ -310,16 +282,14 @@ def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
 def demo(
     memory: Annotated[
         Path | None,
-        typer.Option(help="Keep the memory in this folder. Interrupt the demo, start it again, and it goes on."),
+        Option(help="Keep the memory in this folder. Interrupt the demo, start it again, and it goes on."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the simulated materials.")] = 0,
-    sensor: Annotated[str, typer.Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",
-    features: Annotated[
-        int, typer.Option(min=64, help="Features of the embedding: fewer than the default, 1008.")
-    ] = 504,
-    materials: Annotated[int, typer.Option(hidden=True, min=2, max=20)] = 12,
-    touches: Annotated[int, typer.Option(hidden=True, min=1)] = 6,
-    held_out: Annotated[int, typer.Option(hidden=True, min=1)] = 4,
+    seed: Annotated[int, Option(help="Seed of the simulated materials.")] = 0,
+    sensor: Annotated[str, Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",
+    features: Annotated[int, Option(min=64, help="Features of the embedding: fewer than the default, 1008.")] = 504,
+    materials: Annotated[int, Option(hidden=True, min=2, max=20)] = 12,
+    touches: Annotated[int, Option(hidden=True, min=1)] = 6,
+    held_out: Annotated[int, Option(hidden=True, min=1)] = 4,
 ) -> None:
     """Ten seconds of learning: simulated materials, unknown first, then learned, and none forgotten.
 
@@ -330,15 +300,8 @@ def demo(
     from scroll_tactile.clients.learning.demo import Demo, pull_the_plug
     from scroll_tactile.sensors import read_sensor
 
-    task = Demo(
-        read_sensor(sensor),
-        seed,
-        materials=materials,
-        touches=touches,
-        held_out=held_out,
-        features=features,
-        folder=memory,
-    )
+    size = {"materials": materials, "touches": touches, "held_out": held_out, "features": features}
+    task = Demo(read_sensor(sensor), seed, **size, folder=memory)
     say(
         f"[bold]Simulated[/] {shown(task.sensor.name)} touches, seed {seed}: the names are only names, and nothing "
         "here is a result."
@@ -387,16 +350,16 @@ def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugg
 
 @with_options
 def report(
-    source: Annotated[Path, typer.Argument(help="The folder of a memory, or a recording.", show_default=False)],
-    page: Annotated[Path, typer.Argument(help="The page to write, such as page.html.", show_default=False)],
+    source: Annotated[Path, Argument(help="The folder of a memory, or a recording.", show_default=False)],
+    page: Annotated[Path, Argument(help="The page to write, such as page.html.", show_default=False)],
     *,
     how: Reading,
-    rate: Annotated[float | None, typer.Option(help="Of a recording without times: readings a second.")] = None,
+    rate: Annotated[float | None, Option(help="Of a recording without times: readings a second.")] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="Of a recording: whose readings they are, a name or a JSON file, for its range.")
+        str | None, Option(help="Of a recording: whose readings they are, a name or a JSON file, for its range.")
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(help="Of a recording: a table that cuts it to touches and names them, as for learn.")
+        Path | None, Option(help="Of a recording: a table that cuts it to touches and names them, as for learn.")
     ] = None,
 ) -> None:
     """Write a page that shows what a memory knows, or what a recording holds; any browser opens it, without network."""
@@ -406,8 +369,7 @@ def report(
     chosen = {**vars(how), "rate": rate}
     if _is_memory(source):
         every = {**chosen, "sensor": sensor, "labels": labels}
-        given = [f"--{name}" for name, value in every.items() if value is not None]
-        if given:
+        if given := [f"--{name}" for name, value in every.items() if value is not None]:
             raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
         from scroll_tactile.clients.report.memory_page import memory_page
 
@@ -420,8 +382,7 @@ def report(
 
         cut = None if labels is None else read_intervals(labels)
         whose = None if sensor is None else read_sensor(sensor)
-        words = {"sensor": sensor, "labels": None if labels is None else str(labels)}
-        came_by = {name: word for name, word in words.items() if word is not None}
+        came_by = {name: str(word) for name, word in (("sensor", sensor), ("labels", labels)) if word is not None}
         html = recording_page(source, sensor=whose, intervals=cut, given=came_by, **chosen)
     save(html, page)
     say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")
@@ -431,9 +392,6 @@ def _is_memory(source: Path) -> bool:
     """Whether a memory lies there, sound or not; what holds no store may be a recording."""
     from scroll_tactile_store.layout import holds_store
 
-    if not source.is_dir():
-        return False
-    try:
-        return holds_store(source)
-    except NotAStoreError:
-        return False
+    with suppress(NotAStoreError):
+        return source.is_dir() and holds_store(source)
+    return False

@@ -9,7 +9,7 @@ from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-import typer
+from typer import Argument, Option
 
 from scroll_tactile.errors import InputError
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from scroll_tactile.sensors import Sensor
 
 __all__ = [
+    "AsCsv",
     "AsJson",
     "Axis",
     "Columns",
@@ -36,46 +37,32 @@ __all__ = [
 ]
 
 
-class LabelSource(StrEnum):
-    """What names a touch."""
+LabelSource = StrEnum("LabelSource", ["file", "folder", "topic", "task"])
+Cut = StrEnum("Cut", ["episodes", "intervals", "none", "contact"])
 
-    FILE = "file"
-    FOLDER = "folder"
-    TOPIC = "topic"
-    TASK = "task"
-
-
-class Cut(StrEnum):
-    """How a recording is cut into touches."""
-
-    EPISODES = "episodes"
-    INTERVALS = "intervals"
-    NONE = "none"
-    CONTACT = "contact"
-
-
-MemoryFolder = Annotated[Path, typer.Argument(help="The folder of the memory.", show_default=False)]
+MemoryFolder = Annotated[Path, Argument(help="The folder of the memory.", show_default=False)]
 StreamFile = Annotated[
-    Path, typer.Argument(help="A recording of one touch, such as a .npy or .csv: a row a reading.", show_default=False)
+    Path, Argument(help="A recording of one touch, such as a .npy or .csv: a row a reading.", show_default=False)
 ]
 Sources = Annotated[
     list[str],
-    typer.Argument(
+    Argument(
         help="Recordings, or folders of them: .npy, .csv, .bag, .db3, .mcap, .h5, .zarr, LeRobot data sets, "
         "and addresses such as s3://…",
         show_default=False,
     ),
 ]
 SensorName = Annotated[
-    str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
+    str | None, Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
 ]
-Columns = Annotated[str | None, typer.Option(help="Of wider arrays and tables, by places from 0: 25:44, or 0,3,5:9.")]
-Axis = Annotated[str | None, typer.Option(help="An axis of labels, such as slip, to answer by in place of materials.")]
+Columns = Annotated[str | None, Option(help="Of wider arrays and tables, by places from 0: 25:44, or 0,3,5:9.")]
+Axis = Annotated[str | None, Option(help="An axis of labels, such as slip, to answer by in place of materials.")]
 Scene = Annotated[
-    str | None, typer.Option(help="The materials that can be here, separated by commas; all of them otherwise.")
+    str | None, Option(help="The materials that can be here, separated by commas; all of them otherwise.")
 ]
-Risk = Annotated[float, typer.Option(help="The share of wrong answers among those that are decided.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Risk = Annotated[float, Option(help="The share of wrong answers among those that are decided.")]
+AsCsv = Annotated[bool, Option("--csv", help="Print CSV, a line for each touch.")]
+AsJson = Annotated[bool, Option("--json", help="Print JSON.")]
 
 
 @dataclass(frozen=True)
@@ -84,18 +71,14 @@ class Reading:
 
     preset: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="A known sensor under its driver, in place of sensor, topic and field: biotac, biotac-sp, xela-uskin, "
             "papillarray, anyskin, robotiq-tsf, digit, gelsight."
         ),
     ] = None
-    topic: Annotated[str | None, typer.Option(help="The topic that has the readings, in a recording of several.")] = (
-        None
-    )
-    field: Annotated[str | None, typer.Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
-    clock: Annotated[str | None, typer.Option(help="device, header, publish or log; or a field, column or array.")] = (
-        None
-    )
+    topic: Annotated[str | None, Option(help="The topic that has the readings, in a recording of several.")] = None
+    field: Annotated[str | None, Option(help="The path to the numbers, such as 'tactiles[0].electrodes'.")] = None
+    clock: Annotated[str | None, Option(help="device, header, publish or log; or a field, column or array.")] = None
     columns: Columns = None
 
 
@@ -103,11 +86,11 @@ class Reading:
 class Named(Reading):
     """How recordings are read, cut into touches and named: the fields of `SourceOptions`, as they are typed."""
 
-    material: Annotated[str | None, typer.Option("--label", help="What all of them are touches of.")] = None
-    by: Annotated[LabelSource | None, typer.Option("--label-by", help="What names each touch.")] = None
+    material: Annotated[str | None, Option("--label", help="What all of them are touches of.")] = None
+    by: Annotated[LabelSource | None, Option("--label-by", help="What names each touch.")] = None
     intervals: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--labels",
             help="A .csv of touches, with columns file, begin, end (in seconds) and material; what is under 'force [N] "
             "0..10 step 0.01' (or 'force [N]', once declared) and 'slip \\[label]' is learned as values and labels.",
@@ -115,11 +98,11 @@ class Named(Reading):
     ] = None
     labels: Annotated[
         str | None,
-        typer.Option("--label-topic", help="A topic with texts, or a column, that says what is touched from then on."),
+        Option("--label-topic", help="A topic with texts, or a column, that says what is touched from then on."),
     ] = None
     cut: Annotated[
         Cut | None,
-        typer.Option(help="Where touches begin and end; without it by intervals or episodes if there are any."),
+        Option(help="Where touches begin and end; without it by intervals or episodes if there are any."),
     ] = None
 
     def of(self, found: Sequence[str]) -> SourceOptions:
@@ -145,7 +128,7 @@ class Noted(Named):
 
     annotate: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="A column of LeRobot data sets that is learned as a value or a label of each touch: 'force [N] 0..10 "
             "step 0.01' (or 'force [N]', once declared), 'slip \\[label]', and 'force [N] from observation.wrench[2]' "
             "where the column is called otherwise; several times. A value is the mean over the touch."
@@ -159,14 +142,12 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     The help text of a field is in its annotation, as that of any other option of typer's is.
     """
     hints = get_type_hints(command, include_extras=True)
-    groups = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     taken = []
     for each in signature(command).parameters.values():
-        if kind := groups.get(each.name):
-            own = get_type_hints(kind, include_extras=True)
-            taken += [(field.name, own[field.name], field.default) for field in fields(kind)]
-        else:
-            taken.append((each.name, hints[each.name], each.default))
+        kind = groups.get(each.name)
+        own = hints if kind is None else get_type_hints(kind, include_extras=True)
+        taken += [(one.name, own[one.name], one.default) for one in ([each] if kind is None else fields(kind))]
 
     def gathered(**typed: Any) -> None:
         for name, kind in groups.items():

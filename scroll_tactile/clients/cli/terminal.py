@@ -152,7 +152,7 @@ class Commands(TyperGroup):
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
             if hasattr(error, "possibilities"):  # of an option that there is not
-                _say_what_replaces(error, error.option_name)
+                _say_what_replaces(error, getattr(error, "option_name", ""))
             raise
 
 

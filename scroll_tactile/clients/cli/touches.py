@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.live import Live
 from rich.table import Table
+from typer import Argument, Option
 
 from scroll_tactile.clients.cli.options import (
+    AsCsv,
     AsJson,
     Axis,
     Columns,
@@ -64,6 +66,7 @@ WORDS = {"yes": True, "no": False, "unknown": None}
 SHOWN = 5  # materials of a touch under way
 BAR = 30  # characters of a probability of one
 LONGEST_LINE = 2**24  # characters of a reading, of a camera, too
+IRREGULAR = ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
 
 ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
 
@@ -71,12 +74,12 @@ ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
 @with_options
 def observe(
     memory: MemoryFolder,
-    material: Annotated[str, typer.Argument(help="What was touched; any name.", show_default=False)],
+    material: Annotated[str, Argument(help="What was touched; any name.", show_default=False)],
     file: StreamFile,
     *,
     sensor: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Whose readings they are: biotac, biotac-all, roboskin, contactile, gelsight, or a JSON file with "
             "name, channels, rate, low, high, unit and duration; or give --preset. Needed only to make a new memory."
         ),
@@ -84,10 +87,10 @@ def observe(
     how: Reading,
     value: Annotated[
         list[str] | None,
-        typer.Option(help="What was measured of it, such as force=1.4, of a declared quantity; several times."),
+        Option(help="What was measured of it, such as force=1.4, of a declared quantity; several times."),
     ] = None,
     axis: Annotated[
-        list[str] | None, typer.Option(help="What else it is, as axis=label, such as slip=north; several times.")
+        list[str] | None, Option(help="What else it is, as axis=label, such as slip=north; several times.")
     ] = None,
 ) -> None:
     """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
@@ -139,9 +142,9 @@ def predict(
     of: Axis = None,
     how: Reading,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
+        bool, Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
     ] = False,
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
+    as_csv: AsCsv = False,
 ) -> None:
     """Say what touches in files feel like; the memory stays as it is.
 
@@ -150,9 +153,8 @@ def predict(
     from scroll_tactile.clients.learning.learning import answers
     from scroll_tactile.clients.learning.sources import SourceOptions, find_sources
 
-    candidates = materials_of(scene)
+    candidates, options = materials_of(scene), SourceOptions(**vars(how))
     found, refused = find_sources(sources)
-    options = SourceOptions(**vars(how))
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
         answered = answers(learner, found, options, scene=candidates, of=of)
@@ -184,7 +186,7 @@ def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv:
             say_json({"source": each.touch.source} | _answer(each))
         else:
             say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
-            _say_estimates(each)
+            _say_estimates(each.estimates)
     return refused
 
 
@@ -193,7 +195,7 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
     from scroll_tactile.clients.learning.sources import Refused
 
     if isinstance(found, Refused):
-        raise InputError(found.why)
+        raise InputError(found.why, argument=found.argument)
     prediction = found.prediction
     if as_json:
         say_json(_answer(found))
@@ -201,21 +203,22 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
     say(f"{verdict(prediction)}, from {prediction.seconds:g} s of touch")
     for name, probability in prediction.ranking[:5]:
         say(f"  {percent(probability):>8}  {shown(name)}")
-    _say_estimates(found)
+    _say_estimates(found.estimates)
 
 
-def _say_estimates(answered: Answered) -> None:
-    for name, estimate in answered.estimates.items():
-        say(f"  {shown(name)}: {estimate_text(estimate)}")
+def _say_estimates(estimates: Mapping[str, Estimate], margin: str = "  ") -> None:
+    for name, estimate in estimates.items():
+        say(f"{margin}{shown(name)}: {estimate_text(estimate)}")
 
 
 def _answer(answered: Answered) -> dict[str, Any]:
-    of, found = answered.prediction, {name: own.as_json() for name, own in answered.estimates.items()}
-    return (
-        of.as_json()
-        | {"seconds": of.seconds, "ranking": of.ranking_as_json()}
-        | ({"estimates": found} if found else {})
-    )
+    of = answered.prediction
+    ranked = {"seconds": of.seconds, "ranking": of.ranking_as_json()}
+    return of.as_json() | ranked | _measured(answered.estimates)
+
+
+def _measured(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
 
 
 def answer_row(answered: Answered) -> list[Any]:
@@ -231,20 +234,10 @@ def inspect(memory: MemoryFolder, as_json: AsJson = False) -> None:
         kept = len(learner.memory.kept or ())
     size = sum(file.stat().st_size for file in memory.rglob("*") if file.is_file())
     if as_json:
-        found = {
-            "materials": materials,
-            "observations": sum(materials.values()),
-            "kept": kept,
-            "sensor": sensor.model_dump(mode="json"),
-            "embedding": {
-                "name": embedding.name,
-                "dimension": embedding.dimension,
-                "fingerprint": embedding.fingerprint,
-            },
-            "digest": digest,
-            "bytes": size,
-        }
-        say_json(found)
+        held = {"materials": materials, "observations": sum(materials.values()), "kept": kept}
+        made = {name: getattr(embedding, name) for name in ("name", "dimension", "fingerprint")}
+        by = {"sensor": sensor.model_dump(mode="json"), "embedding": made}
+        say_json({**held, **by, "digest": digest, "bytes": size})
         return
     table = Table("material", "observations")
     for name, count in materials.items():
@@ -263,16 +256,16 @@ def inspect(memory: MemoryFolder, as_json: AsJson = False) -> None:
 
 def describe(
     memory: MemoryFolder,
-    material: Annotated[str, typer.Argument(help="A material, observed or not yet.", show_default=False)],
+    material: Annotated[str, Argument(help="A material, observed or not yet.", show_default=False)],
     constituents: Annotated[
         list[str] | None,
-        typer.Argument(
+        Argument(
             help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown; a property as "
             "'hardness=62 Shore A'. None: its description is removed.",
             show_default=False,
         ),
     ] = None,
-    new: Annotated[bool, typer.Option("--new", help="Though its name is nearly that of an observed material.")] = False,
+    new: Annotated[bool, Option("--new", help="Though its name is nearly that of an observed material.")] = False,
 ) -> None:
     """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
     named = [_constituent(text) for text in constituents or []]
@@ -314,12 +307,7 @@ def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | Non
     return name.strip(), (share, unit.strip()) if unit else share
 
 
-def compose(
-    memory: MemoryFolder,
-    file: StreamFile,
-    columns: Columns = None,
-    as_json: AsJson = False,
-) -> None:
+def compose(memory: MemoryFolder, file: StreamFile, columns: Columns = None, as_json: AsJson = False) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
     from scroll_tactile.recordings import read
 
@@ -331,16 +319,13 @@ def compose(
         found = [
             {"constituent": each.name, **{name: getattr(each, name) for name in kept}} for each in made_of.constituents
         ]
-        answer = {"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material}
-        say_json(answer)
+        say_json({"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material})
         return
     table = Table("constituent", "there with", "share", "feels most like")
-    for constituent in made_of.constituents:
-        there = shown(constituent.unlearned) if constituent.presence is None else percent(constituent.presence)
-        share = "" if constituent.share is None else percent(constituent.share)
-        table.add_row(
-            shown(constituent.name), there, share, shown(constituent.evidence[0][0]) if constituent.evidence else ""
-        )
+    for each in made_of.constituents:
+        there = shown(each.unlearned) if each.presence is None else percent(each.presence)
+        share = "" if each.share is None else percent(each.share)
+        table.add_row(shown(each.name), there, share, shown(each.evidence[0][0]) if each.evidence else "")
     console().print(table)
     say(f"a material never observed: {percent(made_of.unfamiliar)}")
 
@@ -350,7 +335,7 @@ def live(
     memory: MemoryFolder,
     file: Annotated[
         Path,
-        typer.Argument(
+        Argument(
             help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of comma-separated numbers on "
             "the standard input, as they come.",
             show_default=False,
@@ -358,11 +343,11 @@ def live(
     ],
     *,
     risk: Risk = 0.05,
-    timed: Annotated[bool, typer.Option("--timed", help="The first column is each reading's time in seconds.")] = False,
+    timed: Annotated[bool, Option("--timed", help="The first column is each reading's time in seconds.")] = False,
     touch: Annotated[
-        bool, typer.Option("--touch", help="All of it is one touch; otherwise touches are found, after 2 s at rest.")
+        bool, Option("--touch", help="All of it is one touch; otherwise touches are found, after 2 s at rest.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
     of: Axis = None,
     how: Reading,
 ) -> None:
@@ -370,7 +355,7 @@ def live(
     from scroll_tactile.recordings.recording import places
 
     screen = console()
-    rows = _rows(file, timed, {name: value for name, value in vars(how).items() if name != "columns"})
+    rows = _rows(file, timed, how)
     if (columns := how.columns) is not None:
         rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
     growing, before = Live(console=screen, auto_refresh=False, transient=True), None
@@ -398,21 +383,20 @@ def _states(
         yield session.end(), at
 
 
-def _rows(
-    file: Path, timed: bool = False, where: Mapping[str, Any] | None = None
-) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+def _rows(file: Path, timed: bool, how: Reading) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
     """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
     import numpy as np
 
     from scroll_tactile.recordings import read
 
+    where = {name: value for name, value in vars(how).items() if name != "columns"}  # counted behind the time
     if str(file) != "-":
-        recording = read(file, **(where or {}))
+        recording = read(file, **where)
         own = recording.report.clock is not None and (timed or recording.topic is not None)
         for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
             yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
         return
-    if named := [f"--{name} {value}" for name, value in (where or {}).items() if value is not None]:
+    if named := [f"--{name} {value}" for name, value in where.items() if value is not None]:
         raise InputError(
             f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
         )
@@ -445,46 +429,25 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
     """Show what is new after a reading."""
     for ended in now.touches:
         if as_json:
-            _line(
-                "ended",
-                ended.at,
-                seconds=ended.stream.seconds,
-                decided=ended.decided,
-                revised=ended.revised is not None,
-                end=ended.end,
-                **ended.prediction.as_json(),
-                **_measured(ended.estimates),
-            )
+            more = {"revised": ended.revised is not None, "end": ended.end}
+            _line("ended", ended.at, _answer_of(ended, ended.stream.seconds, **more))
         else:
             say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {_judged(ended)}")
-            for name, estimate in ended.estimates.items():
-                say(f"            {shown(name)}: {estimate_text(estimate)}")
+            _say_estimates(ended.estimates, " " * 12)
             growing.update("", refresh=growing.is_started)
     old = before if before is not None and before.contact else None
     if not now.contact:
         return now
     if as_json:
         if old is None:
-            _line("began", at - now.seconds)
+            _line("began", at - now.seconds, {})
         if now.prediction is not None and (old is None or now.prediction is not old.prediction):
-            _line(
-                "prediction",
-                at,
-                seconds=now.seconds,
-                decided=now.decided,
-                **now.prediction.as_json(),
-                **_measured(now.estimates),
-            )
-        return now
-    if growing.is_started:
+            _line("prediction", at, _answer_of(now, now.seconds))
+    elif growing.is_started:
         growing.update(_table(now), refresh=True)
     elif now.decided and (old is None or not old.decided) and now.prediction is not None:
         say(f"{at:8.2f} s  after {now.seconds:.2f} s: {verdict(now.prediction)}, decided")
     return now
-
-
-def _measured(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    return {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
 
 
 def _judged(ended: LiveTouch) -> str:
@@ -497,9 +460,7 @@ def _judged(ended: LiveTouch) -> str:
 def _table(now: LiveState) -> Table:
     """The likeliest materials of a touch under way."""
     state = "decided" if now.decided else "not yet decided"
-    table = Table(title=f"touched for {now.seconds:.2f} s, {state}")
-    for heading in ("material", "probability", ""):
-        table.add_column(heading)
+    table = Table("material", "probability", "", title=f"touched for {now.seconds:.2f} s, {state}")
     if now.prediction is not None:
         for name, probability in now.prediction.ranking[:SHOWN]:
             table.add_row(shown(name), percent(probability), "█" * round(BAR * probability))
@@ -508,7 +469,12 @@ def _table(now: LiveState) -> Table:
     return table
 
 
-def _line(event: str, at: float, **more: Any) -> None:
+def _answer_of(touch: LiveTouch | LiveState, seconds: float, **more: Any) -> dict[str, Any]:
+    answer = {} if touch.prediction is None else touch.prediction.as_json()
+    return {"seconds": seconds, "decided": touch.decided, **more, **answer, **_measured(touch.estimates)}
+
+
+def _line(event: str, at: float, more: Mapping[str, Any]) -> None:
     say_json({"event": event, "at": round(at, 6), **more})
     sys.stdout.flush()
 
@@ -529,10 +495,5 @@ def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
         f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
         f"{report.revised} revised"
     )
-    irregular = [
-        name
-        for name in ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
-        if met.get(name)
-    ]
-    if irregular:
-        say(", ".join(f"{name.replace('_', ' ')}: {met[name]}" for name in irregular))
+    if irregular := [f"{name.replace('_', ' ')}: {met[name]}" for name in IRREGULAR if name in met]:
+        say(", ".join(irregular))

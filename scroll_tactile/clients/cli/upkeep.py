@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 from scroll_tactile_store import Store, StoreError, repair_store
+from typer import Argument, Option
 
 from scroll_tactile.clients.cli.options import (
     AsJson,
@@ -40,20 +41,15 @@ __all__ = ["PASSED_ON", "mcp", "memory", "ros2"]
 PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 """What `ros2` is made with, so that --ros-args and what follows reach ROS."""
 
+ExportForm = StrEnum("ExportForm", ["plain", "c"])
+
 memory = typer.Typer(cls=Commands, no_args_is_help=True, help="Look after a memory on disk.")
-
-
-class ExportForm(StrEnum):
-    """As what a memory is written."""
-
-    PLAIN = "plain"
-    C = "c"
 
 
 @memory.command()
 def reembed(
     folder: MemoryFolder,
-    default: Annotated[bool, typer.Option("--default", help="With the default embedding of its sensor.")] = False,
+    default: Annotated[bool, Option("--default", help="With the default embedding of its sensor.")] = False,
 ) -> None:
     """Embed all readings again, with the memory's own embedding as it is now.
 
@@ -84,8 +80,7 @@ def check(folder: MemoryFolder, as_json: AsJson = False) -> None:
         problems = check_in_process(folder, progress=progress)
     damaged = [problem for problem in problems if problem.kind != "leftover"]
     if as_json:
-        found = [{"path": str(problem.path), "what": problem.what, "kind": problem.kind} for problem in problems]
-        say_json({"sound": not damaged, "problems": found})
+        say_json({"sound": not damaged, "problems": [vars(each) | {"path": str(each.path)} for each in problems]})
     else:
         for problem in problems:
             colour = {"lost": "red", "spare": "yellow"}.get(problem.kind, "dim")
@@ -109,9 +104,9 @@ def check(folder: MemoryFolder, as_json: AsJson = False) -> None:
 @memory.command()
 def health(
     folder: MemoryFolder,
-    source: Annotated[str | None, typer.Option(help="Only touches from there, such as one robot's.")] = None,
-    after: Annotated[int, typer.Option(min=0, help="Only touches behind this observation.")] = 0,
-    bound: Annotated[float, typer.Option(help="Of the probability of a false alarm, over all time.")] = 0.01,
+    source: Annotated[str | None, Option(help="Only touches from there, such as one robot's.")] = None,
+    after: Annotated[int, Option(min=0, help="Only touches behind this observation.")] = 0,
+    bound: Annotated[float, Option(help="Of the probability of a false alarm, over all time.")] = 0.01,
     as_json: AsJson = False,
 ) -> None:
     """Tell whether the sensor is still the one that learned, since when not, which channels, and what to do.
@@ -152,8 +147,8 @@ def repair(folder: MemoryFolder) -> None:
 @memory.command()
 def compact(
     folder: MemoryFolder,
-    keep: Annotated[int, typer.Option(min=0, help="The newest so many observations can still be retracted.")] = 0,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    keep: Annotated[int, Option(min=0, help="The newest so many observations can still be retracted.")] = 0,
+    yes: Annotated[bool, Option("--yes", help="Do not ask.")] = False,
 ) -> None:
     """Give up the features of old observations for space: they stay learned, and can no longer be retracted."""
     with opened_for_upkeep(folder) as learner:
@@ -169,7 +164,7 @@ def compact(
 @memory.command()
 def backup(
     folder: MemoryFolder,
-    target: Annotated[Path, typer.Argument(help="The copy: a folder that is not there yet.", show_default=False)],
+    target: Annotated[Path, Argument(help="The copy: a folder that is not there yet.", show_default=False)],
 ) -> None:
     """Copy a memory, also while it is used: verified, whole, on the disk when it appears, or not there at all."""
     with Store.open(folder, mode="read") as store, progress_bar() as progress:
@@ -181,20 +176,20 @@ def backup(
 @memory.command()
 def export(
     folder: MemoryFolder,
-    target: Annotated[Path, typer.Argument(help="A new or empty folder.", show_default=False)],
+    target: Annotated[Path, Argument(help="A new or empty folder.", show_default=False)],
     form: Annotated[
         ExportForm,
-        typer.Option(
+        Option(
             "--format",
             help="plain: all it holds, as CSV, JSON and NumPy files. c: a judge for a microcontroller.",
         ),
-    ] = ExportForm.PLAIN,
+    ] = ExportForm.plain,
     scene: Annotated[
-        str | None, typer.Option(help="Of c: the materials that can be there, with commas between; all unless given.")
+        str | None, Option(help="Of c: the materials that can be there, with commas between; all unless given.")
     ] = None,
 ) -> None:
     """Write a memory so that it is read without scroll-tactile: all that it holds, or its judge as C for a chip."""
-    if form is ExportForm.C:
+    if form is ExportForm.c:
         say(f"written: {shown(target)}, {_export_c(folder, target, scene)}")
         return
     if scene is not None:
@@ -225,7 +220,7 @@ def _export_c(folder: Path, target: Path, scene: str | None) -> str:
 def declare(
     folder: MemoryFolder,
     quantity: Annotated[
-        str, typer.Argument(help="Name, unit, range, resolution: 'force [N] 0..10 step 0.01'.", show_default=False)
+        str, Argument(help="Name, unit, range, resolution: 'force [N] 0..10 step 0.01'.", show_default=False)
     ],
 ) -> None:
     """Have touches carry values of a quantity from now on; its unit and range stay as they are."""
@@ -240,7 +235,7 @@ def declare(
 @memory.command()
 def retract(
     folder: MemoryFolder,
-    observation: Annotated[int, typer.Argument(help="Its number, as observe and export give it.", show_default=False)],
+    observation: Annotated[int, Argument(help="Its number, as observe and export give it.", show_default=False)],
 ) -> None:
     """Take one observation out again, exactly, as if it had never been made; or what `memory adapt` found."""
     with opened_for_upkeep(folder) as learner:
@@ -252,8 +247,8 @@ def retract(
 @memory.command()
 def relabel(
     folder: MemoryFolder,
-    observation: Annotated[int, typer.Argument(help="Its number, as list gives it.", show_default=False)],
-    material: Annotated[str, typer.Argument(help="What it was a touch of.", show_default=False)],
+    observation: Annotated[int, Argument(help="Its number, as list gives it.", show_default=False)],
+    material: Annotated[str, Argument(help="What it was a touch of.", show_default=False)],
 ) -> None:
     """Put a wrong name right: retract one observation and learn it under another name, exactly and as one change."""
     with opened_for_upkeep(folder) as learner:
@@ -264,7 +259,7 @@ def relabel(
 @memory.command("list")
 def list_observations(
     folder: MemoryFolder,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, a line for each.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print JSON, a line for each.")] = False,
 ) -> None:
     """List the observations: number, material, time, what became of it (kept, compacted, retracted), what was noted of
     it, and source.
@@ -277,32 +272,22 @@ def list_observations(
         found = observations(store)
     for row in found:
         if as_json:
-            say_json(
-                {
-                    "sequence": row.sequence,
-                    "material": row.material,
-                    "time": row.time,
-                    "state": row.state,
-                    "source": row.source,
-                    "key": row.key.hex(),
-                    **({"values": row.values, "labels": row.labels} if row.values or row.labels else {}),
-                }
-            )
+            told = {name: getattr(row, name) for name in ("sequence", "material", "time", "state", "source")}
+            measured = {"values": row.values, "labels": row.labels} if row.values or row.labels else {}
+            say_json(told | {"key": row.key.hex()} | measured)
         else:
             state = "" if row.state == "kept" else f"  [yellow]{row.state}[/]"
-            noted = "".join(
-                f"  {shown(name)}={shown(str(told))}" for name, told in {**row.values, **row.labels}.items()
-            )
-            where = shown(row.source or "")
-            say(f"{row.sequence:>6}  {date_of(row.time)}  {shown(row.material)}{state}{noted}  {where}")
+            noted = "".join(f"  {shown(name)}={shown(what)}" for name, what in {**row.values, **row.labels}.items())
+            begin = f"{row.sequence:>6}  {date_of(row.time)}  {shown(row.material)}{state}"
+            say(f"{begin}{noted}  {shown(row.source or '')}")
 
 
 @memory.command()
 def forget(
     folder: MemoryFolder,
-    material: Annotated[str | None, typer.Argument(help="Its name.", show_default=False)] = None,
+    material: Annotated[str | None, Argument(help="Its name.", show_default=False)] = None,
     source: Annotated[
-        str | None, typer.Option(help="In place of a material: a file, or a folder or address of files, as list shows.")
+        str | None, Option(help="In place of a material: a file, or a folder or address of files, as list shows.")
     ] = None,
 ) -> None:
     """Retract all observations of a material, or from a source, exactly, as if they had never been made."""
@@ -315,12 +300,12 @@ def forget(
 @memory.command()
 def pack(
     folder: MemoryFolder,
-    target: Annotated[Path, typer.Argument(help="The file; one that is there is replaced.", show_default=False)],
+    target: Annotated[Path, Argument(help="The file; one that is there is replaced.", show_default=False)],
     rows: Annotated[
-        bool, typer.Option(help="With each touch's readings, so that it can be retracted where the file is merged.")
+        bool, Option(help="With each touch's readings, so that it can be retracted where the file is merged.")
     ] = True,
-    readings: Annotated[bool, typer.Option(help="With anything that shows a touch as it was read.")] = True,
-    source: Annotated[str | None, typer.Option(help="The source of touches that name none.")] = None,
+    readings: Annotated[bool, Option(help="With anything that shows a touch as it was read.")] = True,
+    source: Annotated[str | None, Option(help="The source of touches that name none.")] = None,
 ) -> None:
     """Write a memory as one file that travels, and that merge takes."""
     with opened_for_upkeep(folder, mode="read") as learner:
@@ -334,7 +319,7 @@ def merge(
     folder: MemoryFolder,
     other: Annotated[
         Path,
-        typer.Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
+        Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
     ],
 ) -> None:
     """Make a memory the one that observed all that both did, exactly."""
@@ -358,7 +343,7 @@ def adapt(
     sources: Sources,
     *,
     until: Annotated[
-        int | None, typer.Option(min=0, help="The last observation of the skin before; health says since when.")
+        int | None, Option(min=0, help="The last observation of the skin before; health says since when.")
     ] = None,
     how: Named,
     as_json: AsJson = False,
@@ -390,32 +375,30 @@ def adapt(
 
 def ros2(
     context: typer.Context,
-    memory: Annotated[
-        Path | None, typer.Option(help="The folder of the memory; here or as the parameter memory.")
-    ] = None,
-    topic: Annotated[str, typer.Option(help="Where the readings are sent; a preset may know it.")] = "",
+    memory: Annotated[Path | None, Option(help="The folder of the memory; here or as the parameter memory.")] = None,
+    topic: Annotated[str, Option(help="Where the readings are sent; a preset may know it.")] = "",
     field: Annotated[
-        str, typer.Option(help="The path to a message's numbers, such as tactiles[0].electrodes; a preset may know it.")
+        str, Option(help="The path to a message's numbers, such as tactiles[0].electrodes; a preset may know it.")
     ] = "",
     preset: Annotated[
         str | None,
-        typer.Option(help="A known sensor, which gives sensor, topic and field: biotac, xela-uskin, anyskin, …"),
+        Option(help="A known sensor, which gives sensor, topic and field: biotac, xela-uskin, anyskin, …"),
     ] = None,
     kind: Annotated[
-        str | None, typer.Option("--type", help="The messages' type, as package/msg/Name; else what the topic says.")
+        str | None, Option("--type", help="The messages' type, as package/msg/Name; else what the topic says.")
     ] = None,
     risk: Risk = 0.05,
     scene: Scene = None,
     contact: Annotated[
-        str, typer.Option(help="auto finds touches, after 2 s at rest; manual waits for the services begin and end.")
+        str, Option(help="auto finds touches, after 2 s at rest; manual waits for the services begin and end.")
     ] = "auto",
     of: Axis = None,
     watch: Annotated[
         bool,
-        typer.Option("--watch", help="Note rest and known touches for the sensor's health, some hundred bytes each."),
+        Option("--watch", help="Note rest and known touches for the sensor's health, some hundred bytes each."),
     ] = False,
     sensor: Annotated[
-        str | None, typer.Option(help="As for observe: whose readings they are. Needed only to make a new memory.")
+        str | None, Option(help="As for observe: whose readings they are. Needed only to make a new memory.")
     ] = None,
 ) -> None:
     """Run the ROS 2 lifecycle node scroll_tactile until ctrl-C: readings from a topic, answers on ~/answer.
@@ -450,11 +433,9 @@ def ros2(
 def mcp(
     memory: MemoryFolder,
     learn: Annotated[
-        bool, typer.Option("--learn", help="Let it observe and retract, too; without it the memory stays as it is.")
+        bool, Option("--learn", help="Let it observe and retract, too; without it the memory stays as it is.")
     ] = False,
-    files: Annotated[
-        Path | None, typer.Option(help="A folder whose recordings it may name in place of readings.")
-    ] = None,
+    files: Annotated[Path | None, Option(help="A folder whose recordings it may name in place of readings.")] = None,
 ) -> None:
     """Serve a memory to a planner over standard input and output, by the Model Context Protocol, until it hangs up.
 

@@ -52,10 +52,7 @@ BIOTAC = ("--preset", "biotac", "--columns", "25:44")
         (("predict", "new", "touch.npy"), "scroll-tactile observe or learn makes one"),
         (("live", "new", "touch.npy"), "scroll-tactile observe or learn makes one"),
         (("inspect", "new"), "scroll-tactile observe or learn makes one"),
-        (
-            ("observe", "new", "oak", "touch.npy", "--topic", "/x", "--sensor", "biotac"),
-            "came --topic '/x': give",
-        ),
+        (("observe", "new", "oak", "touch.npy", "--topic", "/x", "--sensor", "biotac"), "came --topic '/x': give"),
         (("observe", "new", "oak", "rec/oak/0.npy", "--sensor", "biotac"), "taken by --columns '0:19'"),
     ],
     ids=lambda each: each[0] if isinstance(each, tuple) else "",

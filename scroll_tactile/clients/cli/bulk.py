@@ -12,7 +12,7 @@ from rich.markup import escape
 from scroll_tactile_store import NotAStoreError
 from typer import Argument, Option
 
-from scroll_tactile.clients.cli.options import (
+from scroll_tactile.clients.cli.terminal import (
     AsCsv,
     AsJson,
     Axis,
@@ -21,10 +21,6 @@ from scroll_tactile.clients.cli.options import (
     Reading,
     SensorName,
     Sources,
-    sensor_for,
-    with_options,
-)
-from scroll_tactile.clients.cli.terminal import (
     confusion_text,
     counted,
     opened,
@@ -35,8 +31,10 @@ from scroll_tactile.clients.cli.terminal import (
     say_csv,
     say_json,
     say_refused,
+    sensor_for,
     shown,
     verdict,
+    with_options,
 )
 from scroll_tactile.clients.cli.touches import ANSWER, answer_row
 from scroll_tactile.errors import InputError
@@ -281,8 +279,7 @@ def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
 
 def demo(
     memory: Annotated[
-        Path | None,
-        Option(help="Keep the memory in this folder. Interrupt the demo, start it again, and it goes on."),
+        Path | None, Option(help="Keep the memory in this folder. Interrupt the demo, start it again, and it goes on.")
     ] = None,
     seed: Annotated[int, Option(help="Seed of the simulated materials.")] = 0,
     sensor: Annotated[str, Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",

@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.table import Table
 from typer import Argument, Option
 
-from scroll_tactile.clients.cli.options import (
+from scroll_tactile.clients.cli.terminal import (
     AsCsv,
     AsJson,
     Axis,
@@ -27,14 +27,10 @@ from scroll_tactile.clients.cli.options import (
     Scene,
     Sources,
     StreamFile,
-    materials_of,
-    sensor_for,
-    with_options,
-)
-from scroll_tactile.clients.cli.terminal import (
     console,
     counted,
     estimate_text,
+    materials_of,
     opened,
     opened_for_upkeep,
     percent,
@@ -42,8 +38,10 @@ from scroll_tactile.clients.cli.terminal import (
     say_csv,
     say_json,
     say_refused,
+    sensor_for,
     shown,
     verdict,
+    with_options,
 )
 from scroll_tactile.errors import DescriptionError, InputError, printable
 from scroll_tactile.settings import LONGEST_SOURCE, require_name

@@ -11,20 +11,17 @@ import typer
 from scroll_tactile_store import Store, StoreError, repair_store
 from typer import Argument, Option
 
-from scroll_tactile.clients.cli.options import (
+from scroll_tactile.clients.cli.terminal import (
     AsJson,
     Axis,
+    Commands,
     MemoryFolder,
     Named,
     Risk,
     Scene,
     Sources,
-    materials_of,
-    with_options,
-)
-from scroll_tactile.clients.cli.terminal import (
-    Commands,
     counted,
+    materials_of,
     opened,
     opened_for_upkeep,
     progress_bar,
@@ -32,6 +29,7 @@ from scroll_tactile.clients.cli.terminal import (
     say_json,
     say_refused,
     shown,
+    with_options,
 )
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.settings import GONE
@@ -179,10 +177,7 @@ def export(
     target: Annotated[Path, Argument(help="A new or empty folder.", show_default=False)],
     form: Annotated[
         ExportForm,
-        Option(
-            "--format",
-            help="plain: all it holds, as CSV, JSON and NumPy files. c: a judge for a microcontroller.",
-        ),
+        Option("--format", help="plain: all it holds, as CSV, JSON and NumPy files. c: a judge for a microcontroller."),
     ] = ExportForm.plain,
     scene: Annotated[
         str | None, Option(help="Of c: the materials that can be there, with commas between; all unless given.")
@@ -258,8 +253,7 @@ def relabel(
 
 @memory.command("list")
 def list_observations(
-    folder: MemoryFolder,
-    as_json: Annotated[bool, Option("--json", help="Print JSON, a line for each.")] = False,
+    folder: MemoryFolder, as_json: Annotated[bool, Option("--json", help="Print JSON, a line for each.")] = False
 ) -> None:
     """List the observations: number, material, time, what became of it (kept, compacted, retracted), what was noted of
     it, and source.
@@ -318,8 +312,7 @@ def pack(
 def merge(
     folder: MemoryFolder,
     other: Annotated[
-        Path,
-        Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False),
+        Path, Argument(help="The memory that comes in, a folder or packed; it stays as it is.", show_default=False)
     ],
 ) -> None:
     """Make a memory the one that observed all that both did, exactly."""
@@ -381,8 +374,7 @@ def ros2(
         str, Option(help="The path to a message's numbers, such as tactiles[0].electrodes; a preset may know it.")
     ] = "",
     preset: Annotated[
-        str | None,
-        Option(help="A known sensor, which gives sensor, topic and field: biotac, xela-uskin, anyskin, …"),
+        str | None, Option(help="A known sensor, which gives sensor, topic and field: biotac, xela-uskin, anyskin, …")
     ] = None,
     kind: Annotated[
         str | None, Option("--type", help="The messages' type, as package/msg/Name; else what the topic says.")
@@ -394,8 +386,7 @@ def ros2(
     ] = "auto",
     of: Axis = None,
     watch: Annotated[
-        bool,
-        Option("--watch", help="Note rest and known touches for the sensor's health, some hundred bytes each."),
+        bool, Option("--watch", help="Note rest and known touches for the sensor's health, some hundred bytes each.")
     ] = False,
     sensor: Annotated[
         str | None, Option(help="As for observe: whose readings they are. Needed only to make a new memory.")

@@ -211,16 +211,8 @@ class TestFiles:
         (tmp_path / "loop.npy").symlink_to(tmp_path / "loop.npy")
         (tmp_path / "folder.npy").mkdir()
         long = "x" * 300 + ".npy"
-        for name in (
-            "wide.csv",
-            "words.csv",
-            "null.csv",
-            "loop.npy",
-            "folder.npy",
-            "none.npy",
-            long,
-            "/proc/self/mem.npy",
-        ):
+        short = ("wide.csv", "words.csv", "null.csv", "loop.npy", "folder.npy", "none.npy")
+        for name in (*short, long, "/proc/self/mem.npy"):
             assert refused("predict", path, tmp_path / name)
             assert refused("observe", path, "felt", tmp_path / name)
         assert refused("inspect", tmp_path / "t.npy")

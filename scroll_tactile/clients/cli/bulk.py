@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 from scroll_tactile_store import NotAStoreError
+from scroll_tactile_store.layout import holds_store
 from typer import Argument, Option
 
 from scroll_tactile.clients.cli.terminal import (
@@ -364,7 +365,10 @@ def report(
 
     require_page(page)
     chosen = {**vars(how), "rate": rate}
-    if _is_memory(source):
+    is_memory = False
+    with suppress(NotAStoreError):  # of what holds no store, and may be a recording
+        is_memory = source.is_dir() and holds_store(source)
+    if is_memory:
         every = {**chosen, "sensor": sensor, "labels": labels}
         if given := [f"--{name}" for name, value in every.items() if value is not None]:
             raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
@@ -383,12 +387,3 @@ def report(
         html = recording_page(source, sensor=whose, intervals=cut, given=came_by, **chosen)
     save(html, page)
     say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")
-
-
-def _is_memory(source: Path) -> bool:
-    """Whether a memory lies there, sound or not; what holds no store may be a recording."""
-    from scroll_tactile_store.layout import holds_store
-
-    with suppress(NotAStoreError):
-        return source.is_dir() and holds_store(source)
-    return False

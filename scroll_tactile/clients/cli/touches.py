@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from difflib import get_close_matches
 from pathlib import Path
@@ -272,22 +272,17 @@ def describe(
         raise DescriptionError(f"expected each constituent once; came {', '.join(name for name, _ in named)}")
     with opened(memory) as learner:
         known = {*learner.materials, *learner.memory.descriptions}
-        if not new and material not in known and (meant := _meant(material, known)) is not None:
+        letters = re.sub(r"\d", "", material)
+        others = [name for name in sorted(known) if re.sub(r"\d", "", name) != letters]  # a number makes another one
+        if not new and material not in known and (meant := get_close_matches(material, others, 1, NEAR)):
             raise InputError(
-                f"no material {material!r} was observed or described, and {meant!r} is nearly called so: name that "
+                f"no material {material!r} was observed or described, and {meant[0]!r} is nearly called so: name that "
                 "one, or add --new"
             )
         learner.describe(material, shares or None)
         count = learner.materials.get(material, 0)
     now = "its description is removed" if not shares else f"made of {', '.join(map(shown, shares))}"
     say(f"{shown(material)}: {now}; observed {counted(count, 'time')}")
-
-
-def _meant(name: str, known: Iterable[str]) -> str | None:
-    """The known name that this one is a slip of; names that differ in their numbers alone are other ones."""
-    letters = re.sub(r"\d", "", name)
-    others = [other for other in sorted(known) if re.sub(r"\d", "", other) != letters]
-    return next(iter(get_close_matches(name, others, 1, NEAR)), None)
 
 
 def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | None]:
@@ -314,9 +309,7 @@ def compose(memory: MemoryFolder, file: StreamFile, columns: Columns = None, as_
         made_of = learner.compose(recording.stream(learner.sensor))
     if as_json:
         kept = ("presence", "share", "evidence", "unlearned")
-        found = [
-            {"constituent": each.name, **{name: getattr(each, name) for name in kept}} for each in made_of.constituents
-        ]
+        found = [{"constituent": of.name, **{name: getattr(of, name) for name in kept}} for of in made_of.constituents]
         say_json({"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material})
         return
     table = Table("constituent", "there with", "share", "feels most like")
@@ -430,7 +423,10 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
             more = {"revised": ended.revised is not None, "end": ended.end}
             _line("ended", ended.at, _answer_of(ended, ended.stream.seconds, **more))
         else:
-            say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {_judged(ended)}")
+            how = "decided" if ended.decided else "[yellow]undecided[/]"
+            if ended.revised is not None:
+                how = f"[yellow]revised[/]: it was decided as {verdict(ended.revised)}"
+            say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {verdict(ended.prediction)}, {how}")
             _say_estimates(ended.estimates, " " * 12)
             growing.update("", refresh=growing.is_started)
     old = before if before is not None and before.contact else None
@@ -446,13 +442,6 @@ def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, g
     elif now.decided and (old is None or not old.decided) and now.prediction is not None:
         say(f"{at:8.2f} s  after {now.seconds:.2f} s: {verdict(now.prediction)}, decided")
     return now
-
-
-def _judged(ended: LiveTouch) -> str:
-    """The answer to a touch, and whether it was decided, or takes back what was."""
-    if ended.revised is not None:
-        return f"{verdict(ended.prediction)}, [yellow]revised[/]: it was decided as {verdict(ended.revised)}"
-    return f"{verdict(ended.prediction)}, {'decided' if ended.decided else '[yellow]undecided[/]'}"
 
 
 def _table(now: LiveState) -> Table:

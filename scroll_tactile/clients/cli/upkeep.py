@@ -185,7 +185,7 @@ def export(
 ) -> None:
     """Write a memory so that it is read without scroll-tactile: all that it holds, or its judge as C for a chip."""
     if form is ExportForm.c:
-        say(f"written: {shown(target)}, {_export_c(folder, target, scene)}")
+        _export_c(folder, target, scene)
         return
     if scene is not None:
         raise InputError("--scene is for --format c; all that a memory holds is of all materials")
@@ -196,17 +196,16 @@ def export(
     say(f"written: {shown(target)}")
 
 
-def _export_c(folder: Path, target: Path, scene: str | None) -> str:
-    """Write the exported judge of a scene; what it takes, in words."""
+def _export_c(folder: Path, target: Path, scene: str | None) -> None:
     from scroll_tactile.clients.firmware.c_files import flash_bytes, kept_levels, write_firmware
 
     with opened(folder, mode="read") as learner:
         judge = learner.exported(materials_of(scene))
         touches = kept_levels(judge, learner.memory)
     write_firmware(judge, target, touches)
-    return (
-        f"{len(judge.materials)} materials, {flash_bytes(judge) / 1024:.0f} kB of tables in flash, "
-        f"{judge.ram_bytes / 1024:.0f} kB of RAM; `make` there checks {len(touches)} touches. Left out of it: kept "
+    say(
+        f"written: {shown(target)}, {len(judge.materials)} materials, {flash_bytes(judge) / 1024:.0f} kB of tables in "
+        f"flash, {judge.ram_bytes / 1024:.0f} kB of RAM; `make` there checks {len(touches)} touches. Left out of it: kept "
         "touches, views of a whole touch, fine-tuning"
     )
 

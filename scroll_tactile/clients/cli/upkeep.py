@@ -205,8 +205,8 @@ def _export_c(folder: Path, target: Path, scene: str | None) -> None:
     write_firmware(judge, target, touches)
     say(
         f"written: {shown(target)}, {len(judge.materials)} materials, {flash_bytes(judge) / 1024:.0f} kB of tables in "
-        f"flash, {judge.ram_bytes / 1024:.0f} kB of RAM; `make` there checks {len(touches)} touches. Left out of it: kept "
-        "touches, views of a whole touch, fine-tuning"
+        f"flash, {judge.ram_bytes / 1024:.0f} kB of RAM; `make` there checks {len(touches)} touches. Left out of it: "
+        "kept touches, views of a whole touch, fine-tuning"
     )
 
 

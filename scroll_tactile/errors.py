@@ -62,7 +62,15 @@ def plain_cell(text: str) -> str:
 
 
 class ScrollTactileError(Exception):
-    """Every error that scroll-tactile raises on purpose; catch it to catch them all."""
+    """Every error that scroll-tactile raises on purpose; catch it to catch them all.
+
+    argument: the name of the argument that was wrong, or is to be given; several with blanks between; None where it is
+    none of them. Where the message speaks of one it is written `name=`, which a command shows as its option.
+    """
+
+    def __init__(self, *message: object, argument: str | None = None) -> None:
+        super().__init__(*message)
+        self.argument = argument
 
     def __str__(self) -> str:
         return printable(super().__str__(), keep="\n")

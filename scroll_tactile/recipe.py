@@ -85,7 +85,7 @@ class RecipeRequest:
     def recipe(self) -> Recipe:
         """The recipe of a new memory. Raises InputError without a sensor."""
         if self.sensor is None:
-            raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are")
+            raise InputError("a new memory takes a sensor, sensor=: whose readings the sources are", argument="sensor")
         embedding = default_embedding(self.sensor) if self.embedding is None else self.embedding
         return Recipe.of(self.sensor, embedding, self.settings)
 

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scroll_tactile.errors import InputError, MaterialError, UnknownMaterialError
 
 __all__ = [
+    "GONE",
     "LONGEST_NAME",
     "LONGEST_SOURCE",
     "Settings",
@@ -25,6 +26,19 @@ __all__ = [
 LONGEST_NAME = 200  # characters
 LONGEST_SOURCE = 1000
 
+GONE = {
+    "again": "A touch is learned once: readings that a memory has already are not counted anew.",
+    "shared": "Merging makes a memory of the touches of both: one that both observed is counted once.",
+    "augmentation": "A touch is learned as it was felt; fine-tuning makes its varied copies by itself.",
+    "runtime": "Vision runs in torch.",
+    "precision": "Vision computes in float32.",
+    "annotate": "examples/lerobot_annotate.py writes a new LeRobot data set with answers.",
+    "mcap": "live --json prints each answer as a line; examples/rerun_live.py shows a session.",
+    "rerun": "examples/rerun_live.py shows a session in Rerun.",
+    "finger": "A node has one finger: start one for each, in namespaces, by --ros-args -r __ns:=/left.",
+}
+"""Settings, options and commands of earlier versions, and what is there in their place."""
+
 
 class ValidatedFields(BaseModel):
     """Fields that are validated once and never change; raises InputError for what does not fit."""
@@ -35,7 +49,8 @@ class ValidatedFields(BaseModel):
         try:
             super().__init__(**fields)
         except ValidationError as error:
-            raise InputError(_described(error, type(self))) from None
+            loc = error.errors()[0]["loc"]
+            raise InputError(_described(error, type(self)), argument=str(loc[0]) if loc else None) from None
 
 
 class Settings(ValidatedFields):
@@ -62,8 +77,9 @@ def _described(error: ValidationError, model: type[BaseModel]) -> str:
     first = error.errors()[0]
     name = str(first["loc"][0]) if first["loc"] else model.__name__
     if first["type"] == "extra_forbidden":
-        left = ". It left with 0.16: flip, crop and jitter are of fine-tuning" if name == "augmentation" else ""
-        return f"{name!r} is no setting of {model.__name__}; there are {', '.join(model.model_fields)}{left}"
+        if name in GONE:
+            return f"{name!r} is gone. {GONE[name]}"
+        return f"{name!r} is no setting of {model.__name__}; there are {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"{model.__name__} needs {name}"
     what = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
@@ -74,9 +90,11 @@ def require_name(material: str) -> str:
     """The name of a material, of no subclass of str such as numpy's; raises MaterialError for what cannot be one."""
     require_text(material)
     if not material or len(material) > LONGEST_NAME:
-        raise MaterialError(f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}")
+        raise MaterialError(
+            f"expected a name of 1 to {LONGEST_NAME} characters; came {len(material)}", argument="material"
+        )
     if not material.isprintable():
-        raise MaterialError(f"expected a name of printable characters; came {material!r}")
+        raise MaterialError(f"expected a name of printable characters; came {material!r}", argument="material")
     return str(material)
 
 
@@ -120,11 +138,14 @@ def candidates_of(scene: Sequence[str] | None, names: list[str], known: Abstract
         return names
     wanted = list(dict.fromkeys(scene))
     if not wanted:
-        raise InputError("expected at least one material in the scene; came none. Leave scene out for all of them")
+        raise InputError(
+            "expected at least one material in the scene; came none. Leave scene out for all of them", argument="scene"
+        )
     missing = [name for name in wanted if name not in known]
     if missing:
         raise UnknownMaterialError(
             f"the scene names {missing[:30]}, which were never observed; observed were "
-            f"{names if len(names) <= 30 else len(names)}"
+            f"{names if len(names) <= 30 else len(names)}",
+            argument="scene",
         )
     return sorted(wanted)

@@ -6,8 +6,9 @@ from typer.testing import CliRunner
 
 from examples.benchmarks.__main__ import app as benchmarks
 from examples.paper.__main__ import app as paper
-from scroll_tactile.clients.cli.application import app
+from scroll_tactile.clients.cli import application
 
+APP = application()
 PAPER = {command.name or command.callback.__name__ for command in paper.registered_commands}
 PAPER |= {group.name for group in paper.registered_groups}
 
@@ -18,7 +19,7 @@ def run(*words: object) -> Any:
         return CliRunner().invoke(benchmarks, rest)
     if first in PAPER:
         return CliRunner().invoke(paper, [first, *rest])
-    return CliRunner().invoke(app, [first, *rest])
+    return CliRunner().invoke(APP, [first, *rest])
 
 
 def refused(*words: object) -> str:

@@ -84,6 +84,19 @@ class Contents:
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
+        where = ", ".join([repr(self.source), *self._where()])
+        return self._listed(f"read({where})")
+
+    def refused(self, what: str) -> FieldError:
+        """The error of a topic or field that is not chosen, or not there, with those that there are."""
+        return FieldError(f"{what}\n{self._listed(' '.join(['such as', *self._where()]))}", argument="topic field")
+
+    def _where(self) -> list[str]:
+        """The arguments that choose the first."""
+        chosen = {"topic": self.entries[0].topic, "field": self.entries[0].field} if self.entries else {}
+        return [f"{name}={value!r}" for name, value in chosen.items() if value]
+
+    def _listed(self, last: str) -> str:
         if not self.entries:
             return f"{self.source} has no numbers in it" + (f": {'; '.join(self.notes)}" if self.notes else "")
         lines = [f"{self.source} has{f' {self.looked}' if self.looked else ''}:"]
@@ -96,10 +109,7 @@ class Contents:
         if len(self.entries) > 40:
             lines.append(f"  … and {len(self.entries) - 40} more")
         lines += [f"  not read: {note}" for note in self.notes]
-        first = self.entries[0]
-        topic = f", topic={first.topic!r}" if first.topic else ""
-        lines.append(f"read({self.source!r}{topic}{f', field={first.field!r}' if first.field else ''})")
-        return "\n".join(lines)
+        return "\n".join([*lines, last])
 
 
 class Source(ABC):

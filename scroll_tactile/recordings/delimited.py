@@ -74,7 +74,9 @@ class Delimited(Source):
         super().__init__(path, address, request)
         self.budget.add(stored_bytes(path))
         if request.decimal not in (".", ","):
-            raise RecordingError(f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}")
+            raise RecordingError(
+                f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}", argument="decimal"
+            )
         with self._text() as file:
             self.comment, lines = self._first_lines(file)
         self.delimiter = request.delimiter or _delimiter([line for _, line in lines], request.decimal)
@@ -177,14 +179,16 @@ class Delimited(Source):
         text = cell.replace(",", ".") if self.request.decimal == "," else cell
         if is_number(text):
             return float(text)
-        hint = ""
+        hint, argument = "", None
         if self.request.decimal == "." and is_number(cell.replace(",", ".")):
-            hint = ". For numbers with a decimal comma pass decimal=','"
+            hint, argument = ". For numbers with a decimal comma pass decimal=','", "decimal"
         elif self.request.field is None:
             hint = ". Name the columns with numbers by field='first:last', or the column of labels by labels="
+            argument = "field labels"
         raise RecordingError(
             f"{self.address}, row {number}, column {column + 1} ({self.columns[column]}): expected a number; "
-            f"came {cell!r:.60}{hint}"
+            f"came {cell!r:.60}{hint}",
+            argument=argument,
         )
 
     def _time_of(self, cell: str, number: int) -> float:

@@ -82,7 +82,7 @@ _ALSO = {"tactilestate": ("sensors[*].values",), "float32multiarray": ("data",),
 def find(name: str) -> Preset:
     """The preset of this name; raises InputError, with the nearest, for one that is not there."""
     if name not in PRESETS:
-        raise InputError(f"expected a preset; came {name!r}{nearest(name, list(PRESETS))}")
+        raise InputError(f"expected a preset; came {name!r}{nearest(name, list(PRESETS))}", argument="preset")
     return PRESETS[name]
 
 

@@ -180,11 +180,14 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
     source = kind(path, address, request)
     for name, value, takes in (("topic", request.topic, source.topics), ("labels", request.labels, source.labels)):
         if value is not None and not takes:
-            raise InputError(f"{address} has no {name}; came {name}={value!r}: give field= alone")
+            raise InputError(
+                f"{address} has no {name}; came {name}={value!r}: give field= alone", argument=f"{name} field"
+            )
     if request.annotate and not source.annotate:
         raise InputError(
             f"{address} has no columns to annotate touches by; expected a LeRobot data set; came "
-            f"annotate={request.annotate[0]!r}: give values and labels in a table of intervals="
+            f"annotate={request.annotate[0]!r}: give values and labels in a table of intervals=",
+            argument="annotate intervals",
         )
     return source
 
@@ -275,5 +278,6 @@ def _require(recording: Recording, name: str | None) -> None:
         raise ChannelCountError(
             f"expected readings of {name!r}, shape {sensor.shape}; {recording.place} has {shape}"
             + (f", as of {' or '.join(alike)}" if alike else "")
-            + f". {recording.cure(sensor)}"
+            + f". {recording.cure(sensor)}",
+            argument="columns",
         )

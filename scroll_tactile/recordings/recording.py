@@ -140,7 +140,8 @@ class Recording:
         if shape != sensor.shape and int(np.prod(shape)) != sensor.channels:
             raise ChannelCountError(
                 f"expected readings of sensor {sensor.name!r}, {sensor.channels} channels; {self.place} has {shape}. "
-                f"{self.cure(sensor)}"
+                f"{self.cure(sensor)}",
+                argument="columns",
             )
         return validate(self.readings.reshape(len(self), *sensor.shape), sensor)
 
@@ -159,9 +160,12 @@ def resampled(recording: Recording, rate: float) -> Recording:
         raise InputError(f"expected a positive rate in Hz to resample to; came {rate!r}")
     if recording.readings.ndim != 2 or not np.isfinite(recording.times).all():
         what = "pictures" if recording.readings.ndim != 2 else "no clock: give clock= or rate="
-        raise InputError(f"{recording.source} cannot be resampled: it has {what}")
+        raise InputError(f"{recording.source} cannot be resampled: it has {what}", argument="clock rate")
     if recording.annotations:
-        raise InputError(f"{recording.source} has annotations, one a reading: take resample=, or annotate=, not both")
+        raise InputError(
+            f"{recording.source} has annotations, one a reading: take resample=, or annotate=, not both",
+            argument="resample annotate",
+        )
     whole = [Episode(0, len(recording))] if len(recording) else []
     parts, times, episodes = [], [], []
     borders = sorted({0, len(recording), *(e.begin for e in recording.episodes), *(e.end for e in recording.episodes)})
@@ -211,7 +215,9 @@ def require_columns(columns: str) -> list[re.Match[str]]:
     parts = [_PART.fullmatch(part.strip()) for part in columns.split(",")]
     found = [part for part in parts if part is not None]
     if len(found) < len(parts):
-        raise FieldError(f"expected columns such as 25:44 or 0,3,5:9, counted from 0; came {columns!r:.80}")
+        raise FieldError(
+            f"expected columns such as 25:44 or 0,3,5:9, counted from 0; came {columns!r:.80}", argument="columns"
+        )
     return found
 
 
@@ -230,7 +236,8 @@ def places(columns: str, width: int) -> list[int]:
         if begin >= end or end > width:
             raise FieldError(
                 f"columns {part[0]} are not there: expected places from 0 to {width - 1}, a range without its end; "
-                f"0:{width} are all"
+                f"0:{width} are all",
+                argument="columns",
             )
         found += range(begin, end)
     return found
@@ -242,9 +249,11 @@ def only_columns(recording: Recording, columns: str) -> Recording:
     Raises FieldError for a recording of pictures, and as `places` does.
     """
     if recording.readings.ndim != 2:
-        raise FieldError(f"{recording.source} has pictures, which have no columns; came columns={columns!r:.80}")
+        raise FieldError(
+            f"{recording.source} has pictures, which have no columns; came columns={columns!r:.80}", argument="columns"
+        )
     try:
         chosen = places(columns, recording.readings.shape[1])
     except FieldError as error:
-        raise FieldError(f"{recording.source}: {error}") from None
+        raise FieldError(f"{recording.source}: {error}", argument=error.argument) from None
     return replace(recording, readings=recording.readings[:, chosen])

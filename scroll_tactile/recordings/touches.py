@@ -86,7 +86,7 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
         if cut not in ("whole", "episodes"):
             raise InputError(f"expected cut 'whole', 'episodes', intervals or a function; came {cut!r}")
         if cut == "episodes" and not recording.episodes:
-            raise InputError(f"{recording.source} has no episodes: cut it by intervals=, or not")
+            raise InputError(f"{recording.source} has no episodes: cut it by intervals=, or not", argument="intervals")
         spans = recording.episodes if cut == "episodes" else (Episode(0, len(recording), _only(recording)),)
     elif callable(cut):
         spans = tuple(Episode(begin, end, _during(recording, begin, end)) for begin, end in cut(recording))
@@ -152,9 +152,15 @@ def _of_intervals(recording: Recording, mine: Sequence[Interval], intervals: Seq
         raise InputError(f"no interval is of {recording.source}{nearest(_place(recording.source).name, files)}")
     times = recording.times
     if not np.isfinite(times).all():
-        raise InputError(f"{recording.source} has no clock to cut intervals by: give clock= or rate= as it is read")
+        raise InputError(
+            f"{recording.source} has no clock to cut intervals by: give clock= or rate= as it is read",
+            argument="clock rate",
+        )
     if (np.diff(times) < 0).any():
-        raise InputError(f"{recording.source}: time goes back, so that intervals have no place: give another clock=")
+        raise InputError(
+            f"{recording.source}: time goes back, so that intervals have no place: give another clock=",
+            argument="clock",
+        )
     first = float(times[0]) if len(times) else 0.0
     spans = []
     for interval in mine:

@@ -6,14 +6,15 @@ import sys
 
 import numpy as np
 import pytest
-from commands import refused, run
+from commands import APP, refused, run
 from live_touches import slide
 from rich.console import Console
 from touches import PAD, SMALL
+from typer.testing import CliRunner
 
 from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.clients.cli import replay
+from scroll_tactile.clients.cli import touches
 from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -71,23 +72,20 @@ def test_each_thing_that_happens_is_a_line_of_json(memory):
     assert lines[-1]["event"] == "report" and lines[-1]["touches"] == len(SHIFT.touches)
 
 
-def test_lines_on_the_standard_input_are_one_touch(memory, monkeypatch):
+def test_lines_on_the_standard_input_are_one_touch(memory):
     text = "\n".join(",".join(map(str, row)) for row in SCENE.touch("silk", 9).readings)
-    monkeypatch.setattr(sys, "stdin", io.StringIO(text + "\n\n"))
     with TactileLearner.open(memory / "memory", mode="read") as learner:
         expected = learner.predict(SCENE.touch("silk", 9))
-    lines = []
-    monkeypatch.setattr(replay.typer, "echo", lines.append)
-    replay.live(memory / "memory", replay.Path("-"), None, 0.05, False, True, True)
-    answer = json.loads(lines[-2])
+    words = ["live", str(memory / "memory"), "-", "--touch", "--json"]
+    answer = json.loads(CliRunner().invoke(APP, words, input=text + "\n\n").stdout.splitlines()[-2])
     assert (answer["event"], answer["material"]) == ("ended", expected.material)
     assert answer["probability"] == expected.as_json()["probability"]
 
 
 def test_on_a_terminal_the_answer_grows(memory, monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=80)
-    monkeypatch.setattr(replay, "console", lambda: screen)
-    replay.live(memory / "memory", memory / "silk.npy", None, 0.05, False, True, False)
+    monkeypatch.setattr(touches, "console", lambda **_: screen)
+    run("live", memory / "memory", memory / "silk.npy", "--touch")
     shown = screen.file.getvalue()
     assert "touched for 0.30 s" in shown and "touched for 1.50 s" in shown and "█" in shown
 
@@ -97,15 +95,15 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     np.save(memory / "narrow.npy", np.zeros((5, 3)))
     assert "(T, 60)" in refused("live", memory / "memory", memory / "narrow.npy")
     monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,x\n"))
-    with pytest.raises(replay.InputError, match="line 2"):
-        list(replay._rows(replay.Path("-")))
+    with pytest.raises(touches.InputError, match="line 2"):
+        list(touches._rows(touches.Path("-"), False, touches.Reading()))
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"1,2\n\xff\xfe,1\n"), encoding="utf-8"))
-    with pytest.raises(replay.InputError, match=r"line 2.*xff"):
-        list(replay._rows(replay.Path("-")))
-    monkeypatch.setattr(replay, "LONGEST_LINE", 8)
+    with pytest.raises(touches.InputError, match=r"line 2.*xff"):
+        list(touches._rows(touches.Path("-"), False, touches.Reading()))
+    monkeypatch.setattr(touches, "LONGEST_LINE", 8)
     monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,456789\n"))
-    with pytest.raises(replay.InputError, match="a line a reading, of less than 8 characters"):
-        list(replay._rows(replay.Path("-")))
+    with pytest.raises(touches.InputError, match="a line a reading, of less than 8 characters"):
+        list(touches._rows(touches.Path("-"), False, touches.Reading()))
 
 
 @pytest.mark.parametrize("option", ["--topic", "--field", "--preset", "--clock"])

@@ -1,5 +1,6 @@
 """Commands in processes of their own, with what a terminal can do to them: none ends in a traceback."""
 
+import io
 import json
 import os
 import shutil
@@ -11,15 +12,25 @@ import time
 import numpy as np
 import pytest
 from commands import refused, run
+from rich.console import Console
 from scroll_tactile_store import Store
 from touches import PAD, SETTINGS, stream
 
 from scroll_tactile import TactileLearner
+from scroll_tactile.clients.cli import terminal
 from scroll_tactile.clients.cli.terminal import shown
 from scroll_tactile.errors import InputError, UnknownMaterialError, printable
 
 COMMAND = [sys.executable, "-m", "scroll_tactile.clients.cli"]
 HOSTILE = "\x1b]0;pwned\x07\x1b[2J\x9b31m\u202eevil\nline\x7f\u200b"
+
+
+def test_progress_shows_names_as_they_are(monkeypatch):
+    screen = Console(file=io.StringIO(), force_terminal=True, width=120)
+    monkeypatch.setattr(terminal, "console", lambda **_: screen)
+    with terminal.progress_bar() as progress:
+        progress("3 touches; a[oak].npy", 0, 1)
+    assert "a[oak].npy" in screen.file.getvalue()
 
 
 def process(*words, shell="", env=(), **options):
@@ -200,16 +211,8 @@ class TestFiles:
         (tmp_path / "loop.npy").symlink_to(tmp_path / "loop.npy")
         (tmp_path / "folder.npy").mkdir()
         long = "x" * 300 + ".npy"
-        for name in (
-            "wide.csv",
-            "words.csv",
-            "null.csv",
-            "loop.npy",
-            "folder.npy",
-            "none.npy",
-            long,
-            "/proc/self/mem.npy",
-        ):
+        short = ("wide.csv", "words.csv", "null.csv", "loop.npy", "folder.npy", "none.npy")
+        for name in (*short, long, "/proc/self/mem.npy"):
             assert refused("predict", path, tmp_path / name)
             assert refused("observe", path, "felt", tmp_path / name)
         assert refused("inspect", tmp_path / "t.npy")

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -95,14 +96,8 @@ class TestCheckAndRepair:
         "command", ["check", "repair", "backup", "compact", "export", "retract", "forget", "merge"]
     )
     def test_what_is_no_memory_is_refused(self, tmp_path, command):
-        more = {
-            "compact": ["--yes"],
-            "export": [tmp_path / "out"],
-            "backup": [tmp_path / "copy"],
-            "retract": [1],
-            "forget": ["a"],
-            "merge": [tmp_path],
-        }
+        more = {"compact": ["--yes"], "export": [tmp_path / "out"], "backup": [tmp_path / "copy"], "retract": [1]}
+        more |= {"forget": ["a"], "merge": [tmp_path]}
         opens = command in ("compact", "export", "retract", "forget", "merge")  # the others look at what may be damaged
         expected = "there is no memory in" if opens else "holds no store"
         assert expected in refused("memory", command, tmp_path / "none", *more.get(command, []))
@@ -251,19 +246,8 @@ class TestExport:
         assert np.allclose(np.diff(scores), np.diff(expected), rtol=1e-4)
 
     def test_no_cell_is_computed_by_a_spreadsheet_and_every_name_comes_back(self, tmp_path):
-        names = [
-            "=cmd|'/c calc'!A1",
-            "@SUM(A1)",
-            "+1+1",
-            "-2",
-            "'=1",
-            "＝1",
-            "a;=1",
-            "a;'=1;;-2",
-            'b,"=1',
-            "'u'",
-            "ü - c",
-        ]
+        names = ["=cmd|'/c calc'!A1", "@SUM(A1)", "+1+1", "-2", "'=1", "＝1"]
+        names += ["a;=1", "a;'=1;;-2", 'b,"=1', "'u'", "ü - c"]
         with TactileLearner.open(tmp_path / "m", **SETTINGS | {"exemplars": len(names)}) as learner:
             learner.declare(Quantity(name="=q", unit="N", low=0.0, high=1.0, resolution=0.1))
             for i, name in enumerate(names):
@@ -283,16 +267,12 @@ class TestExport:
         long = tmp_path / ("m" * 300)
         assert "too long" in refused("memory", "export", path, long)
         assert "too long" in refused("memory", "export", long, tmp_path / "out")
+        assert "too long" in refused("memory", "merge", path, long)
         with TactileLearner.open(path) as learner:
-            for call in (
-                lambda: export_plain(learner, long),
-                lambda: learner.merge(long),
-                lambda: TactileLearner.open(long),
-                lambda: TactileLearner.open(long, **SETTINGS),
-                lambda: reembed_memory(long),
-            ):
+            calls = (partial(export_plain, learner), TactileLearner.open, partial(TactileLearner.open, **SETTINGS))
+            for call in (*calls, reembed_memory):
                 with pytest.raises((InputError, StoreError)):
-                    call()
+                    call(long)
 
     def test_a_memory_of_as_long_a_name_as_there_can_be_is_opened(self, tmp_path):
         longest = tmp_path / ("m" * 250)  # of which reembedding would make a longer one

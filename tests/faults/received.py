@@ -25,7 +25,7 @@ from faults.common import fingerprint, warnings_told
 from faults.learners import opened, perform, samples
 from faults.model import Operation
 from scroll_tactile import Kernels, TactileLearner
-from scroll_tactile.clients.cli.application import app
+from scroll_tactile.clients.cli import application
 from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.validation.gate import check_memory
@@ -289,7 +289,7 @@ def inspect(case: Case) -> str:
     with heard():
         # A check is a process of its own, which imports all anew.
         words = case.rng.choices((["inspect"], ["inspect", "--json"], ["memory", "check"]), (10, 10, 1))[0]
-        done = CliRunner().invoke(app, [*words, str(case.path)])
+        done = CliRunner().invoke(application(), [*words, str(case.path)])
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     told = done.stdout + done.stderr

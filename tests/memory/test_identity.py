@@ -123,8 +123,8 @@ class TestSnapshots:
             answer = repr(learner.predict(touch(9)))
             digest = learner.digest()
         code = (
-            "import pickle, sys, numpy as np; from scroll_tactile.clients.cli.application import app\n"
-            "try: app(['inspect', sys.argv[1], '--json'])\n"
+            "import pickle, sys, numpy as np; from scroll_tactile.clients.cli import application\n"
+            "try: application()(['inspect', sys.argv[1], '--json'])\n"
             "except SystemExit: pass\n"
             "print('torch' in sys.modules)\n"
             "learner = pickle.loads(open(sys.argv[2], 'rb').read())\n"

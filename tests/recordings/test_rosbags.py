@@ -307,7 +307,7 @@ def test_a_wrong_topic_or_field_names_what_there_is(tmp_path, store2):
         ({"topic": "/rh/tactile", "field": "tactiles"}, "leads to a message, not to numbers; inside it are pac0"),
         ({"topic": "/rh/tactile", "field": "tactiles[7].electrodes"}, r"\[7\] is wanted of an array of 5"),
         ({"topic": "/rh/tactile", "field": "tactiles.electrodes"}, r"write \[0\] or \[\*\]"),
-        ({"topic": "/skin"}, r"read\('.*', topic='/skin', field='data'\)"),
+        ({"topic": "/skin"}, r"such as topic='/skin' field='data'"),
         ({}, r"/skin  data  \[19\], 5 readings, 100 Hz(?s:.*)/rh/tactile  tactiles\[0\].electrodes  \[19\]"),
         ({"topic": "/skin", "field": "data", "clock": "layout"}, "clock 'layout' leads to"),
     ]:

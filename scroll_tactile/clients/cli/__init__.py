@@ -10,9 +10,12 @@ import signal
 import sys
 import warnings
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-__all__ = ["INTERRUPTED", "main"]
+if TYPE_CHECKING:
+    import typer
+
+__all__ = ["INTERRUPTED", "application", "main"]
 
 INTERRUPTED = 130  # what a shell reports for a command ended by ctrl-C: 128 + SIGINT
 IMPORT = "<frozen importlib._bootstrap>"
@@ -31,9 +34,7 @@ def main() -> NoReturn:
     code = 1
     try:
         _require_directory()
-        from scroll_tactile.clients.cli.application import app
-
-        app(prog_name="scroll-tactile")
+        application()(prog_name="scroll-tactile")
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
     except KeyboardInterrupt:
@@ -54,6 +55,31 @@ def main() -> NoReturn:
         _to_nowhere(1)
         code = code or 1
     sys.exit(code)
+
+
+def application() -> typer.Typer:
+    """The commands, put together."""
+    import typer
+
+    from scroll_tactile.clients.cli.bulk import demo, evaluate, fleet, learn, report
+    from scroll_tactile.clients.cli.terminal import Commands, version
+    from scroll_tactile.clients.cli.touches import compose, describe, inspect, live, observe, predict
+    from scroll_tactile.clients.cli.upkeep import PASSED_ON, mcp, memory, ros2
+
+    app = typer.Typer(
+        cls=Commands,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        help="A robot's memory of how things feel. It learns a material from one touch, forgets nothing, and says when "
+        "it has never felt something. Start with: scroll-tactile demo",
+    )
+    app.callback()(version)
+    for command in (demo, observe, learn, fleet, predict, evaluate, live, inspect, describe, compose, report, mcp):
+        app.command()(command)
+    app.command(context_settings=PASSED_ON)(ros2)
+    app.add_typer(memory, name="memory")
+    return app
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

@@ -1,80 +1,62 @@
-"""`scroll-tactile learn`, `fleet` and `evaluate`: the touches of many files and folders."""
+"""`scroll-tactile learn`, `fleet`, `evaluate`, `demo` and `report`: many touches, of files and of the simulation."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
+from scroll_tactile_store import NotAStoreError
+from scroll_tactile_store.layout import holds_store
+from typer import Argument, Option
 
-from scroll_tactile.clients.cli.everyday import ANSWER, answer_row
-from scroll_tactile.clients.cli.options import (
-    Annotate,
+from scroll_tactile.clients.cli.terminal import (
+    AsCsv,
     AsJson,
     Axis,
-    Clock,
-    Columns,
-    CutBy,
-    Field,
-    Label,
-    LabelBy,
-    Labels,
-    LabelTopic,
     MemoryFolder,
-    Preset,
+    Noted,
+    Reading,
+    SensorName,
     Sources,
-    Topic,
-    sensor_for,
-    source_options,
-)
-from scroll_tactile.clients.cli.terminal import (
     confusion_text,
+    counted,
     opened,
+    opened_for_upkeep,
     percent,
     progress_bar,
     say,
     say_csv,
     say_json,
     say_refused,
+    sensor_for,
     shown,
     verdict,
+    with_options,
 )
-from scroll_tactile.clients.cli.wording import counted
+from scroll_tactile.clients.cli.touches import ANSWER, answer_row
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
+    from scroll_tactile.clients.learning.demo import Demo, Outcome, Unplugged
     from scroll_tactile.clients.learning.fleet import FleetReport
     from scroll_tactile.clients.learning.learning import Evaluation, Learned
     from scroll_tactile.clients.learning.sources import Refused
 
-__all__ = ["evaluate", "fleet", "learn"]
+__all__ = ["demo", "evaluate", "fleet", "learn", "report"]
 
 MOST_SHOWN = 20  # mistakes; JSON and CSV have all
 MOST_NAMES = 40  # of a table of confusions
 SECONDS = 20  # in which a scheduler answers
 
 
+@with_options
 def learn(
-    memory: MemoryFolder,
-    sources: Sources,
-    sensor: Annotated[
-        str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
-    ] = None,
-    preset: Preset = None,
-    topic: Topic = None,
-    field: Field = None,
-    clock: Clock = None,
-    columns: Columns = None,
-    label: Label = None,
-    label_by: LabelBy = None,
-    labels: Labels = None,
-    label_topic: LabelTopic = None,
-    cut: CutBy = None,
-    annotate: Annotate = None,
-    as_json: AsJson = False,
+    memory: MemoryFolder, sources: Sources, *, sensor: SensorName = None, how: Noted, as_json: AsJson = False
 ) -> None:
     """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
 
@@ -85,13 +67,12 @@ def learn(
     from scroll_tactile.learner import TactileLearner
 
     found, missing = find_sources(sources)
-    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
-    options = source_options(found, preset, *how)
-    chosen = sensor_for(memory, sensor, preset)
+    options = how.of(found)
+    chosen = sensor_for(memory, sensor, how.preset)
     with progress_bar() as progress:
         # What is refused makes no memory.
         if chosen is None or memory.exists() or has_touches(chosen, found, options):
-            opening: AbstractContextManager[TactileLearner] = opened(memory, sensor=chosen)
+            opening: AbstractContextManager[TactileLearner] = opened(memory, sensor=chosen, new=True)
         else:
             opening = nullcontext(TactileLearner(sensor=chosen))
         with opening as learner:
@@ -107,15 +88,9 @@ def learn(
 def _report_learned(done: Learned, held: int, as_json: bool) -> None:
     count = done.learned.total()
     if as_json:
-        found = {
-            "files": done.files,
-            "touches": count,
-            "learned": dict(sorted(done.learned.items())),
-            "skipped": done.skipped,
-            "refused": _refusals(done.refused),
-            "observations": held,
-        }
-        say_json(found)
+        learned = {"files": done.files, "touches": count, "learned": dict(sorted(done.learned.items()))}
+        left = {"skipped": done.skipped, "refused": _refusals(done.refused)}
+        say_json({**learned, **left, "observations": held})
         return
     of = f" of {counted(len(done.learned), 'material')}" if count else ""
     say(
@@ -128,31 +103,21 @@ def _report_learned(done: Learned, held: int, as_json: bool) -> None:
     say_refused(done.refused)
 
 
+@with_options
 def fleet(
     destination: MemoryFolder,
     sources: Sources,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as there are cores.")] = None,
+    *,
+    workers: Annotated[int | None, Option(min=1, help="Processes; as many as there are cores.")] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
+        str | None, Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
     ] = None,
-    add: Annotated[bool, typer.Option("--add", help="Add to a memory that was made in another way.")] = False,
+    add: Annotated[bool, Option("--add", help="Add to a memory that was made in another way.")] = False,
     patience: Annotated[
-        float | None, typer.Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
+        float | None, Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
     ] = None,
-    sensor: Annotated[
-        str | None, typer.Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
-    ] = None,
-    preset: Preset = None,
-    topic: Topic = None,
-    field: Field = None,
-    clock: Clock = None,
-    columns: Columns = None,
-    label: Label = None,
-    label_by: LabelBy = None,
-    labels: Labels = None,
-    label_topic: LabelTopic = None,
-    cut: CutBy = None,
-    annotate: Annotate = None,
+    sensor: SensorName = None,
+    how: Noted,
     as_json: AsJson = False,
 ) -> None:
     """Learn recordings and memories, in folders, files and buckets, by many workers into one memory.
@@ -164,23 +129,12 @@ def fleet(
 
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
-    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
-    options = source_options(sources, preset, *how)
-    chosen = sensor_for(destination, sensor, preset)
+    options, chosen = how.of(sources), sensor_for(destination, sensor, how.preset)
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(_connected(scheduler))
         progress = stack.enter_context(progress_bar())
-        done = learn(
-            destination,
-            sources,
-            options,
-            sensor=chosen,
-            workers=workers,
-            client=client,
-            add=add,
-            patience=patience,
-            progress=progress,
-        )
+        running: dict[str, Any] = {"workers": workers, "client": client, "patience": patience, "progress": progress}
+        done = learn(destination, sources, options, sensor=chosen, add=add, **running)
     _report_fleet(done, as_json)
     if done.refused:
         raise typer.Exit(1)
@@ -198,18 +152,8 @@ def _connected(scheduler: str) -> Any:
 
 def _report_fleet(done: FleetReport, as_json: bool) -> None:
     if as_json:
-        say_json(
-            {
-                "sources": done.sources,
-                "observations": done.observations,
-                "repeated": done.repeated,
-                "refused": _refusals(done.refused),
-                "deaths": done.deaths,
-                "seconds": done.seconds,
-                "held": done.held,
-                "digest": done.digest,
-            }
-        )
+        names = ("sources", "observations", "repeated", "refused", "deaths", "seconds", "held", "digest")
+        say_json({name: getattr(done, name) for name in names} | {"refused": _refusals(done.refused)})
         return
     rate = done.observations / done.seconds if done.seconds else 0.0
     say(
@@ -224,26 +168,18 @@ def _report_fleet(done: FleetReport, as_json: bool) -> None:
     say(f"[bold]digest:[/] {done.digest}")
 
 
+@with_options
 def evaluate(
     memory: MemoryFolder,
     sources: Sources,
-    preset: Preset = None,
-    topic: Topic = None,
-    field: Field = None,
-    clock: Clock = None,
-    columns: Columns = None,
-    label: Label = None,
-    label_by: LabelBy = None,
-    labels: Labels = None,
-    label_topic: LabelTopic = None,
-    cut: CutBy = None,
-    annotate: Annotate = None,
+    *,
+    how: Noted,
     of: Axis = None,
     with_learned: Annotated[
-        bool, typer.Option("--with-learned", help="Answer also the touches that the memory has learned.")
+        bool, Option("--with-learned", help="Answer also the touches that the memory has learned.")
     ] = False,
     as_json: AsJson = False,
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV, a line for each touch.")] = False,
+    as_csv: AsCsv = False,
 ) -> None:
     """Answer all touches in files and folders, and compare with what they are: accuracy, confusions, calibration.
 
@@ -254,8 +190,7 @@ def evaluate(
     from scroll_tactile.clients.learning.sources import find_sources
 
     found, missing = find_sources(sources)
-    how = topic, field, clock, columns, label, label_by, labels, label_topic, cut, annotate
-    options = source_options(found, preset, *how)
+    options = how.of(found)
     with opened(memory, mode="read") as learner, progress_bar() as progress:
         done = evaluate_sources(learner, found, options, progress, of=of, with_learned=with_learned)
     refused = [*missing, *done.refused]
@@ -341,3 +276,114 @@ def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
         say(f"  {shown(each.touch.source)}, {shown(done.truth(each))}: {verdict(each.prediction)}")
     if len(done.wrong) > MOST_SHOWN:
         say(f"  … and {len(done.wrong) - MOST_SHOWN} more, which --json lists")
+
+
+def demo(
+    memory: Annotated[
+        Path | None, Option(help="Keep the memory in this folder. Interrupt the demo, start it again, and it goes on.")
+    ] = None,
+    seed: Annotated[int, Option(help="Seed of the simulated materials.")] = 0,
+    sensor: Annotated[str, Option(help="biotac, roboskin, contactile, or a JSON file of one.")] = "biotac",
+    features: Annotated[int, Option(min=64, help="Features of the embedding: fewer than the default, 1008.")] = 504,
+    materials: Annotated[int, Option(hidden=True, min=2, max=20)] = 12,
+    touches: Annotated[int, Option(hidden=True, min=1)] = 6,
+    held_out: Annotated[int, Option(hidden=True, min=1)] = 4,
+) -> None:
+    """Ten seconds of learning: simulated materials, unknown first, then learned, and none forgotten.
+
+    When half of them are learned, it answers touches of the others, which it has never felt; in the end of all,
+    and the first 0.3 s of touches; and a process that learns is killed. It needs no data, and keeps nothing unless
+    you give --memory.
+    """
+    from scroll_tactile.clients.learning.demo import Demo, pull_the_plug
+    from scroll_tactile.sensors import read_sensor
+
+    size = {"materials": materials, "touches": touches, "held_out": held_out, "features": features}
+    task = Demo(read_sensor(sensor), seed, **size, folder=memory)
+    say(
+        f"[bold]Simulated[/] {shown(task.sensor.name)} touches, seed {seed}: the names are only names, and nothing "
+        "here is a result."
+    )
+    learned: list[str] = []
+    with progress_bar() as progress:
+
+        def count(name: str) -> None:
+            learned.append(name)
+            progress(f"learned {name}", len(learned), materials)
+
+        outcome = task.run(count)
+        progress("a process is killed while it learns", len(learned), materials)
+        plug = pull_the_plug(task.sensor, seed)
+    _report_demo(task, outcome, learned, plug)
+
+
+def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugged) -> None:
+    half, middle, answers, short = outcome.half, max(1, len(learned) // 2), outcome.answers, outcome.short
+    first, others = learned[:middle], learned[middle:]
+    say(f"[bold]learned[/] {len(first)} materials, {task.touches} touches of each: {', '.join(first)}")
+    answer = "never felt this" if half.known is False else f"known, as {half.nearest}"
+    say(
+        f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{answer}[/] "
+        f"(nearest is {half.nearest}, novelty {half.novelty:.1f})"
+    )
+    say(f"  of {half.tested} touches of materials that it had never felt it called {half.unknown} unknown")
+    say(f"[bold]then learned[/] {len(others)} more, {task.touches} touches of each: {', '.join(others)}")
+    say(f"[bold]learned from {task.touches} touches:[/] {half.material}: {verdict(answers.predictions[outcome.first])}")
+    say(f"  of {len(answers.truth)} touches held out, of all materials, it names {percent(answers.accuracy)} right")
+    say(
+        f"[bold]forgets nothing:[/] the first {len(first)} were named {percent(half.right)} right before the others "
+        f"came, and {percent(outcome.still_right)} after"
+    )
+    say(f"[bold]answers from 0.3 s on:[/] 0.3 s of {short.truth[0]}: {verdict(short.predictions[0])}")
+    say(f"  of 0.3 s of a touch of every material it names {percent(short.accuracy)} right")
+    bits = "the very bits of a memory that nothing interrupted" if plug.same else "[bold red]not as it was[/]"
+    say(
+        f"[bold]survives the power plug:[/] a process was killed when it had reported that {plug.acknowledged} touches "
+        f"were learned; its memory has {plug.found}, {bits}"
+    )
+    say(f"[bold]observed now:[/] {outcome.observed} touches; [bold]digest:[/] {outcome.digest}")
+    if task.folder is not None:
+        say(f"kept: try  scroll-tactile inspect {shown(task.folder / 'memory')}")
+
+
+@with_options
+def report(
+    source: Annotated[Path, Argument(help="The folder of a memory, or a recording.", show_default=False)],
+    page: Annotated[Path, Argument(help="The page to write, such as page.html.", show_default=False)],
+    *,
+    how: Reading,
+    rate: Annotated[float | None, Option(help="Of a recording without times: readings a second.")] = None,
+    sensor: Annotated[
+        str | None, Option(help="Of a recording: whose readings they are, a name or a JSON file, for its range.")
+    ] = None,
+    labels: Annotated[
+        Path | None, Option(help="Of a recording: a table that cuts it to touches and names them, as for learn.")
+    ] = None,
+) -> None:
+    """Write a page that shows what a memory knows, or what a recording holds; any browser opens it, without network."""
+    from scroll_tactile.clients.report.page import require_page, save
+
+    require_page(page)
+    chosen = {**vars(how), "rate": rate}
+    is_memory = False
+    with suppress(NotAStoreError):  # of what holds no store, and may be a recording
+        is_memory = source.is_dir() and holds_store(source)
+    if is_memory:
+        every = {**chosen, "sensor": sensor, "labels": labels}
+        if given := [f"--{name}" for name, value in every.items() if value is not None]:
+            raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
+        from scroll_tactile.clients.report.memory_page import memory_page
+
+        with opened_for_upkeep(source, mode="read") as learner, progress_bar() as progress:
+            html = memory_page(learner, progress=progress)
+    else:
+        from scroll_tactile.clients.report.recording_page import recording_page
+        from scroll_tactile.recordings import read_intervals
+        from scroll_tactile.sensors import read_sensor
+
+        cut = None if labels is None else read_intervals(labels)
+        whose = None if sensor is None else read_sensor(sensor)
+        came_by = {name: str(word) for name, word in (("sensor", sensor), ("labels", labels)) if word is not None}
+        html = recording_page(source, sensor=whose, intervals=cut, given=came_by, **chosen)
+    save(html, page)
+    say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")

@@ -141,7 +141,8 @@ def learn(
         if into.learned and not (folder / NOTES).exists() and not add:
             raise InputError(
                 f"{place} is there already, and not by a run of this kind: take another folder, or add=True to "
-                "add to it"
+                "add to it",
+                argument="add",
             )
         steps = Steps(folder, into.making, afresh=not into.learned)
         stack.callback(steps.leave)
@@ -244,7 +245,7 @@ class _Run:
         except (InputError, MismatchError, StoreError, OSError) as error:
             if isinstance(error, StoreError) and not _is_of(error, place):
                 raise
-            self._report.refused.append(Refused(source, str(error)))
+            self._report.refused.append(Refused.by(error, source))
             step.failed = {source}
             return
         self._report.refused += [Refused(str(head.attributes.get(SOURCE, source)), why) for head, why in refused]

@@ -80,7 +80,10 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
-            raise InputError("touches can be named in one way: by one of material=, by= and intervals=")
+            raise InputError(
+                "touches can be named in one way: by one of material=, by= and intervals=",
+                argument="material by intervals",
+            )
         if self.material is not None:
             require_name(self.material)
         if self.preset is not None:
@@ -88,12 +91,18 @@ class SourceOptions:
         if self.columns is not None:
             require_columns(self.columns)
         if self.cut == "intervals" and self.intervals is None:
-            raise InputError("cut='intervals' takes intervals=, a table with columns file, begin, end and material")
+            raise InputError(
+                "cut='intervals' takes intervals=, a table with columns file, begin, end and material",
+                argument="cut intervals",
+            )
         if self.intervals is not None and self.cut not in (None, "intervals"):
-            raise InputError(f"intervals= cuts by itself; came cut={self.cut!r} beside it")
+            raise InputError(f"intervals= cuts by itself; came cut={self.cut!r} beside it", argument="intervals cut")
         names = [Heading.parsed(text).name for text in self.annotate]
         if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise InputError(f"expected each quantity and axis once in annotate=; came {twice[0]!r} several times")
+            raise InputError(
+                f"expected each quantity and axis once in annotate=; came {twice[0]!r} several times",
+                argument="annotate",
+            )
 
     @property
     def declared(self) -> list[Quantity]:
@@ -134,17 +143,24 @@ def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, 
     if not spans:
         raise InputError(
             f"no contact was found in {recording.source}: it has to begin at rest, for two seconds or more, from which "
-            "the sensor's noise is learned. For a file of one touch take cut='none'"
+            "the sensor's noise is learned. For a file of one touch take cut='none'",
+            argument="cut",
         )
     return spans
 
 
 @dataclass(frozen=True)
 class Refused:
-    """A source, or a touch in one, that could not be taken, and why."""
+    """A source, or a touch in one, that could not be taken, and why. argument: as of the error that says so."""
 
     source: str
     why: str
+    argument: str | None = None
+
+    @classmethod
+    def by(cls, error: Exception, source: str) -> Refused:
+        """What an error refuses."""
+        return cls(source, str(error), getattr(error, "argument", None))
 
 
 @dataclass(frozen=True)
@@ -171,21 +187,24 @@ def source_touches(
     try:
         recording, found = options.touches_in(address, learner)
     except (InputError, OSError) as error:
-        yield Refused(address, str(error))
+        yield Refused.by(error, address)
         return
     for touch in found:
         source = _source(recording, touch, options)
         try:
             material = options.material if options.material is not None else touch.material
             if named and material is None:
-                raise InputError("nothing names it: give material= for all, by='folder', by='file' or intervals=")
+                raise InputError(
+                    "nothing names it: give material= for all, by='folder', by='file' or intervals=",
+                    argument="material by intervals",
+                )
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
             stream = learner.stream(part.stream(learner.sensor))
             noted = Noted(touch.values, touch.labels) + noted_in(recording.annotations, touch.begin, touch.end)
             values, name = _values(noted, learner.quantities), material if material is None else require_name(material)
             yield SourceTouch(source, name, stream, values, dict(noted.labels))
         except (InputError, SensorMismatchError) as error:
-            yield Refused(source, str(error))
+            yield Refused.by(error, source)
 
 
 def _values(noted: Noted, quantities: Mapping[str, Quantity]) -> dict[str, float]:
@@ -236,7 +255,7 @@ def find_sources(
             for source in _sources_in(path, memories, patience):
                 found.setdefault(source if is_remote(source) else Path(source).resolve(), source)
         except (InputError, OSError) as error:
-            refused.append(Refused(path, str(error)))
+            refused.append(Refused.by(error, path))
     return list(found.values()), refused
 
 

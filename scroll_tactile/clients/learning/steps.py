@@ -103,13 +103,15 @@ class Made:
     @classmethod
     def from_json(cls, noted: Any) -> Made:
         """What was noted; raises TypeError, KeyError or ValueError for anything else."""
-        refused = [Refused(each["source"], each["why"]) for each in noted["refused"]]
+        refused = [Refused(each["source"], each["why"], each["argument"]) for each in noted["refused"]]
         return cls(**{**noted, "refused": refused})
 
     def require(self, job: LearnJob) -> None:
         """Raise MismatchError where a job cannot have made this, as far as nobody but its worker can know it."""
         count = len(job.sources)
-        refused = _is_list(self.refused, Refused) and all(_is_list([r.source, r.why], str) for r in self.refused)
+        refused = _is_list(self.refused, Refused) and all(
+            _is_list([r.source, r.why, r.argument or ""], str) for r in self.refused
+        )
         failed = _is_list(self.failed, str) and set(self.failed) <= set(job.sources)
         rows = _is_list(self.rows, int) and len(self.rows) == count and min(self.rows, default=0) >= 0
         clipped = _is_list(self.clipped, str) and all(map(CONTENT.fullmatch, self.clipped))

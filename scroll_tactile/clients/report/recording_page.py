@@ -55,7 +55,7 @@ def recording_page(
     sensor and a preset.
     """
     if sensor is not None and chosen.get("preset") is not None:
-        raise InputError("give sensor= or preset=: both say whose readings they are")
+        raise InputError("give sensor= or preset=: both say whose readings they are", argument="sensor preset")
     contents = describe(path)
     recording, chosen, why = _read(contents, fspath(path), chosen)
     whose = whose_readings(contents, recording, sensor, chosen.get("preset"))

@@ -48,7 +48,7 @@ class _Arrays(Source):
         if self.request.field is None:
             contents = self._listed(arrays)
             if len(contents.entries) != 1:
-                raise FieldError(f"expected a field to read\n{contents}")
+                raise contents.refused("expected a field to read")
             key, rest = contents.entries[0].field, ""
         else:
             key, rest = matched(self.request.field, arrays, self.address)
@@ -109,7 +109,10 @@ class Npy(_Arrays):
         if self.request.field and not self.request.field.startswith("["):
             raise FieldError(f"{self.address} holds one array without a name; came field {self.request.field!r}")
         if self.request.clock is not None:
-            raise FieldError(f"{self.address} holds no clock; came {self.request.clock!r}: give rate= in its place")
+            raise FieldError(
+                f"{self.address} holds no clock; came {self.request.clock!r}: give rate= in its place",
+                argument="clock rate",
+            )
         yield from self._slices(array, None, "", self.field(), None)
 
     def _array(self) -> _NpyArray:

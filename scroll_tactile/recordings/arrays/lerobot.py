@@ -222,7 +222,7 @@ class LeRobot(Source):
 
     def _column(self) -> tuple[str, str]:
         if self.request.field is None:
-            raise FieldError(f"expected a field to read\n{self.contents()}")
+            raise self.contents().refused("expected a field to read")
         key, rest = matched(self.request.field, self.features, self.address)
         kind = self.features[key]["dtype"]
         if kind in ("video", "image", "string"):

@@ -108,7 +108,8 @@ def _reader(channel: Channel, given: str) -> _MessageReader:
     if channel.type not in store.fielddefs:
         raise RecordingError(
             f"{channel.type} of topic {channel.topic!r} is not defined in the recording, as before ROS 2 Iron: "
-            f"pass definitions={{{channel.type!r}: text of its .msg file}}"
+            f"pass definitions={{{channel.type!r}: text of its .msg file}}",
+            argument="definitions",
         )
     objects, nested = _objects(store.fielddefs, channel.type, {})
     if objects > _MOST_OBJECTS:

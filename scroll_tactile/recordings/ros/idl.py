@@ -48,6 +48,7 @@ def _plain(text: str) -> str:
         raise RecordingError(
             f"a definition in IDL has {found[0]!r} in {plain[max(found.start() - 30, 0) : found.end() + 30]!r}; "
             "expected constants and lengths as plain numbers, and no sequence in a sequence, as ROS 2 writes. Pass "
-            "the type's .msg file in definitions=, or write the numbers out"
+            "the type's .msg file in definitions=, or write the numbers out",
+            argument="definitions",
         )
     return plain

@@ -157,11 +157,11 @@ class RosBag(Source):
             return topics[0], text
         contents = self.contents()
         if text is not None and contents.entries:
-            raise FieldError(f"{'several topics have' if topics else 'no topic has'} a field {text!r}\n{contents}")
+            raise contents.refused(f"{'several topics have' if topics else 'no topic has'} a field {text!r}")
         entries = tuple(entry for entry in contents.entries if topic in (None, entry.topic))
         if not entries:
             self._absent(topic)
-        raise FieldError(f"expected a topic and a field to read\n{Contents(contents.source, entries)}")
+        raise Contents(contents.source, entries).refused("expected a topic and a field to read")
 
     def _having(self, path: FieldPath) -> list[str]:
         """The topics in whose first message a path leads to numbers; the likely one alone where it is among them."""

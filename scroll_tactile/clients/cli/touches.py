@@ -1,0 +1,486 @@
+"""`scroll-tactile observe`, `predict`, `live`, `inspect`, `describe`, `compose`: a memory on disk, touches in files."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.live import Live
+from rich.table import Table
+from typer import Argument, Option
+
+from scroll_tactile.clients.cli.terminal import (
+    AsCsv,
+    AsJson,
+    Axis,
+    Columns,
+    MemoryFolder,
+    Reading,
+    Risk,
+    Scene,
+    Sources,
+    StreamFile,
+    console,
+    counted,
+    estimate_text,
+    materials_of,
+    opened,
+    opened_for_upkeep,
+    percent,
+    say,
+    say_csv,
+    say_json,
+    say_refused,
+    sensor_for,
+    shown,
+    verdict,
+    with_options,
+)
+from scroll_tactile.errors import DescriptionError, InputError, printable
+from scroll_tactile.settings import LONGEST_SOURCE, require_name
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from scroll_tactile.clients.learning.learning import Answered
+    from scroll_tactile.clients.learning.sources import Refused
+    from scroll_tactile.live.answers import LiveReport, LiveState, LiveTouch
+    from scroll_tactile.live.session import LiveSession
+    from scroll_tactile.results import Estimate
+
+__all__ = ["ANSWER", "answer_row", "compose", "describe", "inspect", "live", "observe", "predict"]
+
+NEAR = 0.85  # likeness of two names, of which one is taken for a slip of the other
+WORDS = {"yes": True, "no": False, "unknown": None}
+
+SHOWN = 5  # materials of a touch under way
+BAR = 30  # characters of a probability of one
+LONGEST_LINE = 2**24  # characters of a reading, of a camera, too
+IRREGULAR = ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
+
+ANSWER = ("source", "answer", "probability", "known", "novelty", "seconds")
+
+
+@with_options
+def observe(
+    memory: MemoryFolder,
+    material: Annotated[str, Argument(help="What was touched; any name.", show_default=False)],
+    file: StreamFile,
+    *,
+    sensor: Annotated[
+        str | None,
+        Option(
+            help="Whose readings they are: biotac, biotac-all, roboskin, contactile, gelsight, or a JSON file with "
+            "name, channels, rate, low, high, unit and duration; or give --preset. Needed only to make a new memory."
+        ),
+    ] = None,
+    how: Reading,
+    value: Annotated[
+        list[str] | None,
+        Option(help="What was measured of it, such as force=1.4, of a declared quantity; several times."),
+    ] = None,
+    axis: Annotated[
+        list[str] | None, Option(help="What else it is, as axis=label, such as slip=north; several times.")
+    ] = None,
+) -> None:
+    """Learn how a material feels, from one touch in a file; it is on disk when this returns."""
+    from scroll_tactile.learner import TactileLearner
+    from scroll_tactile.recordings import read
+
+    require_name(material)
+    labels = _noted("axis", axis)
+    try:
+        values = {name: float(number) for name, number in _noted("value", value).items()}
+    except ValueError as error:
+        raise InputError(f"expected --value as a name and a number, such as force=1.4: {error}") from None
+    recording = read(file, **vars(how))
+    chosen = sensor_for(memory, sensor, how.preset)
+    if chosen is not None and not memory.exists():
+        TactileLearner(sensor=chosen).stream(recording.stream(chosen))  # what is refused makes no memory
+    with opened(memory, sensor=chosen, new=True) as learner:
+        source = printable(str(file))[-LONGEST_SOURCE:]
+        stream = learner.stream(recording.stream(learner.sensor))
+        others = [name for name in learner.names_of(stream) if name != material]
+        receipt = learner.observe(material, stream, values=values, labels=labels, source=source)
+        count = learner.materials[material]
+    clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
+    if receipt.repeated:
+        say(f"{shown(material)}: this touch was learned already, as observation {receipt.sequence}")
+    else:
+        say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+    if others:
+        say(f"this very touch is there as {', '.join(map(shown, others))}, too: relabel or retract one of them")
+    say(f"it has now been observed {count} time{'s' * (count > 1)}")
+
+
+def _noted(option: str, given: Sequence[str] | None) -> dict[str, str]:
+    """What an option says several times, by name."""
+    pairs = [each.partition("=") for each in given or ()]
+    if wrong := [each for each, pair in zip(given or (), pairs, strict=True) if not (pair[0] and pair[2])]:
+        raise InputError(f"expected --{option} as name=what, such as force=1.4 or slip=north; came {wrong[0]!r:.60}")
+    if len({name for name, *_ in pairs}) < len(pairs):
+        raise InputError(f"expected each name once; came --{option} {' '.join(given or ())!r:.80}")
+    return {name: told for name, _, told in pairs}
+
+
+@with_options
+def predict(
+    memory: MemoryFolder,
+    sources: Sources,
+    *,
+    scene: Scene = None,
+    of: Axis = None,
+    how: Reading,
+    as_json: Annotated[
+        bool, Option("--json", help="Print JSON, with the whole ranking; of many touches a line each.")
+    ] = False,
+    as_csv: AsCsv = False,
+) -> None:
+    """Say what touches in files feel like; the memory stays as it is.
+
+    Of many the exit code is 1 where some were refused.
+    """
+    from scroll_tactile.clients.learning.learning import answers
+    from scroll_tactile.clients.learning.sources import SourceOptions, find_sources
+
+    candidates, options = materials_of(scene), SourceOptions(**vars(how))
+    found, refused = find_sources(sources)
+    alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
+    with opened(memory, mode="read") as learner:
+        answered = answers(learner, found, options, scene=candidates, of=of)
+        if alone:
+            several = [*refused, *answered]
+            if len(several) == 1:
+                _show_answer(several[0], as_json)
+                return
+            refused, answered = [], iter(several)
+        refused += _show_answers(answered, as_json, as_csv)
+    say_refused(refused)
+    if refused:
+        raise typer.Exit(1)
+
+
+def _show_answers(answered: Iterator[Answered | Refused], as_json: bool, as_csv: bool) -> list[Refused]:
+    """Print a line for each answer, as it comes; returns what was refused."""
+    from scroll_tactile.clients.learning.sources import Refused
+
+    refused = []
+    if as_csv:
+        say_csv(*ANSWER)
+    for each in answered:
+        if isinstance(each, Refused):
+            refused.append(each)
+        elif as_csv:
+            say_csv(*answer_row(each))
+        elif as_json:
+            say_json({"source": each.touch.source} | _answer(each))
+        else:
+            say(f"{shown(each.touch.source)}: {verdict(each.prediction)}")
+            _say_estimates(each.estimates)
+    return refused
+
+
+def _show_answer(found: Answered | Refused, as_json: bool) -> None:
+    """The one answer that there is, or why there is none."""
+    from scroll_tactile.clients.learning.sources import Refused
+
+    if isinstance(found, Refused):
+        raise InputError(found.why, argument=found.argument)
+    prediction = found.prediction
+    if as_json:
+        say_json(_answer(found))
+        return
+    say(f"{verdict(prediction)}, from {prediction.seconds:g} s of touch")
+    for name, probability in prediction.ranking[:5]:
+        say(f"  {percent(probability):>8}  {shown(name)}")
+    _say_estimates(found.estimates)
+
+
+def _say_estimates(estimates: Mapping[str, Estimate], margin: str = "  ") -> None:
+    for name, estimate in estimates.items():
+        say(f"{margin}{shown(name)}: {estimate_text(estimate)}")
+
+
+def _answer(answered: Answered) -> dict[str, Any]:
+    of = answered.prediction
+    ranked = {"seconds": of.seconds, "ranking": of.ranking_as_json()}
+    return of.as_json() | ranked | _measured(answered.estimates)
+
+
+def _measured(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {"estimates": {name: own.as_json() for name, own in estimates.items()}} if estimates else {}
+
+
+def answer_row(answered: Answered) -> list[Any]:
+    """The cells that `ANSWER` names."""
+    of = answered.prediction
+    return [answered.touch.source, *of.as_json().values(), of.seconds]
+
+
+def inspect(memory: MemoryFolder, as_json: AsJson = False) -> None:
+    """Show what a memory holds: materials with their counts, sensor, embedding, digest and size on disk."""
+    with opened_for_upkeep(memory, mode="read") as learner:
+        materials, digest, sensor, embedding = learner.materials, learner.digest(), learner.sensor, learner.embedding
+        kept = len(learner.memory.kept or ())
+    size = sum(file.stat().st_size for file in memory.rglob("*") if file.is_file())
+    if as_json:
+        held = {"materials": materials, "observations": sum(materials.values()), "kept": kept}
+        made = {name: getattr(embedding, name) for name in ("name", "dimension", "fingerprint")}
+        by = {"sensor": sensor.model_dump(mode="json"), "embedding": made}
+        say_json({**held, **by, "digest": digest, "bytes": size})
+        return
+    table = Table("material", "observations")
+    for name, count in materials.items():
+        table.add_row(shown(name), str(count))
+    console().print(table)
+    say(f"[bold]observations:[/] {sum(materials.values())} of {counted(len(materials), 'material')}")
+    say(f"[bold]kept touches:[/] {kept}")
+    say(f"[bold]sensor:[/] {shown(sensor.name)}, {counted(sensor.channels, 'channel')} at {sensor.rate:g} Hz")
+    say(
+        f"[bold]embedding:[/] {shown(embedding.name)}, {embedding.dimension} features, "
+        f"fingerprint {embedding.fingerprint[:12]}"
+    )
+    say(f"[bold]digest:[/] {digest}")
+    say(f"[bold]on disk:[/] {size / 2**20:.1f} MB")
+
+
+def describe(
+    memory: MemoryFolder,
+    material: Annotated[str, Argument(help="A material, observed or not yet.", show_default=False)],
+    constituents: Annotated[
+        list[str] | None,
+        Argument(
+            help="Each as NAME=SHARE, shares by mass that sum to one, or NAME=yes, no or unknown; a property as "
+            "'hardness=62 Shore A'. None: its description is removed.",
+            show_default=False,
+        ),
+    ] = None,
+    new: Annotated[bool, Option("--new", help="Though its name is nearly that of an observed material.")] = False,
+) -> None:
+    """Say what a material is made of, before or after it was touched: wool=0.65 viscose=0.35."""
+    named = [_constituent(text) for text in constituents or []]
+    shares = dict(named)
+    if len(shares) < len(named):
+        raise DescriptionError(f"expected each constituent once; came {', '.join(name for name, _ in named)}")
+    with opened(memory) as learner:
+        known = {*learner.materials, *learner.memory.descriptions}
+        letters = re.sub(r"\d", "", material)
+        others = [name for name in sorted(known) if re.sub(r"\d", "", name) != letters]  # a number makes another one
+        if not new and material not in known and (meant := get_close_matches(material, others, 1, NEAR)):
+            raise InputError(
+                f"no material {material!r} was observed or described, and {meant[0]!r} is nearly called so: name that "
+                "one, or add --new"
+            )
+        learner.describe(material, shares or None)
+        count = learner.materials.get(material, 0)
+    now = "its description is removed" if not shares else f"made of {', '.join(map(shown, shares))}"
+    say(f"{shown(material)}: {now}; observed {counted(count, 'time')}")
+
+
+def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | None]:
+    name, sign, value = text.rpartition("=")
+    if value in WORDS and sign:
+        return name.strip(), WORDS[value]
+    number, _, unit = value.strip().partition(" ")
+    try:
+        share = float(number if sign else "")
+    except ValueError:
+        raise DescriptionError(
+            "expected a constituent as NAME=SHARE, such as wool=0.65, or NAME=yes, no or unknown, or a property as "
+            f"'hardness=62 Shore A'; came {text!r}"
+        ) from None
+    return name.strip(), (share, unit.strip()) if unit else share
+
+
+def compose(memory: MemoryFolder, file: StreamFile, columns: Columns = None, as_json: AsJson = False) -> None:
+    """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
+    from scroll_tactile.recordings import read
+
+    recording = read(file, columns=columns)
+    with opened(memory, mode="read") as learner:
+        made_of = learner.compose(recording.stream(learner.sensor))
+    if as_json:
+        kept = ("presence", "share", "evidence", "unlearned")
+        found = [{"constituent": of.name, **{name: getattr(of, name) for name in kept}} for of in made_of.constituents]
+        say_json({"constituents": found, "unfamiliar": made_of.unfamiliar, "material": made_of.prediction.material})
+        return
+    table = Table("constituent", "there with", "share", "feels most like")
+    for each in made_of.constituents:
+        there = shown(each.unlearned) if each.presence is None else percent(each.presence)
+        share = "" if each.share is None else percent(each.share)
+        table.add_row(shown(each.name), there, share, shown(each.evidence[0][0]) if each.evidence else "")
+    console().print(table)
+    say(f"a material never observed: {percent(made_of.unfamiliar)}")
+
+
+@with_options
+def live(
+    memory: MemoryFolder,
+    file: Annotated[
+        Path,
+        Argument(
+            help="A .npy or .csv file of readings, a row each, or a bag; or - for lines of comma-separated numbers on "
+            "the standard input, as they come.",
+            show_default=False,
+        ),
+    ],
+    *,
+    risk: Risk = 0.05,
+    timed: Annotated[bool, Option("--timed", help="The first column is each reading's time in seconds.")] = False,
+    touch: Annotated[
+        bool, Option("--touch", help="All of it is one touch; otherwise touches are found, after 2 s at rest.")
+    ] = False,
+    as_json: Annotated[bool, Option("--json", help="Print a line of JSON for each thing that happens.")] = False,
+    of: Axis = None,
+    how: Reading,
+) -> None:
+    """Take readings as they come, find the touches, and show each answer grow; the memory stays as it is."""
+    from scroll_tactile.recordings.recording import places
+
+    screen = console()
+    rows = _rows(file, timed, how)
+    if (columns := how.columns) is not None:
+        rows = ((time, reading[places(columns, reading.size)]) for time, reading in rows)
+    growing, before = Live(console=screen, auto_refresh=False, transient=True), None
+    with (
+        opened(memory, mode="read") as learner,
+        learner.live(risk=risk, contact="manual" if touch else "auto", of=of) as session,
+        growing if screen.is_terminal and not as_json else nullcontext(),
+    ):
+        for now, at in _states(session, rows, touch):
+            before = _shown(before, now, at, as_json, growing)
+    _summed_up(session.report, as_json, whole=touch)
+
+
+def _states(
+    session: LiveSession, rows: Iterator[tuple[float | None, npt.NDArray[np.float64]]], touch: bool
+) -> Iterator[tuple[LiveState, float]]:
+    """The state after each reading, and when; and that at the end, where all of them are one touch."""
+    sensor, at = session.sensor, 0.0
+    if touch:
+        session.begin()
+    for count, (time, reading) in enumerate(rows, start=1):
+        at = count / sensor.rate if time is None else time
+        yield session.push(reading.reshape(sensor.shape) if reading.size == sensor.channels else reading, time), at
+    if touch:
+        yield session.end(), at
+
+
+def _rows(file: Path, timed: bool, how: Reading) -> Iterator[tuple[float | None, npt.NDArray[np.float64]]]:
+    """Readings, one after the other, with their times where these are there, as in bags, or were asked for."""
+    import numpy as np
+
+    from scroll_tactile.recordings import read
+
+    where = {name: value for name, value in vars(how).items() if name != "columns"}  # counted behind the time
+    if str(file) != "-":
+        recording = read(file, **where)
+        own = recording.report.clock is not None and (timed or recording.topic is not None)
+        for time, reading in zip(recording.times.tolist(), recording.readings, strict=True):
+            yield (time, reading) if own else _parted(reading, timed)  # a table names its times, or they come first
+        return
+    if named := [f"--{name} {value}" for name, value in where.items() if value is not None]:
+        raise InputError(
+            f"the standard input has readings alone; came {', '.join(named)}: leave that out, or give a file"
+        )
+    for number, line in enumerate(_lines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            yield _parted(np.array([float(cell) for cell in line.split(",")]), timed)
+        except ValueError:
+            raise InputError(
+                f"standard input, line {number}: expected numbers with commas between; came {line.strip()!r:.60}"
+            ) from None
+
+
+def _lines() -> Iterator[str]:
+    """Lines of the standard input, however long it is. Raises InputError where one does not end."""
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(errors="backslashreplace")  # what is no text is no number, which is said of its line
+    while line := sys.stdin.readline(LONGEST_LINE):
+        if len(line) == LONGEST_LINE and not line.endswith("\n"):
+            raise InputError(f"standard input: expected a line a reading, of less than {LONGEST_LINE} characters")
+        yield line
+
+
+def _parted(row: npt.NDArray[np.float64], timed: bool) -> tuple[float | None, npt.NDArray[np.float64]]:
+    return (float(row[0]), row[1:]) if timed else (None, row)
+
+
+def _shown(before: LiveState | None, now: LiveState, at: float, as_json: bool, growing: Live) -> LiveState:
+    """Show what is new after a reading."""
+    for ended in now.touches:
+        if as_json:
+            more = {"revised": ended.revised is not None, "end": ended.end}
+            _line("ended", ended.at, _answer_of(ended, ended.stream.seconds, **more))
+        else:
+            how = "decided" if ended.decided else "[yellow]undecided[/]"
+            if ended.revised is not None:
+                how = f"[yellow]revised[/]: it was decided as {verdict(ended.revised)}"
+            say(f"{ended.at:8.2f} s  touched for {ended.stream.seconds:.2f} s: {verdict(ended.prediction)}, {how}")
+            _say_estimates(ended.estimates, " " * 12)
+            growing.update("", refresh=growing.is_started)
+    old = before if before is not None and before.contact else None
+    if not now.contact:
+        return now
+    if as_json:
+        if old is None:
+            _line("began", at - now.seconds, {})
+        if now.prediction is not None and (old is None or now.prediction is not old.prediction):
+            _line("prediction", at, _answer_of(now, now.seconds))
+    elif growing.is_started:
+        growing.update(_table(now), refresh=True)
+    elif now.decided and (old is None or not old.decided) and now.prediction is not None:
+        say(f"{at:8.2f} s  after {now.seconds:.2f} s: {verdict(now.prediction)}, decided")
+    return now
+
+
+def _table(now: LiveState) -> Table:
+    """The likeliest materials of a touch under way."""
+    state = "decided" if now.decided else "not yet decided"
+    table = Table("material", "probability", "", title=f"touched for {now.seconds:.2f} s, {state}")
+    if now.prediction is not None:
+        for name, probability in now.prediction.ranking[:SHOWN]:
+            table.add_row(shown(name), percent(probability), "█" * round(BAR * probability))
+    for name, estimate in now.estimates.items():
+        table.add_row(shown(name), "", estimate_text(estimate))
+    return table
+
+
+def _answer_of(touch: LiveTouch | LiveState, seconds: float, **more: Any) -> dict[str, Any]:
+    answer = {} if touch.prediction is None else touch.prediction.as_json()
+    return {"seconds": seconds, "decided": touch.decided, **more, **answer, **_measured(touch.estimates)}
+
+
+def _line(event: str, at: float, more: Mapping[str, Any]) -> None:
+    say_json({"event": event, "at": round(at, 6), **more})
+    sys.stdout.flush()
+
+
+def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
+    met = {name: count for name, count in vars(report).items() if count}
+    if as_json:
+        say_json({"event": "report", **met})
+    if not report.touches and not whole:
+        why = "all of it went into learning" if report.learning else "its first 2 s were taken for"
+        console(error=True).print(
+            f"[yellow]no touch was found:[/] {why} the sensor at rest. If it begins in a touch, or is one from end to "
+            "end, take --touch"
+        )
+    if as_json:
+        return
+    say(
+        f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
+        f"{report.revised} revised"
+    )
+    if irregular := [f"{name.replace('_', ' ')}: {met[name]}" for name in IRREGULAR if name in met]:
+        say(", ".join(irregular))

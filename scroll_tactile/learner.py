@@ -471,8 +471,7 @@ class TactileLearner:
         Raises InputError for values that cannot be, and for "auto" with frames that have no resting image; what
         `predict` raises for scene and of.
         """
-        from scroll_tactile.live.health_notes import HealthNotes
-        from scroll_tactile.live.session import LiveSession
+        from scroll_tactile.live.session import HealthNotes, LiveSession
 
         session: dict[str, Any] = {"risk": risk, "contact": contact, "false_contacts": false_contacts, "scene": scene}
         notes = None if changed is None else HealthNotes(self, changed, logger.warning, materials=of is None)

@@ -3,35 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from numbers import Real
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import StoreError
 
 from scroll_tactile.embeddings.protocol import canary, capabilities_of
-from scroll_tactile.errors import InputError, StreamError
+from scroll_tactile.errors import InputError, ScrollTactileError, StreamError
 from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
-from scroll_tactile.live.detector import ContactDetector, Event
-from scroll_tactile.live.health_notes import HealthNotes
-from scroll_tactile.live.pressing import PressDetector
+from scroll_tactile.live.detector import ContactDetector, Event, PressDetector
 from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows, is_touch
 from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor
-from scroll_tactile.results import Prediction
+from scroll_tactile.results import Health, Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.contact import MOST_FRAMES, Rest
 from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
 
-__all__ = ["LiveSession"]
+__all__ = ["HealthNotes", "LiveSession"]
 
 Array = npt.NDArray[Any]
 
@@ -39,6 +38,78 @@ REMEMBERED = 2.0  # seconds before a contact is noticed in which it may have beg
 RESTED = 0.5  # seconds of rest that a touch tells, always as many: noise of fewer readings scatters otherwise
 KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
 MOST_EARLIER = 7  # touches of one thing before a touch: more hardly say more, each has its price in every prediction
+
+
+class Noting(Protocol):
+    """What is needed of a learner."""
+
+    def sense(self, stream: Stream, material: str | None = None) -> None:
+        """As `TactileLearner.sense`."""
+        ...
+
+    def health(self) -> Health:
+        """As `TactileLearner.health`."""
+        ...
+
+    def names_of(self, stream: Stream) -> list[str]:
+        """As `TactileLearner.names_of`."""
+        ...
+
+
+class HealthNotes:
+    """Notes the rest before each touch, and touches that were decided, are known and were not learned.
+
+    learner: whose memory it is. changed: called once with what `health` says, when it sees a change; again only after
+    it saw none. warn: called with a text for each kind of failure once: a full disk must not end a session. materials:
+    whether answers are by materials, without which touches have no name.
+
+    A memory with a damaged row is warned of. Raises InputError as `TactileLearner.health` does: it needs one on disk.
+    """
+
+    def __init__(
+        self,
+        learner: Noting,
+        changed: Callable[[Health], object] | None,
+        warn: Callable[[str], object],
+        *,
+        materials: bool = True,
+    ) -> None:
+        self._learner, self._changed, self._warn, self._materials = learner, changed, warn, materials
+        self._warned: set[type[Exception]] = set()
+        self._last: LiveTouch | None = None  # until another ended: meanwhile it may be learned
+        self._told = False
+        try:
+            learner.health()
+        except StoreError as error:  # a damaged row is no reason to feel nothing: what comes is noted behind it
+            self._warn_once(error)
+
+    def take(self, ended: LiveTouch | None) -> None:
+        """Take the touch that ended; None where the session did: note the touch before it and the rest, and look."""
+        touch, self._last = self._last, ended
+        try:
+            if touch is not None and self._counts(touch):
+                self._learner.sense(touch.stream, touch.prediction.material)
+            if ended is not None and ended.rest is not None:
+                self._learner.sense(ended.rest)
+            found = None if self._changed is None else self._learner.health()
+        except (ScrollTactileError, StoreError) as error:
+            self._warn_once(error)
+            return
+        if self._changed is not None and found is not None:
+            before, self._told = self._told, found.since is not None
+            if self._told and not before:
+                self._changed(found)
+
+    def _counts(self, touch: LiveTouch) -> bool:
+        """Whether a touch is noted: it was decided, is known, and was not learned, whose row has its channels, too."""
+        answer = touch.prediction
+        certain = self._materials and touch.decided and answer.known is True and answer.material is not None
+        return certain and not self._learner.names_of(touch.stream)
+
+    def _warn_once(self, error: Exception) -> None:
+        if type(error) not in self._warned:
+            self._warned.add(type(error))
+            self._warn(f"the health of the sensor cannot be told: {error}")
 
 
 class LiveSession:

@@ -11,7 +11,7 @@ import numpy as np
 
 from scroll_tactile.clients.report.page import lines, note
 from scroll_tactile.errors import InputError, printable
-from scroll_tactile.live.spans import contact_spans
+from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.recordings import PRESETS, Contents, Interval, Recording, Touch, touches
 from scroll_tactile.recordings.presets import find, names_for
 from scroll_tactile.sensors import Sensor, known

@@ -17,7 +17,7 @@ from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import AnnotationError, DescriptionError, InputError, RangeWarning
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, has_numbers
-from scroll_tactile.health.watched_rows import WatchRules
+from scroll_tactile.health.watch import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory

@@ -128,7 +128,7 @@ class GrowingTouch:
             moment = self.moments.pop()
         if moment:
             with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
-                stream = self.stream(moment)
+                stream = self.beginning(moment)
                 if self.prediction is None or not self.decided:
                     self.predict(stream)
                 else:  # the prediction stays; what is asked of intervals is not reached yet
@@ -136,7 +136,7 @@ class GrowingTouch:
         if self.decided and (self.settled or not self.widths):
             self.moments.clear()
 
-    def stream(self, count: int) -> Stream:
+    def beginning(self, count: int) -> Stream:
         """The stream of its first readings, corrected. Raises StreamError where they make none."""
         return corrected_stream(self.extractor.stream(self.rows.first(count)), self.correction)
 

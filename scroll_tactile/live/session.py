@@ -41,19 +41,13 @@ MOST_EARLIER = 7  # touches of one thing before a touch: more hardly say more, e
 
 
 class Noting(Protocol):
-    """What is needed of a learner."""
+    """The methods of a `TactileLearner` that notes are taken with."""
 
-    def sense(self, stream: Stream, material: str | None = None) -> None:
-        """As `TactileLearner.sense`."""
-        ...
+    def sense(self, stream: Stream, material: str | None = None) -> None: ...
 
-    def health(self) -> Health:
-        """As `TactileLearner.health`."""
-        ...
+    def health(self) -> Health: ...
 
-    def names_of(self, stream: Stream) -> list[str]:
-        """As `TactileLearner.names_of`."""
-        ...
+    def names_of(self, stream: Stream) -> list[str]: ...
 
 
 class HealthNotes:
@@ -351,9 +345,17 @@ class LiveSession:
         moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
         at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
         earlier, self._again = self._thing if self._again else (), False
-        kept = TouchRows(rows, limit)
         self._under_way = GrowingTouch(
-            *(self._predictor, self._extractor, self._scene, kept, at, frozen, rule, moments, before, earlier),
+            predictor=self._predictor,
+            extractor=self._extractor,
+            scene=self._scene,
+            rows=TouchRows(rows, limit),
+            at=at,
+            frozen=frozen,
+            rule=rule,
+            moments=moments,
+            before=before,
+            earlier=earlier,
             estimator=self._predictor.estimator(),
             widths=self._widths,
             rest=None if self.sensor.camera else rest,
@@ -394,24 +396,34 @@ class LiveSession:
         try:
             if touch.rows.kept - touch.before < fewest_readings(self.sensor):
                 raise StreamError
-            stream = touch.stream(touch.rows.kept)
+            stream = touch.beginning(touch.rows.kept)
         except StreamError:  # nothing that could be observed
             self.report.brief += 1
             self._leave(touch)
             return
         before = touch.prediction if touch.decided else None
-        prediction, rest = touch.predict(stream), touch.rest_before()
+        prediction = touch.predict(stream)
         revised = before if before is not None and _says(before) != _says(prediction) else None
         self.touch, self._thing = stream, (*touch.earlier, stream)[-MOST_EARLIER:]
         self.report.touches += 1
         self.report.undecided += not touch.decided
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
-        outcome = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
-        self._ended.append(LiveTouch(stream, prediction, *outcome, rest))
+        ended = LiveTouch(
+            stream=stream,
+            prediction=prediction,
+            decided=touch.decided,
+            at=touch.at,
+            end=end,
+            earlier=touch.earlier,
+            revised=revised,
+            estimates=touch.estimates,
+            rest=touch.rest_before(),
+        )
+        self._ended.append(ended)
         self._settled = touch.settled
         if self._notes is not None:
-            self._notes.take(self._ended[-1])
+            self._notes.take(ended)
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""
@@ -425,13 +437,28 @@ class LiveSession:
         touch, ended = self._under_way, tuple(self._ended)
         if touch is not None:
             seconds = max(0, touch.rows.came - touch.before) / self.sensor.rate
-            growing = touch.prediction, touch.decided, bool(ended), ended, touch.estimates, touch.settled
-            return LiveState(True, seconds, *growing)
+            return LiveState(
+                contact=True,
+                seconds=seconds,
+                prediction=touch.prediction,
+                decided=touch.decided,
+                ended=bool(ended),
+                touches=ended,
+                estimates=touch.estimates,
+                settled=touch.settled,
+            )
         if not ended:
             return _AT_REST
         last = ended[-1]
-        outcome = last.prediction, last.decided, True, ended, last.estimates, self._settled
-        return LiveState(False, last.stream.seconds, *outcome)
+        return LiveState(
+            seconds=last.stream.seconds,
+            prediction=last.prediction,
+            decided=last.decided,
+            ended=True,
+            touches=ended,
+            estimates=last.estimates,
+            settled=self._settled,
+        )
 
 
 def _require_risk(risk: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from scroll_tactile.clients.report.facts import MemoryFacts
 from scroll_tactile.errors import ScrollTactileError, printable
-from scroll_tactile.health.advice import advice, in_words
+from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.matching.likelihood import LEVELS
 from scroll_tactile.matching.match import KeptTouch

@@ -13,9 +13,7 @@ from scroll_tactile_store import Checkpoint, StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
-from scroll_tactile.health import watched_rows
-from scroll_tactile.health.watch import Watch
-from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
+from scroll_tactile.health.watch import EVERY, Watch, WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.validation import stored_watch
 from scroll_tactile.validation.expected import Unexpected
 
@@ -86,7 +84,7 @@ def test_few_copies_are_kept_and_few_rows_read_again() -> None:
     assert len(watched._earlier) <= 14
     for gone in (3000, 2990, 2700, 2000):
         watched.take_back(gone)
-        assert 2 * (3000 - watched.last) <= 4 * (3000 - gone) + 5 * watched_rows.EVERY
+        assert 2 * (3000 - watched.last) <= 4 * (3000 - gone) + 5 * EVERY
         taken(rows, watched)
 
 
@@ -143,7 +141,7 @@ def test_an_undo_reads_few_rows_again(memory: Path, counted: Counted) -> None:
         assert counted.rows(learner.health)[1] == 0
         learner.retract(150)
         after, count = counted.rows(learner.health)
-        assert count <= watched_rows.EVERY
+        assert count <= EVERY
         learner.relabel(139, NAMES[1])
         learner.forget(source="robot-1/day.npy")
         learner.sense(SCENE.touch(NAMES[0], 99))

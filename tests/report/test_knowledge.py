@@ -10,8 +10,17 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
 from scroll_tactile.clients.learning.metrics import calibration_error
 from scroll_tactile.clients.report.channels import channels_of
-from scroll_tactile.clients.report.growing import chosen, growing, soon
-from scroll_tactile.clients.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
+from scroll_tactile.clients.report.facts import (
+    bins_of,
+    chosen,
+    growing,
+    interval,
+    mistakes,
+    separations,
+    soon,
+    trust_in,
+    unknown_by,
+)
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of

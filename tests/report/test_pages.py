@@ -15,8 +15,8 @@ from robot_sets import FIELD, robot_set
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.clients.learning.learning import store_model
 from scroll_tactile.clients.report import memory_page, recording_page, save
+from scroll_tactile.clients.report.channels import health_cards, health_section
 from scroll_tactile.clients.report.page import cards, table
-from scroll_tactile.clients.report.sensing import health_cards, health_section
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import held_out_touches

@@ -75,10 +75,10 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
     touch = SCENE.touch(name, i, seconds=1.0)
     model, found = grown(learner, [touch.key])
     assert found[0].material == name
-    assert found[0].seconds[-1] == 1.0
+    assert found[0].predictions[-1].seconds == 1.0
     other = taught(leave=(name, i))
-    for seconds, prediction in zip(found[0].seconds, found[0].predictions, strict=True):
-        expected = dict(other.predict(touch.first(seconds)).ranking)
+    for prediction in found[0].predictions:
+        expected = dict(other.predict(touch.first(prediction.seconds)).ranking)
         assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
     # The model has not lost the touch.
     assert (name, touch.key) in model.matcher.kept.held
@@ -88,7 +88,7 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
 def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
     key = SCENE.touch(NAMES[0], 0, seconds=1.0).key
     _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.05, sure=0.0, together=0.0, least_new=0.0))
-    assert found[0].seconds == (0.1, 0.3, 0.5, 1.0)
+    assert [at.seconds for at in found[0].predictions] == [0.1, 0.3, 0.5, 1.0]
     assert found[0].decided == 0
     _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.0, sure=1.1, together=1.1, least_new=1e9))
     assert found[0].decided is None

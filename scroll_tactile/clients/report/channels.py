@@ -1,4 +1,4 @@
-"""Whether each channel of a sensor measures, by a memory's kept touches and its health or by one recording; and its pictures."""
+"""Whether each channel of a sensor measures, by a memory's touches and health or by one recording; and pictures."""
 
 from __future__ import annotations
 
@@ -18,22 +18,6 @@ from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.results import ChangeKind, Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down
-
-__all__ = [
-    "DEAD",
-    "DRIFTING",
-    "SATURATED",
-    "ChannelSummary",
-    "card_of",
-    "channel_card",
-    "channel_section",
-    "channels_of",
-    "exemplar_pictures",
-    "health_cards",
-    "health_section",
-    "level_picture",
-    "state_rows",
-]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -91,18 +75,11 @@ class ChannelSummary:
             found.append("died lately")
         elif max(self.top, self.bottom if self.signed else 0.0) >= SATURATED:
             found.append("saturated")
-        if self.drift is not None and not found and self.drifts:
+        if self.drift is not None and not found and abs(self.drift[0]) >= max(DRIFTING, CERTAIN * self.drift[1]):
             found.append("drifting")
         if self.missing >= SATURATED:
             found.append("missing readings")
         return found
-
-    @property
-    def drifts(self) -> bool:
-        """Whether its level moved, and by more than chance."""
-        return (
-            self.drift is not None and abs(self.drift[0]) >= DRIFTING and abs(self.drift[0]) >= CERTAIN * self.drift[1]
-        )
 
 
 def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *, ordered: bool) -> list[ChannelSummary]:
@@ -110,35 +87,33 @@ def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *,
 
     signed: whether zero lies inside the range of each, (C,). ordered: whether they follow each other, as parts do.
     """
-    count = len(touches[0])
+    count, found = len(touches[0]), []
     still = np.array([_still(levels) for levels in touches])
-    means = np.array([_mean(levels) for levels in touches])
     counts = np.zeros((count, 256), np.int64)
     for levels in touches:
         placed = np.arange(count)[:, None] * 256 + levels
         counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
-    drifts = drift(means) if ordered else [None] * count
-    lately = still[-LATELY:].mean(axis=0) if ordered else still.mean(axis=0)
-    return [
-        _channel(i, counts[i], (float(still[:, i].mean()), float(lately[i])), drifts[i], signed=bool(signed[i]))
-        for i in range(count)
-    ]
-
-
-def _channel(
-    i: int,
-    counts: npt.NDArray[np.int64],
-    still: tuple[float, float],
-    moved: tuple[float, float] | None,
-    *,
-    signed: bool,
-) -> ChannelSummary:
-    total, read = int(counts.sum()), counts[:MISSING]
-    reached = np.cumsum(read) / max(int(read.sum()), 1)
-    low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
-    bottom, top = float(read[0]) / max(int(read.sum()), 1), float(read[LEVELS - 1]) / max(int(read.sum()), 1)
-    missing = float(counts[MISSING]) / max(total, 1)
-    return ChannelSummary(i, middle, low, high, *still, bottom, top, signed, missing, moved)
+    drifts = drift(np.array([_mean(levels) for levels in touches])) if ordered else [None] * count
+    lately = (still[-LATELY:] if ordered else still).mean(axis=0)
+    for i, own in enumerate(counts):
+        read = max(int(own[:MISSING].sum()), 1)
+        reached = np.cumsum(own[:MISSING]) / read
+        low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
+        channel = ChannelSummary(
+            number=i,
+            middle=middle,
+            low=low,
+            high=high,
+            still=float(still[:, i].mean()),
+            still_lately=float(lately[i]),
+            bottom=float(own[0]) / read,
+            top=float(own[LEVELS - 1]) / read,
+            signed=bool(signed[i]),
+            missing=float(own[MISSING]) / max(int(own.sum()), 1),
+            drift=drifts[i],
+        )
+        found.append(channel)
+    return found
 
 
 def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
@@ -194,12 +169,6 @@ COLUMNS = 400  # touches beside each other in the picture of all
 Pixels = npt.NDArray[np.uint8]
 
 
-def listed(channels: Sequence[ChannelSummary], most: int = 8) -> str:
-    """Their numbers in words."""
-    numbers = [str(channel.number) for channel in channels]
-    return ", ".join(numbers[:most]) + (f" and {len(numbers) - most} more" if len(numbers) > most else "")
-
-
 def health_cards(found: Health | None) -> list[Card]:
     """What is to be seen first of the sensor's health; nothing where it was not told."""
     if found is None or not found.grew:
@@ -236,15 +205,18 @@ def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | Non
 
 def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
     """How channels stand, of these readings."""
-    wrong: dict[str, list[ChannelSummary]] = {}
+    wrong: dict[str, list[str]] = {}
     for channel in found:
         for fault in channel.faults:
-            wrong.setdefault(fault, []).append(channel)
+            wrong.setdefault(fault, []).append(str(channel.number))
     if not wrong:
         return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or changed, by {by}."
     worst = any(fault.startswith(("dead", "died")) for fault in wrong)
     answer = "; ".join(f"{len(own)} {fault}" for fault, own in sorted(wrong.items()))
-    more = ". ".join(f"{fault.capitalize()}: {listed(own)}" for fault, own in sorted(wrong.items()))
+    more = ". ".join(
+        f"{fault.capitalize()}: {', '.join(own[:8])}{f' and {len(own) - 8} more' if len(own) > 8 else ''}"
+        for fault, own in sorted(wrong.items())
+    )
     return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
@@ -283,41 +255,22 @@ def state_rows(
     found: Sequence[ChannelSummary], low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], unit: str
 ) -> str:
     """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
-    faulty = [channel for channel in found if channel.faults]
-    others = [channel for channel in found if not channel.faults] if len(found) <= MOST_ROWS else []
-    rows, drifts = [], any(channel.drift for channel in found)
-    for channel in [*faulty, *others][:MOST_ROWS]:
+    drifts = any(channel.drift for channel in found)
+    shown_channels = [channel for channel in found if channel.faults or len(found) <= MOST_ROWS]
+    rows = []
+    for channel in sorted(shown_channels, key=lambda channel: not channel.faults)[:MOST_ROWS]:
         bottom, top = float(low[channel.number]), float(high[channel.number])
         median, least, most = (
             brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
         )
         moved = None if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
-        rows.append(
-            [
-                channel.number,
-                ", ".join(channel.faults) or "fine",
-                median,
-                f"{least} to {most}",
-                f"{channel.still:.0%}",
-                f"{channel.bottom:.1%}",
-                f"{channel.top:.1%}",
-                *([moved] if drifts else []),
-            ]
-        )
-    header = [
-        "channel",
-        "state",
-        f"median ({unit})" if unit else "median",
-        "90% lie in",
-        "never changes",
-        "at bottom",
-        "at top",
-        *(["drift"] if drifts else []),
-    ]
+        state = ", ".join(channel.faults) or "fine"
+        ends = f"{channel.still:.0%}", f"{channel.bottom:.1%}", f"{channel.top:.1%}"
+        rows.append([channel.number, state, median, f"{least} to {most}", *ends, *([moved] if drifts else [])])
+    header = ["channel", "state", f"median ({unit})" if unit else "median", "90% lie in", "never changes", "at bottom"]
     left = len(found) - len(rows)
-    return table(header, rows, "channels") + (
-        note(f"{left} more channels have no row, those without a fault first.") if left else ""
-    )
+    more = note(f"{left} more channels have no row, those without a fault first.") if left else ""
+    return table([*header, "at top", *(["drift"] if drifts else [])], rows, "channels") + more
 
 
 def _levels_mean(levels: LevelArray) -> npt.NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""All that the page of a memory rests on: how alike its materials are, and how it judges touches that it never observed."""
+"""What a memory's page rests on: how alike its materials are, and how it judges touches that it never observed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -40,23 +41,9 @@ from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.results import Observation, Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.sample import SampledTouch
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = [
-    "MOST_NEAR",
-    "Growing",
-    "MemoryFacts",
-    "bins_of",
-    "chosen",
-    "growing",
-    "interval",
-    "mistakes",
-    "separations",
-    "soon",
-    "trust_in",
-    "unknown_by",
-]
+__all__ = ["MOST_NEAR", "Growing", "MemoryFacts", "bins_of", "unknown_by"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -75,9 +62,9 @@ def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatA
     if model.fusion is None:
         return [], np.zeros((0, 0))
     scales = model.scales("complete", len(model.calibrations) - 1)
-    weights = (
-        model.fusion.complete.calibration.weights if model.kind == "lda" else np.full(len(scales), PRIOR / len(scales))
-    )
+    weights = np.full(len(scales), PRIOR / len(scales))
+    if model.kind == "lda":
+        weights = model.fusion.complete.calibration.weights
     names = [name for name in model.names if all(name in model.readouts[scale].places for scale in scales)]
     total = np.zeros((len(names), len(names)))
     with one_thread():
@@ -93,8 +80,7 @@ def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatA
     return names, total
 
 
-@dataclass(frozen=True)
-class Mistake:
+class Mistake(NamedTuple):
     """Left-out touches of one material that were called another: how many, of how many, and their mean probability."""
 
     material: str
@@ -111,10 +97,7 @@ def mistakes(held_out: Sequence[HeldOutTouch]) -> list[Mistake]:
     for touch in held_out:
         if touch.answer != touch.material:
             wrong.setdefault((touch.material, touch.answer), []).append(touch.confidence)
-    found = [
-        Mistake(material, answer, len(sure), tested[material], float(np.mean(sure)))
-        for (material, answer), sure in wrong.items()
-    ]
+    found = [Mistake(*pair, len(sure), tested[pair[0]], float(np.mean(sure))) for pair, sure in wrong.items()]
     return sorted(found, key=lambda m: (-m.count, -m.count / m.tested, m.material, m.answer))
 
 
@@ -154,15 +137,25 @@ class Trust:
 
 def trust_in(held_out: Sequence[HeldOutTouch]) -> Trust:
     """How far answers can be believed, by one or more touches left out."""
-    confidence = np.array([touch.confidence for touch in held_out])
-    right = np.array([touch.answer == touch.material for touch in held_out])
-    count = len(held_out)
-    low, high = interval(int(right.sum()), count)
-    draws = np.random.default_rng(0).random((200, count)) < confidence
-    chance = float(np.mean([_error(confidence, drawn) for drawn in draws]))
-    unknown = float(np.mean([not touch.known for touch in held_out]))
-    mean = float(confidence.mean())
-    return Trust(count, float(right.mean()), low, high, mean, _error(confidence, right), chance, unknown)
+    confidence, right = _answered(held_out)
+    low, high = interval(int(right.sum()), len(held_out))
+    draws = np.random.default_rng(0).random((200, len(held_out))) < confidence
+    return Trust(
+        count=len(held_out),
+        right=float(right.mean()),
+        low=low,
+        high=high,
+        confidence=float(confidence.mean()),
+        error=_error(confidence, right),
+        chance=float(np.mean([_error(confidence, drawn) for drawn in draws])),
+        unknown=float(np.mean([not touch.known for touch in held_out])),
+    )
+
+
+def _answered(held_out: Sequence[HeldOutTouch]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """How sure each answer was, and whether it was right."""
+    sure = np.array([touch.confidence for touch in held_out])
+    return sure, np.array([touch.answer == touch.material for touch in held_out])
 
 
 def _places(confidence: FloatArray) -> npt.NDArray[np.intp]:
@@ -177,8 +170,7 @@ def _error(confidence: FloatArray, right: npt.NDArray[np.bool_]) -> float:
 
 def bins_of(held_out: Sequence[HeldOutTouch]) -> list[Bin]:
     """Answers by their probability, in equal steps of it."""
-    confidence = np.array([touch.confidence for touch in held_out])
-    right = np.array([touch.answer == touch.material for touch in held_out])
+    confidence, right = _answered(held_out)
     places, found = _places(confidence), []
     for place in np.unique(places):
         own = places == place
@@ -195,31 +187,16 @@ def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
     return sorted(found, key=lambda row: (-row[1] / row[2], row[0]))
 
 
-PARTS = (
-    0.025,
-    0.05,
-    0.1,
-    0.15,
-    0.2,
-    0.3,
-    0.45,
-    0.6,
-    0.8,
-    1.0,
-)  # of a touch, where a rule has no moments before its end
+# Parts of a touch, where a rule has no moments before its end.
+PARTS = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 CAMERA_PARTS = (0.2, 0.4, 0.7, 1.0)
 TOUCHES, CAMERA_TOUCHES = 6, 3
 
 
-@dataclass(frozen=True)
-class Growing:
-    """The answers to one touch.
-
-    seconds: of touch at each moment. predictions: then. decided: by which of them; None if by none.
-    """
+class Growing(NamedTuple):
+    """The answers to one touch, one after the other. decided: by which of them; None if by none."""
 
     material: str
-    seconds: tuple[float, ...]
     predictions: tuple[Prediction, ...]
     decided: int | None
 
@@ -259,15 +236,26 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
         best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
         for touch in np.flatnonzero(reached & ~done).tolist():
             name, chance = str(best[touch]), float(chances[touch].max())
-            known = bool(novelty[touch] <= threshold)
-            prediction = Prediction(name, chance, ((name, chance),), float(novelty[touch]), known, moment.steps / rate)
+            prediction = Prediction(
+                material=name,
+                probability=chance,
+                ranking=((name, chance),),
+                novelty=float(novelty[touch]),
+                known=bool(novelty[touch] <= threshold),
+                seconds=moment.steps / rate,
+            )
             if rule.decided(prediction, moment.steps):
-                done[touch], wrong[touch] = True, not known or best[touch] != held_out.targets[touch]
+                done[touch], wrong[touch] = True, not prediction.known or best[touch] != held_out.targets[touch]
         right.append(float((best == held_out.targets)[reached].mean()) if reached.any() else 0.0)
         decided.append(float(done.mean()))
         mistaken.append(float(wrong.mean()))
-    seconds = tuple(moment.steps / rate for moment in moments)
-    return Soon(seconds, tuple(right), tuple(decided), tuple(mistaken), len(held_out.targets))
+    return Soon(
+        seconds=tuple(moment.steps / rate for moment in moments),
+        right=tuple(right),
+        decided=tuple(decided),
+        wrong=tuple(mistaken),
+        count=len(held_out.targets),
+    )
 
 
 def chosen(held_out: Sequence[HeldOutTouch], keys: Iterable[bytes], camera: bool) -> list[HeldOutTouch]:
@@ -306,8 +294,7 @@ def growing(
         with _without(model, touch) as other:
             answers = list(_answers(learner, other, extractor, rule, stream))
         decided = next((i for i, (steps, at) in enumerate(answers) if rule.decided(at, steps)), None)
-        predictions = tuple(prediction for _, prediction in answers)
-        found.append(Growing(touch.material, tuple(at.seconds for at in predictions), predictions, decided))
+        found.append(Growing(touch.material, tuple(prediction for _, prediction in answers), decided))
     return found
 
 
@@ -315,9 +302,14 @@ def growing(
 def _without(model: Model, touch: HeldOutTouch) -> Iterator[Model]:
     """The model as if it had never observed a touch, nor kept it, but for how it is calibrated."""
     sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
+    stages, readouts = [[*stage, *model.views] for stage in model.stages], dict(model.readouts)
     with one_thread():
-        other = _left_by(model, touch.material, sampled)
-    matcher = model.matcher
+        for scale, readout in model.readouts.items():
+            if own := rows_at(sampled, stages, scale):
+                # As many rows as it added: of windows that are learned one by one the sample has the mean.
+                times = max(1, round(sampled.learned[own[0]] / len(own)))
+                readouts[scale] = readout.without(touch.material, np.repeat(sampled.rows[own], times, axis=0))
+    other, matcher = replace(model, readouts=readouts), model.matcher
     if matcher is None or (touch.material, touch.key) not in matcher.kept.held:
         yield other
         return
@@ -327,18 +319,6 @@ def _without(model: Model, touch: HeldOutTouch) -> Iterator[Model]:
         yield other
     finally:
         matcher.kept.follow([kept])
-
-
-def _left_by(model: Model, material: str, sampled: SampledTouch) -> Model:
-    """The model of which the readouts never observed a sampled touch; its material has others."""
-    stages = [[*stage, *model.views] for stage in model.stages]
-    readouts = dict(model.readouts)
-    for scale, readout in model.readouts.items():
-        if own := rows_at(sampled, stages, scale):
-            # As many rows as it added: of windows that are learned one by one the sample has the mean.
-            times = max(1, round(sampled.learned[own[0]] / len(own)))
-            readouts[scale] = readout.without(material, np.repeat(sampled.rows[own], times, axis=0))
-    return replace(model, readouts=readouts)
 
 
 def _answers(
@@ -407,21 +387,18 @@ class MemoryFacts:
     def model(self) -> Model | None:
         """The model that answers, touches held out of it; None of an empty memory, and where none can be fitted."""
         try:
-            return self._fitted() if self.counts else None
+            try:
+                return self.learner._by(self.of).examined() if self.counts else None
+            except CANNOT_EMBED as error:
+                self.missing.append(f"When answers are decided: {error}")
+                self.unread = True
+                with enough_memory():
+                    return Draft.of(self.memory, self.learner.settings.readout).fit(None)
         except CapacityError:
             raise
         except ScrollTactileError as error:  # sums that came from elsewhere have no readout, and the ridge has a limit
             self.missing.append(f"Nothing could be fitted: {error}")
             return None
-
-    def _fitted(self) -> Model:
-        try:
-            return self.learner._by(self.of).examined()
-        except CANNOT_EMBED as error:
-            self.missing.append(f"When answers are decided: {error}")
-            self.unread = True
-            with enough_memory():
-                return Draft.of(self.memory, self.learner.settings.readout).fit(None)
 
     @cached_property
     def held_out(self) -> list[HeldOutTouch]:
@@ -451,11 +428,6 @@ class MemoryFacts:
         touches = self.memory.kept.touches() if self.memory.kept is not None else []
         place = {row.key: row.sequence for row in self.journal}
         return sorted(touches, key=lambda touch: (place.get(touch.key, 0), touch.material, touch.key))
-
-    @property
-    def ordered(self) -> bool:
-        """Whether that order is known."""
-        return bool(self.journal)
 
     @cached_property
     def exemplars(self) -> dict[str, list[Exemplar]]:

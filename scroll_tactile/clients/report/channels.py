@@ -20,6 +20,7 @@ from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down
 
 FloatArray = npt.NDArray[np.float64]
+Pixels = npt.NDArray[np.uint8]
 
 DEAD = 0.8  # of the touches, in which a channel never changes
 SATURATED = 0.05  # of the readings, at an end of the range
@@ -27,6 +28,12 @@ DRIFTING = 0.05  # of the range, from the first part of a recording to the last 
 CERTAIN = 4.0  # … and as many standard errors
 LATELY = 20  # parts: a channel that died is seen in these
 STEADY = 0.5  # of a channel that lives, in as many parts at most it may be still
+MOST_ROWS = 128  # channels, of which all have a row in a table
+MOST_PICTURES = 60
+LONGEST = 160  # columns of a picture
+HIGHEST = 64  # rows
+FRAME = (60, 80)  # of a camera's picture
+COLUMNS = 400  # touches beside each other in the picture of all
 CHANGED: dict[ChangeKind, str] = {
     "gain": "another gain",
     "offset": "another offset",
@@ -93,7 +100,7 @@ def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *,
     for levels in touches:
         placed = np.arange(count)[:, None] * 256 + levels
         counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
-    drifts = drift(np.array([_mean(levels) for levels in touches])) if ordered else [None] * count
+    drifts = drift(np.array([_mean(levels) for levels in touches]) / (LEVELS - 1)) if ordered else [None] * count
     lately = (still[-LATELY:] if ordered else still).mean(axis=0)
     for i, own in enumerate(counts):
         read = max(int(own[:MISSING].sum()), 1)
@@ -124,11 +131,11 @@ def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
 
 
 def _mean(levels: LevelArray) -> FloatArray:
-    """The mean of each channel as a share of its range, (C,); NaN where nothing was read."""
+    """The mean level of each channel, (C,); NaN where nothing was read."""
     read = levels != MISSING
     sums = np.where(read, levels, 0).sum(axis=1, dtype=np.int64)
     with np.errstate(invalid="ignore"):
-        return np.asarray(sums / read.sum(axis=1) / (LEVELS - 1))
+        return np.asarray(sums / read.sum(axis=1))
 
 
 def drift(means: FloatArray) -> list[tuple[float, float] | None]:
@@ -149,24 +156,6 @@ def drift(means: FloatArray) -> list[tuple[float, float] | None]:
             left = rest - slope * place
             found[i] = slope, float(np.sqrt(max(left @ left, 0.0) / (count - 2) / spread))
     return found
-
-
-def changed_in(channels: Sequence[ChannelSummary], health: Health | None) -> list[ChannelSummary]:
-    """The channels, and what a memory's health says became of them."""
-    if health is None or health.since is None or health.kind not in CHANGED:
-        return list(channels)
-    what = f"{CHANGED[health.kind]} since observation {health.since}"
-    return [replace(own, change=what) if own.number in health.channels else own for own in channels]
-
-
-MOST_ROWS = 128  # channels, of which all have a row in a table
-MOST_PICTURES = 60
-LONGEST = 160  # columns of a picture
-HIGHEST = 64  # rows
-FRAME = (60, 80)  # of a camera's picture
-COLUMNS = 400  # touches beside each other in the picture of all
-
-Pixels = npt.NDArray[np.uint8]
 
 
 def health_cards(found: Health | None) -> list[Card]:
@@ -221,8 +210,13 @@ def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
 
 
 def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
+    """The channels by kept touches, and what the memory's health says became of them."""
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
-    return changed_in(channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False), health)
+    found = channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False)
+    if health is None or health.since is None or health.kind not in CHANGED:
+        return found
+    what = f"{CHANGED[health.kind]} since observation {health.since}"
+    return [replace(own, change=what) if own.number in health.channels else own for own in found]
 
 
 def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None, *, ordered: bool) -> str:
@@ -235,7 +229,7 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | 
             "made with kept_touches=0."
         )
     found = _channels(sensor, kept, health)
-    means = np.stack([_levels_mean(touch.levels) for touch in kept], axis=1)
+    means = np.nan_to_num(np.stack([_mean(touch.levels) for touch in kept], axis=1))
     order = "in the order of observation" if ordered else "by material"
     caption = (
         f"Each row is a channel, 0 at the top; each column a touch, {order}. Dark is the least mean level that "
@@ -273,23 +267,12 @@ def state_rows(
     return table([*header, "at top", *(["drift"] if drifts else [])], rows, "channels") + more
 
 
-def _levels_mean(levels: LevelArray) -> npt.NDArray[np.float64]:
-    read = levels != MISSING
-    return np.asarray(np.where(read, levels, 0).sum(axis=1) / np.maximum(read.sum(axis=1), 1))
-
-
 def _averaged(levels: npt.NDArray[np.number], columns: int) -> npt.NDArray[np.float64]:
     """Levels (C, T) with their columns averaged down to at most so many."""
     if levels.shape[1] <= columns:
         return levels.astype(np.float64)
     edges = np.linspace(0, levels.shape[1], columns + 1).astype(np.intp)
     return np.asarray(np.add.reduceat(levels, edges[:-1], axis=1, dtype=np.float64) / np.diff(edges))
-
-
-def _spread_out(means: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Mean levels (C, touches), each channel from its least to its most but for the outermost hundredths."""
-    low, high = (np.quantile(means, share, axis=1, keepdims=True) for share in (0.01, 0.99))
-    return np.asarray((means - low) / np.maximum(high - low, 1.0) * (LEVELS - 1))
 
 
 def _thinned(levels: npt.NDArray[np.floating], columns: int) -> Pixels:
@@ -299,9 +282,13 @@ def _thinned(levels: npt.NDArray[np.floating], columns: int) -> Pixels:
 
 
 def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str) -> str:
-    """A picture of levels (C, T), each channel from its least to its most; `alternative` is for who cannot see it."""
+    """A picture of levels (C, T), each channel from its least to its most but for the outermost hundredths.
+
+    alternative: for who cannot see it.
+    """
     few = _averaged(levels, COLUMNS)
-    pixels = _thinned(_spread_out(few), COLUMNS)
+    low, high = (np.quantile(few, share, axis=1, keepdims=True) for share in (0.01, 0.99))
+    pixels = _thinned((few - low) / np.maximum(high - low, 1.0) * (LEVELS - 1), COLUMNS)
     height = max(60, min(260, 9 * len(pixels)))
     drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="height:{height}px">'
     return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
@@ -313,7 +300,9 @@ def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapp
     if sensor.camera:
         for name, ranked in exemplars.items():
             if ranked and len(found) < MOST_PICTURES:
-                found[name] = png(_frame(sensor, ranked[0].readings))
+                frames, (low, high) = ranked[0].readings, sensor.limits
+                small = scaled_down(frames[len(frames) // 2][None], *FRAME)[0]
+                found[name] = png(np.rint(np.clip((small - low) / (high - low), 0, 1) * 255).astype(np.uint8))
     else:
         for touch in kept:
             if touch.material not in found and len(found) < MOST_PICTURES:
@@ -341,9 +330,3 @@ def _touch(levels: LevelArray) -> npt.NDArray[np.float64]:
     low = np.where(read, levels, LEVELS).min(axis=1, keepdims=True)
     high = np.where(read, levels, 0).max(axis=1, keepdims=True)
     return np.asarray((np.where(read, levels, low) - low) / np.maximum(high - low, 1) * (LEVELS - 1), dtype=np.float64)
-
-
-def _frame(sensor: Sensor, readings: npt.NDArray[np.float32]) -> Pixels:
-    low, high = sensor.limits
-    small = scaled_down(readings[len(readings) // 2][None], *FRAME)[0]
-    return np.asarray(np.rint(np.clip((small - low) / (high - low), 0, 1) * 255), dtype=np.uint8)

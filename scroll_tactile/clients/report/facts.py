@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -46,6 +46,8 @@ from scroll_tactile.statistics.statistics import Statistics
 __all__ = ["MOST_NEAR", "Growing", "MemoryFacts", "bins_of", "unknown_by"]
 
 FloatArray = npt.NDArray[np.float64]
+
+Streams = Sequence[tuple[HeldOutTouch, Stream]]
 
 MOST_NEAR = 1024  # materials: the separation of each two of more takes minutes
 PRIOR = 0.1  # of a readout's scores, where the calibration is that of another kind
@@ -111,8 +113,7 @@ def interval(right: int, count: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-@dataclass(frozen=True)
-class Trust:
+class Trust(NamedTuple):
     """How right and how well calibrated answers to left-out touches are.
 
     count: of touches. right: share, between low and high with 95 %. confidence: the mean probability that was given.
@@ -191,6 +192,7 @@ def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
 PARTS = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 CAMERA_PARTS = (0.2, 0.4, 0.7, 1.0)
 TOUCHES, CAMERA_TOUCHES = 6, 3
+CANNOT_EMBED = EmbeddingError, MismatchError, StreamError, WeightsError
 
 
 class Growing(NamedTuple):
@@ -201,8 +203,7 @@ class Growing(NamedTuple):
     decided: int | None
 
 
-@dataclass(frozen=True)
-class Soon:
+class Soon(NamedTuple):
     """How soon held-out touches are decided, and how many of the decisions are wrong.
 
     seconds: of touch, at each moment. right: the share of touches of that length whose likeliest material is the true
@@ -277,24 +278,27 @@ def chosen(held_out: Sequence[HeldOutTouch], keys: Iterable[bytes], camera: bool
 
 
 def growing(
-    learner: TactileLearner,
-    model: Model,
-    extractor: FeatureExtractor,
-    rule: DecisionRule,
-    touches: Sequence[HeldOutTouch],
-    streams: Mapping[bytes, Stream],
+    model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float, touches: Streams
 ) -> list[Growing]:
-    """The answers to some touches, each as if it had never been observed. streams: the touches, by key.
+    """The answers to some touches, each as if it had never been observed, at the rule's moments or at parts of it.
 
     Raises EmbeddingMismatchError where only its user can make the memory's embedding, and what that raises.
     """
-    found = []
-    for touch in touches:
-        stream = extractor.stream(streams[touch.key])
+    sensor, names, found = extractor.sensor, model.names, list[Growing]()
+    first = 1 if sensor.camera and capabilities_of(extractor.embedding).rest is not None else 0  # the frame at rest
+    for touch, readings in touches:
+        stream, predictions, decided = extractor.stream(readings), list[Prediction](), None
+        parts = CAMERA_PARTS if sensor.camera else PARTS
+        moments = rule.moments if len(rule.moments) > 1 else [round(part * len(stream)) for part in parts]
+        least, most = max(fewest_readings(sensor), first + 1), len(stream)
         with _without(model, touch) as other:
-            answers = list(_answers(learner, other, extractor, rule, stream))
-        decided = next((i for i, (steps, at) in enumerate(answers) if rule.decided(at, steps)), None)
-        found.append(Growing(touch.material, tuple(prediction for _, prediction in answers), decided))
+            for count in sorted({min(max(least, moment), most) for moment in (*moments, most)}):
+                prefix = stream.first(count / sensor.rate)
+                encoded = extractor.encode(prefix, other.longest, lambda steps: model.scales_for(names, steps))
+                predictions.append(answer(other, extractor, names, [(encoded, None)], false_alarms))
+                if decided is None and rule.decided(predictions[-1], encoded.steps):
+                    decided = len(predictions) - 1
+        found.append(Growing(touch.material, tuple(predictions), decided))
     return found
 
 
@@ -319,24 +323,6 @@ def _without(model: Model, touch: HeldOutTouch) -> Iterator[Model]:
         yield other
     finally:
         matcher.kept.follow([kept])
-
-
-def _answers(
-    learner: TactileLearner, model: Model, extractor: FeatureExtractor, rule: DecisionRule, stream: Stream
-) -> Iterator[tuple[int, Prediction]]:
-    """Steps and prediction at the rule's moments, or at some parts of the touch, and at its end."""
-    sensor, names = learner.sensor, model.names
-    first = 1 if sensor.camera and capabilities_of(learner.embedding).rest is not None else 0  # the frame at rest
-    parts = CAMERA_PARTS if sensor.camera else PARTS
-    counts = {round(part * len(stream)) for part in parts} if len(rule.moments) < 2 else {*rule.moments, len(stream)}
-    for count in sorted({min(max(fewest_readings(sensor), first + 1, count), len(stream)) for count in counts}):
-        prefix = stream.first(count / sensor.rate)
-        encoded = extractor.encode(prefix, model.longest, lambda steps: model.scales_for(names, steps))
-        prediction = answer(model, extractor, names, [(encoded, None)], learner.settings.false_alarms)
-        yield encoded.steps, prediction
-
-
-CANNOT_EMBED = EmbeddingError, MismatchError, StreamError, WeightsError
 
 
 @dataclass
@@ -471,12 +457,12 @@ class MemoryFacts:
         touches = chosen(self.held_out, kept or held, sensor.camera)
         if not touches:
             return [], "of no touch that could be left out the readings are kept."
-        streams = {
-            touch.key: stream_of(kept[touch.key].levels, sensor) if kept else validate(held[touch.key].readings, sensor)
-            for touch in touches
-        }
+        streams = [
+            (own, stream_of(kept[own.key].levels, sensor) if kept else validate(held[own.key].readings, sensor))
+            for own in touches
+        ]
         try:
-            return growing(self.learner, self.model, self.extractor, self.rule, touches, streams), ""
+            return growing(self.model, self.extractor, self.rule, self.learner.settings.false_alarms, streams), ""
         except CANNOT_EMBED as error:
             return [], str(error)
 

@@ -10,9 +10,9 @@ import struct
 import unicodedata
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from html import escape
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -277,7 +277,8 @@ def confusions(names: Sequence[str], counts: npt.NDArray[np.int64]) -> str:
     return drawing.svg()
 
 
-class Bin(NamedTuple):
+@dataclass(frozen=True)
+class Bin:
     """Answers of about one confidence: how many, its mean, the share that is right, and its 95 % interval."""
 
     count: int
@@ -386,10 +387,10 @@ def answers(
         drawing.line([(x, 12), (x, 140)], "decided")
         drawing.text(x + (-4 if late else 4), 11, decided[1], "small", "end" if late else "start")
     drawing.across(axis, 140, 140, "seconds of touch")
-    for name, kind, x in ((own, "own", 40.0), (rival, "rival", 80 + min(120.0, LETTER * len(own)))):
-        if name is not None:
+    for called, kind, x in ((own, "own", 40.0), (rival, "rival", 80 + min(120.0, LETTER * len(own)))):
+        if called is not None:
             drawing.line([(x, 184), (x + 20, 184)], kind)
-            drawing.text(x + 24, 188, clipped_name(name, 120), title=name)
+            drawing.text(x + 24, 188, clipped_name(called, 120), title=called)
     return drawing.svg()
 
 

@@ -82,7 +82,8 @@ def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatA
     return names, total
 
 
-class Mistake(NamedTuple):
+@dataclass(frozen=True)
+class Mistake:
     """Left-out touches of one material that were called another: how many, of how many, and their mean probability."""
 
     material: str
@@ -113,7 +114,8 @@ def interval(right: int, count: int) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-class Trust(NamedTuple):
+@dataclass(frozen=True)
+class Trust:
     """How right and how well calibrated answers to left-out touches are.
 
     count: of touches. right: share, between low and high with 95 %. confidence: the mean probability that was given.
@@ -203,7 +205,8 @@ class Growing(NamedTuple):
     decided: int | None
 
 
-class Soon(NamedTuple):
+@dataclass(frozen=True)
+class Soon:
     """How soon held-out touches are decided, and how many of the decisions are wrong.
 
     seconds: of touch, at each moment. right: the share of touches of that length whose likeliest material is the true

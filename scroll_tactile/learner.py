@@ -554,7 +554,7 @@ class TactileLearner:
 
         It is read from the observations in the order of the journal, and from what `sense` noted, as numbers of each
         channel; touches are compared with earlier ones of the same material, of a similar length and level, so that no
-        mixture of materials, lengths and forces is a change. See `health.betting`. The digest knows nothing of it.
+        mixture of materials, lengths and forces is a change. See `health.watch`. The digest knows nothing of it.
 
         Raises InputError for values that cannot be, for a camera, for more than 256 channels, and in a memory without a
         path; StoreError.

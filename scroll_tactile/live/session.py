@@ -128,7 +128,6 @@ class LiveSession:
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
         if not 0 < false_contacts < math.inf:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
-        _require_risk(risk)
         self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
         self.sensor = sensor = predictor.recipe.sensor
         self._rest: Rest = capabilities_of(self._extractor.embedding).rest
@@ -237,7 +236,6 @@ class LiveSession:
         Raises what `TactileLearner.live` raises for these, and InputError after `close`. Then nothing has changed.
         """
         self._require_open()
-        _require_risk(risk)
         model = self._predictor.frozen().model
         candidates_of(scene, model.names, model.known)
         before, self._risk = self._risk, risk
@@ -459,11 +457,6 @@ class LiveSession:
             estimates=last.estimates,
             settled=self._settled,
         )
-
-
-def _require_risk(risk: float) -> None:
-    if not 0 < risk < 1:
-        raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
 
 
 def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:

@@ -15,7 +15,7 @@ from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.results import ChangeKind, Health
+from scroll_tactile.results import Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down
 
@@ -34,16 +34,9 @@ LONGEST = 160  # columns of a picture
 HIGHEST = 64  # rows
 FRAME = (60, 80)  # of a camera's picture
 COLUMNS = 400  # touches beside each other in the picture of all
-CHANGED: dict[ChangeKind, str] = {
-    "gain": "another gain",
-    "offset": "another offset",
-    "dead": "dead",
-    "noisier": "noisier",
-    "slower": "slower",
-    "gains": "another gain",
-    "all gains": "another gain",
-    "all offsets": "another offset",
-}
+CHANGED = {kind: kind for kind in ("dead", "noisier", "slower")}
+CHANGED |= dict.fromkeys(("gain", "gains", "all gains"), "another gain")
+CHANGED |= dict.fromkeys(("offset", "all offsets"), "another offset")
 
 
 @dataclass(frozen=True)

@@ -406,8 +406,8 @@ def trace(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
     chosen = _moving(readings)
     at, unit = counted_from(recording)
     gaps = recording.report.gaps if unit == "s" else ()
-    drawing, bottom = Drawing(TRACE * max(len(chosen), 1) + 50, "The channels over time"), TRACE * max(len(chosen), 1)
-    axis, bottom = Axis(float(at[0]), float(at[-1]), LEFT, RIGHT), bottom + 14
+    axis, bottom = Axis(float(at[0]), float(at[-1]), LEFT, RIGHT), TRACE * max(len(chosen), 1) + 14
+    drawing = Drawing(bottom + 36, "The channels over time")
     bands = [(at[begin], at[end - 1], "fill", 0.15, f"touch, readings {begin} to {end}") for begin, end in spans]
     for gap in gaps:
         title = f"a gap of {gap.seconds:.3g} s before reading {gap.index}"

@@ -333,8 +333,8 @@ class MemoryFacts:
     """What a memory knows.
 
     risk: the share of wrong answers among those decided. of: an axis, whose labels it then knows in place of materials.
-    missing: what the page lacks and why, filled as it is made. unread: whether the embedding is not at hand, and
-    nothing was fitted to beginnings.
+    names: what touches are called by. missing: what the page lacks and why, filled as it is made. unread: whether the
+    embedding is not at hand, and nothing was fitted to beginnings.
     """
 
     learner: TactileLearner
@@ -357,10 +357,8 @@ class MemoryFacts:
         """What was learned, by materials or by labels."""
         return self.learner.memory if self.of is None else axis_memory(self.learner.memory, self.of)
 
-    @property
-    def names(self) -> str:
-        """What touches are called by."""
-        return "materials" if self.of is None else f"labels on {self.of}"
+    def __post_init__(self) -> None:
+        self.names = "materials" if self.of is None else f"labels on {self.of}"
 
     @cached_property
     def counts(self) -> dict[str, int]:

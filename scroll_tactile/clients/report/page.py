@@ -19,8 +19,8 @@ Card = tuple[State, str, str, str]
 """How it stands, a heading, the answer in few words, and a sentence more."""
 
 LONG = 40  # rows, from which on a table scrolls inside itself, and says so
-HALF = ("when", "health", "time", "holds")  # sections of one figure or table, two of which stand side by side
-BESIDE = ("channels",)  # sections of which the table stands beside the picture
+# Sections of one figure or table, two of which stand side by side; one of which the table stands beside the picture.
+KINDS = dict.fromkeys(("when", "health", "time", "holds"), ' class="half"') | {"channels": ' class="beside"'}
 
 SIGNS = {"good": ("✓", "fine"), "look": ("!", "look at it"), "bad": ("✕", "bad"), "none": ("–", "not measured")}
 
@@ -97,9 +97,8 @@ def page(title: str, under: str, summary: str, sections: Sequence[tuple[str, str
     """The whole page. under: what stands below the title; sections: anchor, heading and HTML of each; all but names are
     HTML already."""
     links = "".join(f'<a href="#{anchor}">{shown(heading)}</a>' for anchor, heading, _ in sections)
-    kinds = dict.fromkeys(HALF, ' class="half"') | dict.fromkeys(BESIDE, ' class="beside"')
     body = "".join(
-        f'<section id="{anchor}"{kinds.get(anchor, "")}><h2>{shown(heading)}</h2>{inside}</section>\n'
+        f'<section id="{anchor}"{KINDS.get(anchor, "")}><h2>{shown(heading)}</h2>{inside}</section>\n'
         for anchor, heading, inside in sections
     )
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"

@@ -86,9 +86,13 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     sure = _least_sure_of(held_out, held_out.novelty <= thresholds, risk)
     pairs, known = in_pairs(held_out, thresholds, model.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
-    least_new = max(BEYOND * float(np.nanmax(held_out.novelty)), UNMEASURED)
-    steps = (*(moment.steps for moment in moments), least)
-    return DecisionRule(steps, risk, sure=sure, together=max(sure, together), least_new=least_new)
+    return DecisionRule(
+        moments=(*(moment.steps for moment in moments), least),
+        risk=risk,
+        sure=sure,
+        together=max(sure, together),
+        least_new=max(BEYOND * float(np.nanmax(held_out.novelty)), UNMEASURED),
+    )
 
 
 def _least_sure_of(trajectories: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:

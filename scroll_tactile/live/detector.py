@@ -102,10 +102,6 @@ class Rest:
         self._unread: list[int] = []  # channels of which nothing was read yet
         self._levels: deque[tuple[Whole, int]] = deque(maxlen=FOLLOWED)
         self._scatter: npt.NDArray[np.int64] = np.zeros((sensor.channels, sensor.channels), np.int64)
-        self._floor = 1.0
-        self._whiten: Whole = np.empty((0, 0))
-        self._blocks = self._due = self.measured = 0
-        self._sum = self._squares = self._fourths = 0.0  # of d² over blocks, of its square over them and one by one
         self.mean = self.kappa = self.alarm = self.inner = self.near = math.inf
 
     def whole(self, rows: npt.NDArray[np.float64]) -> Whole:
@@ -164,7 +160,7 @@ class Rest:
         self._scatter[:] = 0
         self._levels.clear()
         self._blocks = self.measured = 0
-        self._sum = self._squares = self._fourths = 0.0
+        self._sum = self._squares = self._fourths = 0.0  # of d² over blocks, of its square over them and one by one
         blocks = [numbers[first : first + self.block] for first in range(0, len(numbers), self.block)]
         half = -(-len(blocks) // 2)
         for block in blocks[:half]:
@@ -236,7 +232,7 @@ class Rest:
         pulled = covariance * (1 - part)
         pulled[np.diag_indices(channels)] = own * (1 - part) + own.mean() * part + self._floor
         factor = np.linalg.cholesky(pulled)
-        self._whiten = np.rint(np.linalg.inv(factor).T * FINE)
+        self._whiten: Whole = np.rint(np.linalg.inv(factor).T * FINE)
         mean, spread = float(channels), 2.0 * channels  # of d², where noise is normal
         if self.measured:
             count = self.measured + UNMEASURED

@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import partial
 from numbers import Real
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -40,29 +40,20 @@ KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
 MOST_EARLIER = 7  # touches of one thing before a touch: more hardly say more, each has its price in every prediction
 
 
-class Noting(Protocol):
-    """The methods of a `TactileLearner` that notes are taken with."""
-
-    def sense(self, stream: Stream, material: str | None = None) -> None: ...
-
-    def health(self) -> Health: ...
-
-    def names_of(self, stream: Stream) -> list[str]: ...
-
-
 class HealthNotes:
     """Notes the rest before each touch, and touches that were decided, are known and were not learned.
 
-    learner: whose memory it is. changed: called once with what `health` says, when it sees a change; again only after
-    it saw none. warn: called with a text for each kind of failure once: a full disk must not end a session. materials:
-    whether answers are by materials, without which touches have no name.
+    learner: the `TactileLearner` whose memory it is; it stands above this module. changed: called once with what
+    `health` says, when it sees a change; again only after it saw none. warn: called with a text for each kind of
+    failure once: a full disk must not end a session. materials: whether answers are by materials, without which touches
+    have no name.
 
     A memory with a damaged row is warned of. Raises InputError as `TactileLearner.health` does: it needs one on disk.
     """
 
     def __init__(
         self,
-        learner: Noting,
+        learner: Any,
         changed: Callable[[Health], object] | None,
         warn: Callable[[str], object],
         *,
@@ -156,7 +147,7 @@ class LiveSession:
         self._closed = self._settled = False
         self.touch: Stream | None = None
         first = model not in _RULES
-        rule = self._rule(model)
+        rule = self._rule(model, risk)
         if first and model.names and not sensor.camera:
             self._warm_up(model, rule)
 
@@ -196,8 +187,7 @@ class LiveSession:
         A touch that is under way ends. Raises InputError in a session that finds contacts itself.
         """
         self._require_manual("begin")
-        self._ended = []
-        self._end("end")
+        self.end()
         self._begin(np.empty((0, *self.sensor.shape), self._dtype))
         return self._state()
 
@@ -238,13 +228,8 @@ class LiveSession:
         self._require_open()
         model = self._predictor.frozen().model
         candidates_of(scene, model.names, model.known)
-        before, self._risk = self._risk, risk
-        try:
-            self._rule(model)
-        except BaseException:
-            self._risk = before
-            raise
-        self._scene = scene
+        self._rule(model, risk)
+        self._scene, self._risk = scene, risk
 
     def close(self) -> None:
         """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
@@ -331,7 +316,7 @@ class LiveSession:
         self._recent.clear()
         frozen = self._predictor.frozen()
         model = frozen.model
-        rule = self._rule(model)
+        rule = self._rule(model, self._risk)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame = 0, 1
         if self.sensor.camera:
@@ -367,13 +352,13 @@ class LiveSession:
         if touch is not None:
             self._again = bool(touch.earlier)
 
-    def _rule(self, model: Model) -> DecisionRule:
+    def _rule(self, model: Model, risk: float) -> DecisionRule:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
-        if self._risk not in known:
+        if risk not in known:
             with self._predictor.turn(model):
-                known[self._risk] = decision_rule(model, self._risk)
-        return known[self._risk]
+                known[risk] = decision_rule(model, risk)
+        return known[risk]
 
     def _warm_up(self, model: Model, rule: DecisionRule) -> None:
         """Predict a made-up touch as a real one will be: the first time takes ten times as long."""

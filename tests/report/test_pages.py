@@ -156,10 +156,8 @@ def test_odd_names_are_shown_and_not_run(browser, tmp_path):
 
 def test_what_a_page_says_of_a_memory(learner, html):
     text = words(html)
-    assert "5 materials, 59 touches" in text
-    assert "1 of them were retracted" in text
-    assert learner.digest() in text
-    assert "all 6 alive" in text
+    assert "5 materials, 59 touches" in text and "1 of them were retracted" in text
+    assert learner.digest() in text and "all 6 alive" in text
     assert "What is missing" not in text
     assert text.count("A touch of ") == 6
     assert "Others of their sittings were learned: tomorrow's touches are harder" in text

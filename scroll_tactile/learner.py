@@ -17,7 +17,7 @@ from scroll_tactile.arguments import require_arguments, silent
 from scroll_tactile.embeddings.protocol import Embedding
 from scroll_tactile.errors import AnnotationError, DescriptionError, InputError, RangeWarning
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, has_numbers
-from scroll_tactile.health.watched_rows import WatchRules
+from scroll_tactile.health.watch import WatchRules
 from scroll_tactile.memory.descriptions import Description, checked
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
@@ -464,8 +464,7 @@ class TactileLearner:
         Raises InputError for values that cannot be, and for "auto" with frames that have no resting image; what
         `predict` raises for scene and of.
         """
-        from scroll_tactile.live.health_notes import HealthNotes
-        from scroll_tactile.live.session import LiveSession
+        from scroll_tactile.live.session import HealthNotes, LiveSession
 
         session: dict[str, Any] = {"risk": risk, "contact": contact, "false_contacts": false_contacts, "scene": scene}
         notes = None if changed is None else HealthNotes(self, changed, logger.warning, materials=of is None)
@@ -548,7 +547,7 @@ class TactileLearner:
 
         It is read from the observations in the order of the journal, and from what `sense` noted, as numbers of each
         channel; touches are compared with earlier ones of the same material, of a similar length and level, so that no
-        mixture of materials, lengths and forces is a change. See `health.betting`. The digest knows nothing of it.
+        mixture of materials, lengths and forces is a change. See `health.watch`. The digest knows nothing of it.
 
         Raises InputError for values that cannot be, for a camera, for more than 256 channels, and in a memory without a
         path; StoreError.

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.health import betting
-from scroll_tactile.health.betting import JUMP, SCORES, STAKES, Bets
-from scroll_tactile.health.watch import Watch
+from scroll_tactile.health import watch
+from scroll_tactile.health.watch import JUMP, SCORES, STAKES, Bets, Watch
 
 __all__ = ["PEERS", "Order", "lacking", "oracle_difference", "peer_records"]
 
@@ -200,11 +199,11 @@ def oracle_difference(order: Order) -> Record:
 
 
 def _ours(values: Floats, stakes: Floats) -> Floats:
-    before, betting.STAKES = betting.STAKES, stakes
+    before, watch.STAKES = watch.STAKES, stakes
     try:
         bets = Bets(values.shape[1])
         for row in values:
             bets.take(row, 0)
     finally:
-        betting.STAKES = before
+        watch.STAKES = before
     return bets.log

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,16 +34,15 @@ FOLLOWED = 0.02  # of how far a stamp lies off, in the next one's place
 CLOCK_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
-class ClockPart:
+class ClockPart(NamedTuple):
     """Rows at the sensor's rate, shape (k, …), and what came before them.
 
     breaks: "gap" or "time went back", where time began anew before them. time: the stamp of the first row.
     """
 
-    __slots__ = ("breaks", "rows", "time")
-
-    def __init__(self, rows: Rows, breaks: str = "", time: float = math.nan) -> None:
-        self.rows, self.breaks, self.time = rows, breaks, time
+    rows: Rows
+    breaks: str = ""
+    time: float = math.nan
 
 
 class Clock:

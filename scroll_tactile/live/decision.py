@@ -80,14 +80,19 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     least = max(1, min(model.least, model.longest))
     held_out = None if model.fusion is None else model.fusion.trajectories
     if model.fusion is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
-        return DecisionRule((least,), risk, 1 - risk, 1 - risk, 2 * UNMEASURED)
+        return DecisionRule((least,), risk, sure=1 - risk, together=1 - risk, least_new=2 * UNMEASURED)
     moments = model.fusion.moments[:-1]
     thresholds = np.array([np.quantile(m.novelties, KNOWN) if len(m.novelties) else np.inf for m in moments])
     sure = _least_sure_of(held_out, held_out.novelty <= thresholds, risk)
     pairs, known = in_pairs(held_out, thresholds, model.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
-    least_new = max(BEYOND * float(np.nanmax(held_out.novelty)), UNMEASURED)
-    return DecisionRule((*(moment.steps for moment in moments), least), risk, sure, max(sure, together), least_new)
+    return DecisionRule(
+        moments=(*(moment.steps for moment in moments), least),
+        risk=risk,
+        sure=sure,
+        together=max(sure, together),
+        least_new=max(BEYOND * float(np.nanmax(held_out.novelty)), UNMEASURED),
+    )
 
 
 def _least_sure_of(trajectories: Trajectories, known: npt.NDArray[np.bool_], risk: float) -> float:

@@ -128,7 +128,7 @@ class GrowingTouch:
             moment = self.moments.pop()
         if moment:
             with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
-                stream = self.stream(moment)
+                stream = self.beginning(moment)
                 if self.prediction is None or not self.decided:
                     self.predict(stream)
                 else:  # the prediction stays; what is asked of intervals is not reached yet
@@ -136,7 +136,7 @@ class GrowingTouch:
         if self.decided and (self.settled or not self.widths):
             self.moments.clear()
 
-    def stream(self, count: int) -> Stream:
+    def beginning(self, count: int) -> Stream:
         """The stream of its first readings, corrected. Raises StreamError where they make none."""
         return corrected_stream(self.extractor.stream(self.rows.first(count)), self.correction)
 
@@ -158,8 +158,7 @@ class GrowingTouch:
         self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
         current = self._encoded(stream)
         self.prediction = self.predictor.answer_of(model, self.extractor, candidates, [*self.encoded, current])
-        several = bool(self.earlier)
-        self.decided = self.decided or self.rule.decided(self.prediction, current.steps, several=several)
+        self.decided |= self.rule.decided(self.prediction, current.steps, several=bool(self.earlier))
         self._estimate(current, self.prediction)
         return self.prediction
 
@@ -190,8 +189,8 @@ class GrowingTouch:
                 estimator, names, encoded, self.extractor, prediction, self.rule.risk, known=None
             )
             self.stage = stage
-            found = [(self.estimates[name].width, width) for name, width in self.widths.items()]
-            narrow = [own is not None and own <= width for own, width in found]
+            widths = ((self.estimates[name].width, width) for name, width in self.widths.items())
+            narrow = [own is not None and own <= width for own, width in widths]
             self.settled = self.settled or (bool(narrow) and all(narrow))
 
 

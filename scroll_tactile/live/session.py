@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from numbers import Real
@@ -13,25 +13,24 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import StoreError
 
 from scroll_tactile.embeddings.protocol import canary, capabilities_of
-from scroll_tactile.errors import InputError, StreamError
+from scroll_tactile.errors import InputError, ScrollTactileError, StreamError
 from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
-from scroll_tactile.live.detector import ContactDetector, Event
-from scroll_tactile.live.health_notes import HealthNotes
-from scroll_tactile.live.pressing import PressDetector
+from scroll_tactile.live.detector import ContactDetector, Event, PressDetector
 from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows, is_touch
 from scroll_tactile.prediction.features import WindowCache
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.predictor import Predictor
-from scroll_tactile.results import Prediction
+from scroll_tactile.results import Health, Prediction
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.contact import MOST_FRAMES, Rest
 from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
 
-__all__ = ["LiveSession"]
+__all__ = ["HealthNotes", "LiveSession"]
 
 Array = npt.NDArray[Any]
 
@@ -39,6 +38,63 @@ REMEMBERED = 2.0  # seconds before a contact is noticed in which it may have beg
 RESTED = 0.5  # seconds of rest that a touch tells, always as many: noise of fewer readings scatters otherwise
 KEPT = 60.0  # seconds of a touch, or four times the longest that was learned
 MOST_EARLIER = 7  # touches of one thing before a touch: more hardly say more, each has its price in every prediction
+
+
+class HealthNotes:
+    """Notes the rest before each touch, and touches that were decided, are known and were not learned.
+
+    learner: the `TactileLearner` whose memory it is; it stands above this module. changed: called once with what
+    `health` says, when it sees a change; again only after it saw none. warn: called with a text for each kind of
+    failure once: a full disk must not end a session. materials: whether answers are by materials, without which touches
+    have no name.
+
+    A memory with a damaged row is warned of. Raises InputError as `TactileLearner.health` does: it needs one on disk.
+    """
+
+    def __init__(
+        self,
+        learner: Any,
+        changed: Callable[[Health], object] | None,
+        warn: Callable[[str], object],
+        *,
+        materials: bool = True,
+    ) -> None:
+        self._learner, self._changed, self._warn, self._materials = learner, changed, warn, materials
+        self._warned: set[type[Exception]] = set()
+        self._last: LiveTouch | None = None  # until another ended: meanwhile it may be learned
+        self._told = False
+        try:
+            learner.health()
+        except StoreError as error:  # a damaged row is no reason to feel nothing: what comes is noted behind it
+            self._warn_once(error)
+
+    def take(self, ended: LiveTouch | None) -> None:
+        """Take the touch that ended; None where the session did: note the touch before it and the rest, and look."""
+        touch, self._last = self._last, ended
+        try:
+            if touch is not None and self._counts(touch):
+                self._learner.sense(touch.stream, touch.prediction.material)
+            if ended is not None and ended.rest is not None:
+                self._learner.sense(ended.rest)
+            found = None if self._changed is None else self._learner.health()
+        except (ScrollTactileError, StoreError) as error:
+            self._warn_once(error)
+            return
+        if self._changed is not None and found is not None:
+            before, self._told = self._told, found.since is not None
+            if self._told and not before:
+                self._changed(found)
+
+    def _counts(self, touch: LiveTouch) -> bool:
+        """Whether a touch is noted: it was decided, is known, and was not learned, whose row has its channels, too."""
+        answer = touch.prediction
+        certain = self._materials and touch.decided and answer.known is True and answer.material is not None
+        return certain and not self._learner.names_of(touch.stream)
+
+    def _warn_once(self, error: Exception) -> None:
+        if type(error) not in self._warned:
+            self._warned.add(type(error))
+            self._warn(f"the health of the sensor cannot be told: {error}")
 
 
 class LiveSession:
@@ -63,7 +119,6 @@ class LiveSession:
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
         if not 0 < false_contacts < math.inf:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
-        _require_risk(risk)
         self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
         self.sensor = sensor = predictor.recipe.sensor
         self._rest: Rest = capabilities_of(self._extractor.embedding).rest
@@ -92,7 +147,7 @@ class LiveSession:
         self._closed = self._settled = False
         self.touch: Stream | None = None
         first = model not in _RULES
-        rule = self._rule(model)
+        rule = self._rule(model, risk)
         if first and model.names and not sensor.camera:
             self._warm_up(model, rule)
 
@@ -132,8 +187,7 @@ class LiveSession:
         A touch that is under way ends. Raises InputError in a session that finds contacts itself.
         """
         self._require_manual("begin")
-        self._ended = []
-        self._end("end")
+        self.end()
         self._begin(np.empty((0, *self.sensor.shape), self._dtype))
         return self._state()
 
@@ -172,16 +226,10 @@ class LiveSession:
         Raises what `TactileLearner.live` raises for these, and InputError after `close`. Then nothing has changed.
         """
         self._require_open()
-        _require_risk(risk)
         model = self._predictor.frozen().model
         candidates_of(scene, model.names, model.known)
-        before, self._risk = self._risk, risk
-        try:
-            self._rule(model)
-        except BaseException:
-            self._risk = before
-            raise
-        self._scene = scene
+        self._rule(model, risk)
+        self._scene, self._risk = scene, risk
 
     def close(self) -> None:
         """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
@@ -268,7 +316,7 @@ class LiveSession:
         self._recent.clear()
         frozen = self._predictor.frozen()
         model = frozen.model
-        rule = self._rule(model)
+        rule = self._rule(model, self._risk)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame = 0, 1
         if self.sensor.camera:
@@ -280,9 +328,17 @@ class LiveSession:
         moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
         at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
         earlier, self._again = self._thing if self._again else (), False
-        kept = TouchRows(rows, limit)
         self._under_way = GrowingTouch(
-            *(self._predictor, self._extractor, self._scene, kept, at, frozen, rule, moments, before, earlier),
+            predictor=self._predictor,
+            extractor=self._extractor,
+            scene=self._scene,
+            rows=TouchRows(rows, limit),
+            at=at,
+            frozen=frozen,
+            rule=rule,
+            moments=moments,
+            before=before,
+            earlier=earlier,
             estimator=self._predictor.estimator(),
             widths=self._widths,
             rest=None if self.sensor.camera else rest,
@@ -296,12 +352,12 @@ class LiveSession:
         if touch is not None:
             self._again = bool(touch.earlier)
 
-    def _rule(self, model: Model) -> DecisionRule:
+    def _rule(self, model: Model, risk: float) -> DecisionRule:
         """When predictions are made with a model, and when they are decided; once for each model."""
         known = _RULES.setdefault(model, {})
-        if self._risk not in known:
-            known[self._risk] = decision_rule(model, self._risk)
-        return known[self._risk]
+        if risk not in known:
+            known[risk] = decision_rule(model, risk)
+        return known[risk]
 
     def _warm_up(self, model: Model, rule: DecisionRule) -> None:
         """Predict a made-up touch as a real one will be: the first time takes ten times as long."""
@@ -322,24 +378,34 @@ class LiveSession:
         try:
             if touch.rows.kept - touch.before < fewest_readings(self.sensor):
                 raise StreamError
-            stream = touch.stream(touch.rows.kept)
+            stream = touch.beginning(touch.rows.kept)
         except StreamError:  # nothing that could be observed
             self.report.brief += 1
             self._leave(touch)
             return
         before = touch.prediction if touch.decided else None
-        prediction, rest = touch.predict(stream), touch.rest_before()
+        prediction = touch.predict(stream)
         revised = before if before is not None and _says(before) != _says(prediction) else None
         self.touch, self._thing = stream, (*touch.earlier, stream)[-MOST_EARLIER:]
         self.report.touches += 1
         self.report.undecided += not touch.decided
         self.report.revised += revised is not None
         self.report.truncated += touch.rows.came > touch.rows.kept
-        outcome = touch.decided, touch.at, end, touch.earlier, revised, touch.estimates
-        self._ended.append(LiveTouch(stream, prediction, *outcome, rest))
+        ended = LiveTouch(
+            stream=stream,
+            prediction=prediction,
+            decided=touch.decided,
+            at=touch.at,
+            end=end,
+            earlier=touch.earlier,
+            revised=revised,
+            estimates=touch.estimates,
+            rest=touch.rest_before(),
+        )
+        self._ended.append(ended)
         self._settled = touch.settled
         if self._notes is not None:
-            self._notes.take(self._ended[-1])
+            self._notes.take(ended)
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""
@@ -353,18 +419,28 @@ class LiveSession:
         touch, ended = self._under_way, tuple(self._ended)
         if touch is not None:
             seconds = max(0, touch.rows.came - touch.before) / self.sensor.rate
-            growing = touch.prediction, touch.decided, bool(ended), ended, touch.estimates, touch.settled
-            return LiveState(True, seconds, *growing)
+            return LiveState(
+                contact=True,
+                seconds=seconds,
+                prediction=touch.prediction,
+                decided=touch.decided,
+                ended=bool(ended),
+                touches=ended,
+                estimates=touch.estimates,
+                settled=touch.settled,
+            )
         if not ended:
             return _AT_REST
         last = ended[-1]
-        outcome = last.prediction, last.decided, True, ended, last.estimates, self._settled
-        return LiveState(False, last.stream.seconds, *outcome)
-
-
-def _require_risk(risk: float) -> None:
-    if not 0 < risk < 1:
-        raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
+        return LiveState(
+            seconds=last.stream.seconds,
+            prediction=last.prediction,
+            decided=last.decided,
+            ended=True,
+            touches=ended,
+            estimates=last.estimates,
+            settled=self._settled,
+        )
 
 
 def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:

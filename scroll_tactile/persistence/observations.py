@@ -148,8 +148,16 @@ def observations(store: Store) -> list[Observation]:
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
-        values, labels = annotation.measured(quantities), dict(annotation.labels)
-        return Observation(head.sequence, head.label, head.key, head.time, state(head), _source(head), values, labels)
+        return Observation(
+            sequence=head.sequence,
+            material=head.label,
+            key=head.key,
+            time=head.time,
+            state=state(head),
+            source=_source(head),
+            values=annotation.measured(quantities),
+            labels=dict(annotation.labels),
+        )
 
     return [observation(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
 

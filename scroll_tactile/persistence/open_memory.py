@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scroll_tactile_store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
 
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.health.watched_rows import WatchedRows, WatchRules
+from scroll_tactile.health.watch import WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.contents import ListedContents, StoredContents

@@ -19,8 +19,7 @@ from scroll_tactile_store import Head, Store, StoreError
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
 from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
-from scroll_tactile.health.watch import Watch
-from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
+from scroll_tactile.health.watch import Watch, WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.matching.likelihood import LEVELS, MISSING
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
@@ -269,5 +268,13 @@ def _not_recognised(
 def _result(correction: Correction, found: Fitted, why: str, sequence: int | None) -> Adaptation:
     lost = np.flatnonzero(correction.lost).tolist()
     reason = why or "later touches are read through it" + (f"; channels {lost} are left out" if lost else "")
-    gains, offsets = tuple(correction.gains.tolist()), tuple(correction.offsets.tolist())
-    return Adaptation(not why, reason, sequence, gains, offsets, tuple(lost), found.before, found.after)
+    return Adaptation(
+        kept=not why,
+        why=reason,
+        sequence=sequence,
+        gains=tuple(correction.gains.tolist()),
+        offsets=tuple(correction.offsets.tolist()),
+        left_out=tuple(lost),
+        before=found.before,
+        after=found.after,
+    )

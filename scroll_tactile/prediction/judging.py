@@ -83,16 +83,17 @@ def answer(
     p_own, least_own, p_all, least_all = typical[order].T.tolist()
     unusual = tuple(sorted({way for judgement in judgements for way in judgement.unusual}))
     return Prediction(
-        *ranking[0],
-        ranking,
-        novelty,
-        known,
-        seconds,
-        tuned,
-        tuple(p_own),
-        tuple(p_all),
-        (*least_own, max(least_all)),
-        unusual,
+        material=ranking[0][0],
+        probability=ranking[0][1],
+        ranking=ranking,
+        novelty=novelty,
+        known=known,
+        seconds=seconds,
+        tuned=tuned,
+        typicality=tuple(p_own),
+        typicality_of_all=tuple(p_all),
+        least_typicality=(*least_own, max(least_all)),
+        unusual=unusual,
     )
 
 

@@ -357,4 +357,4 @@ def _scales_for(
 
 def nothing_known(seconds: float) -> Prediction:
     """The prediction for so many seconds of touch without any candidate."""
-    return Prediction(None, 0.0, (), float("inf"), False, seconds)
+    return Prediction(material=None, probability=0.0, ranking=(), novelty=math.inf, known=False, seconds=seconds)

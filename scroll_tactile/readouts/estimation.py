@@ -189,12 +189,21 @@ def _estimate(
     heads: Heads | str, quantity: Quantity, features: Sequence[FloatArray], risk: float, *, known: bool
 ) -> Estimate:
     if isinstance(heads, str):
-        return Estimate(None, None, None, quantity.unit, risk, known, missing=heads)
+        return Estimate(value=None, low=None, high=None, unit=quantity.unit, risk=risk, known=known, missing=heads)
     head = heads.known if known else heads.new
     said, half = head(features), head.half_width(risk)
     value, low, high = (min(max(one, quantity.low), quantity.high) for one in (said, said - half, said + half))
-    touches, missing = len(heads.targets), ""
+    missing = ""
     if math.isinf(half):
         missing = f"the interval is the range: one of risk {risk:g} takes {math.ceil(1 / risk - 1e-9) - 1} touches"
-    count = len(set(heads.materials))
-    return Estimate(value, low, high, quantity.unit, risk, known, touches=touches, materials=count, missing=missing)
+    return Estimate(
+        value=value,
+        low=low,
+        high=high,
+        unit=quantity.unit,
+        risk=risk,
+        known=known,
+        touches=len(heads.targets),
+        materials=len(set(heads.materials)),
+        missing=missing,
+    )

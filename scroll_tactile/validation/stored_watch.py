@@ -17,11 +17,9 @@ import numpy.typing as npt
 from scroll_tactile_store import Checkpoint
 
 from scroll_tactile import __version__
-from scroll_tactile.health.betting import SCORES, STAKES
 from scroll_tactile.health.channel_numbers import KINDS
 from scroll_tactile.health.diagnosis import Deviation, SensorChange
-from scroll_tactile.health.watch import AT_REST, MOST_ROWS, RECENT, Cell, Watch
-from scroll_tactile.health.watched_rows import WatchedRows, WatchRules
+from scroll_tactile.health.watch import AT_REST, MOST_ROWS, RECENT, SCORES, STAKES, Cell, Watch, WatchedRows, WatchRules
 from scroll_tactile.results import ChangeKind
 from scroll_tactile.validation.expected import array, counts, expect, name, whole
 from scroll_tactile.validation.stored_readouts import ArrayReader

@@ -13,10 +13,9 @@ from commands import run
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors, sensors
 from scroll_tactile.clients.report import memory_page
-from scroll_tactile.health import betting
-from scroll_tactile.health.advice import advice, in_words
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text, to_text
-from scroll_tactile.health.watch import Watch
+from scroll_tactile.health.diagnosis import advice, in_words
+from scroll_tactile.health.watch import JUMP, STAKES, Bets, Watch, ranks
 from scroll_tactile.results import ChangeKind
 from scroll_tactile.signals.stream import Stream, validate
 
@@ -367,12 +366,10 @@ def test_martingales_are_those_of_crepes() -> None:
     martingales = pytest.importorskip("crepes.martingales")
     random = np.random.default_rng(0)
     values = np.concatenate([random.random((80, 6)), random.beta(0.4, 2, (60, 6))])
-    bets = betting.Bets(8)
+    bets = Bets(8)
     for row in values:
         bets.take(row, 2)
-    jumper = martingales.SimpleJumper(
-        J=betting.JUMP, bf=martingales.EpsilonBettingFunction(betting.STAKES[:, 0].tolist())
-    )
+    jumper = martingales.SimpleJumper(J=JUMP, bf=martingales.EpsilonBettingFunction(STAKES[:, 0].tolist()))
     theirs = [np.log(jumper.apply(column)[-1]) for column in values.T]
     np.testing.assert_allclose(bets.log[2:], theirs, rtol=1e-12, atol=1e-12)
     assert (bets.log[:2] == 0).all()
@@ -383,5 +380,5 @@ def test_p_values_are_those_of_crepes() -> None:
     scores = np.random.default_rng(0).integers(0, 9, 40).astype(float)
     theirs = martingales.semi_online_p_values(scores, seed=7)
     ties = np.random.RandomState(7).random_sample(len(scores))  # by which crepes breaks its ties
-    ours = [betting.ranks(-scores[: i + 1, None], tie)[0] for i, tie in enumerate(ties)]
+    ours = [ranks(-scores[: i + 1, None], tie)[0] for i, tie in enumerate(ties)]
     np.testing.assert_allclose(ours, theirs, rtol=1e-15)

@@ -13,9 +13,7 @@ from scroll_tactile_store import Checkpoint, StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
-from scroll_tactile.health import watched_rows
-from scroll_tactile.health.watch import Watch
-from scroll_tactile.health.watched_rows import WatchedRow, WatchedRows, WatchRules
+from scroll_tactile.health.watch import EVERY, Watch, WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.validation import stored_watch
 from scroll_tactile.validation.expected import Unexpected
 
@@ -86,7 +84,7 @@ def test_few_copies_are_kept_and_few_rows_read_again() -> None:
     assert len(watched._earlier) <= 14
     for gone in (3000, 2990, 2700, 2000):
         watched.take_back(gone)
-        assert 2 * (3000 - watched.last) <= 4 * (3000 - gone) + 5 * watched_rows.EVERY
+        assert 2 * (3000 - watched.last) <= 4 * (3000 - gone) + 5 * EVERY
         taken(rows, watched)
 
 
@@ -143,7 +141,7 @@ def test_an_undo_reads_few_rows_again(memory: Path, counted: Counted) -> None:
         assert counted.rows(learner.health)[1] == 0
         learner.retract(150)
         after, count = counted.rows(learner.health)
-        assert count <= watched_rows.EVERY
+        assert count <= EVERY
         learner.relabel(139, NAMES[1])
         learner.forget(source="robot-1/day.npy")
         learner.sense(SCENE.touch(NAMES[0], 99))
@@ -173,7 +171,10 @@ def test_the_memory_is_free_while_rows_are_read_and_may_change(memory: Path, cou
     assert fresh(memory) == found
 
 
-def test_rows_of_a_batch_that_was_lost_are_not_there(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("asked", [True, False])
+def test_rows_of_a_batch_that_was_lost_count_no_more_nor_after_a_restart(
+    memory: Path, monkeypatch: pytest.MonkeyPatch, asked: bool
+) -> None:
     def full(*_: Any) -> None:
         raise StoreFullError("no space left")
 
@@ -182,49 +183,19 @@ def test_rows_of_a_batch_that_was_lost_are_not_there(memory: Path, monkeypatch: 
         with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
             for i in range(4):
                 learner.sense(SCENE.touch(NAMES[0], 80 + i), NAMES[0])
-            assert learner.health().touches == before.touches + 4
+            lost = learner.health()
+            assert lost.touches == before.touches + 4
             monkeypatch.setattr(LogWriter, "stage", full)
             with pytest.raises(StoreFullError):
                 learner.sense(SCENE.touch(NAMES[0], 84), NAMES[0])
         monkeypatch.undo()
+        if asked:
+            assert learner.health() == before
         for i in range(4):  # these have the same places in the journal
             learner.sense(SCENE.touch(NAMES[1], 90 + i), NAMES[1])
-        found = learner.health()
-    assert fresh(memory) == found
-
-
-def test_rows_of_a_batch_that_was_lost_are_not_kept_over_restarts(
-    memory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: Any) -> None:
-        raise StoreFullError("no space left")
-
-    with TactileLearner.open(memory) as learner:
-        with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
-            for i in range(4):
-                learner.sense(SCENE.touch(NAMES[0], 80 + i), NAMES[0])
-            lost = learner.health()
-            monkeypatch.setattr(LogWriter, "stage", full)
-            learner.sense(SCENE.touch(NAMES[0], 84), NAMES[0])
-        monkeypatch.undo()
-        for i in range(4):
-            learner.sense(SCENE.touch(NAMES[1], 90 + i), NAMES[1])
-    assert fresh(memory).grew[-1] != lost.grew[-1]
-
-
-def test_health_after_a_failed_batch_counts_no_row_that_is_gone(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise StoreFullError("no space left")
-
-    with TactileLearner.open(memory) as learner:
-        before = learner.health().touches
-        with pytest.raises(StoreError), learner.batch():
-            learner.sense(SCENE.touch(NAMES[0], 80), NAMES[0])
-            assert learner.health().touches == before + 1
-            monkeypatch.setattr(LogWriter, "stage", full)
-            learner.sense(SCENE.touch(NAMES[0], 81), NAMES[0])
-        monkeypatch.undo()
-        assert learner.health().touches == before
+        found = learner.health() if asked else None
+    after = fresh(memory)
+    assert after.grew[-1] != lost.grew[-1] and found in (None, after)
 
 
 def test_rows_that_others_ask_about_are_not_read_again_and_nobody_takes_those_that_are_told_of(

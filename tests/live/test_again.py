@@ -104,41 +104,30 @@ def test_the_memory_is_that_of_when_the_last_of_them_began():
     assert second.material == "c"
 
 
-def test_before_anything_was_observed_touches_add_up_to_nothing():
-    empty = TactileLearner(sensor=PAD, embedding=EMBEDDINGS["kernels"])
-    touches = [slide("a", 30, RANDOM), slide("a", 20, RANDOM)]
-    with empty.live(contact="manual") as live:
+@pytest.mark.parametrize("scene", [None, ["c", "b"], "nothing was observed"])
+def test_a_scene_is_that_of_all_of_them_and_of_an_empty_memory_nothing_adds_up(scene):
+    made, touches = learner(), [slide("a", 30, RANDOM), slide("a", 20, RANDOM)]
+    if isinstance(scene, str):
+        made, scene = TactileLearner(sensor=PAD, embedding=EMBEDDINGS["kernels"]), None
+    with made.live(contact="manual", scene=scene) as live:
         touched(live, touches[0])
-        assert touched(live, touches[1], again=True).prediction == empty.predict(*touches)
+        assert touched(live, touches[1], again=True).prediction == made.predict(*touches, scene=scene)
 
 
-def test_a_scene_is_that_of_all_of_them():
-    made, touches = learner(), [slide("a", 30, RANDOM) for _ in range(2)]
-    with made.live(contact="manual", scene=["c", "b"]) as live:
-        touched(live, touches[0])
-        assert touched(live, touches[1], again=True).prediction == made.predict(*touches, scene=["b", "c"])
-
-
-def test_contacts_too_brief_for_a_touch_change_nothing():
+@pytest.mark.parametrize("said", ["before it", "of it"])
+def test_a_contact_too_brief_for_a_touch_changes_nothing_and_is_a_thing_of_which_nothing_is_known(said):
     made, touches = learner(), [slide("b", 30, RANDOM) for _ in range(2)]
     with made.live(contact="manual") as live:
         touched(live, touches[0])
-        live.again()
+        if said == "before it":
+            live.again()
         live.begin()
         live.push(touches[1][:1])
+        if said == "of it":  # the next is as that, whatever it was
+            live.again()
         assert not live.end().touches and live.report.brief == 1
-        assert touched(live, touches[1]).prediction == made.predict(*touches)
-
-
-def test_a_brief_contact_is_a_thing_of_which_nothing_is_known():
-    made, touches = learner(), [slide("b", 30, RANDOM) for _ in range(2)]
-    with made.live(contact="manual") as live:
-        touched(live, touches[0])
-        live.begin()
-        live.push(touches[1][:1])
-        live.again()  # as that, whatever it was
-        live.end()
-        assert touched(live, touches[1]).prediction == made.predict(touches[1])
+        expected = made.predict(*(touches if said == "before it" else touches[1:]))
+        assert touched(live, touches[1]).prediction == expected
 
 
 def test_gaps_and_steps_back_in_time_change_nothing():

@@ -7,8 +7,7 @@ from touches import PAD, SMALL
 
 from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Sensor, TactileLearner, sensors
-from scroll_tactile.live.detector import ContactDetector
-from scroll_tactile.live.rest import Rest
+from scroll_tactile.live.detector import ContactDetector, Rest
 from scroll_tactile.simulation.scene import Scene
 
 
@@ -181,6 +180,53 @@ def test_a_simulated_shift_s_touches_are_found():
     off = [touch.at - truth.begin for touch, truth in zip(touches, shift_.touches, strict=True)]
     assert np.median(np.abs(off)) <= 0.03
     assert live.report.gaps == 5 and live.report.lost > 0
+
+
+HOLES = {
+    "one value": np.s_[100, 1],
+    "one reading": np.s_[100],
+    "a burst of one channel": np.s_[50:90, 1],
+    "a burst of all": np.s_[80:100],
+    "infinite": np.s_[100:104, 2],
+    "one channel throughout": np.s_[:100, 1],
+    "one channel for long": np.s_[:230, 0],
+    "all channels for a second": np.s_[:50],
+}
+
+
+def three_channels(holes):
+    """What a pad of three channels reads beside what holes leave of it, and where its two touches lie."""
+    random = np.random.default_rng(5)
+    rows = 0.5 + 0.004 * random.standard_normal((600, 3))
+    places = [(170, 220), (400, 450)]
+    for begin, end in places:
+        rows[begin:end] += 0.1 + 0.1 * np.sin(np.arange(end - begin)[:, None] * (0.4, 0.5, 0.6))
+    holed = rows.copy()
+    holed[HOLES[holes]] = np.inf if holes == "infinite" else np.nan
+    return rows, holed, places
+
+
+@pytest.mark.parametrize("holes", HOLES)
+def test_missing_values_while_rest_is_learned_blind_nothing(holes):
+    sensor = wide(3, rate=50.0, low=0.0, high=1.0, duration=1.0, non_finite="missing")
+    rows, holed, places = three_channels(holes)
+    assert np.abs(np.array(found(sensor, rows)[0]) - places).max() <= 2
+    kept = []
+    for size in (1, 7, 10_000):
+        contacts, detector = found(sensor, holed, size=size)
+        assert len(contacts) == 2 and np.abs(np.array(contacts) - places).max() <= 2
+        kept.append((contacts, detector._rest.level.tobytes(), detector._rest._scatter.tobytes(), detector._rest.alarm))
+    assert kept[0] == kept[1] == kept[2]
+    assert np.abs(detector._rest.level / 2**16 - 0.5).max() < 0.01  # that of a channel that came late, too
+
+
+def test_a_session_finds_the_first_touches_though_a_value_was_missing_before_them():
+    sensor = wide(3, rate=50.0, low=0.0, high=1.0, duration=1.0, non_finite="missing")
+    _, holed, places = three_channels("one value")
+    with TactileLearner(sensor=sensor, embedding=SMALL).live() as live:
+        touches = live.push(holed).touches
+    assert [round(touch.at * 50) for touch in touches] == pytest.approx([begin for begin, _ in places], abs=2)
+    assert live.report.missing == 1
 
 
 @pytest.mark.filterwarnings("error")

@@ -9,7 +9,7 @@ from scroll_tactile_store import StoreError
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
 from scroll_tactile.live.answers import LiveTouch
-from scroll_tactile.live.health_notes import HealthNotes
+from scroll_tactile.live.session import HealthNotes
 from scroll_tactile.results import Prediction
 from scroll_tactile.signals.stream import Stream, validate
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.clients.report.growing import _without
+from scroll_tactile.clients.report.facts import _without
 from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft, at_pace

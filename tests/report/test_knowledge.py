@@ -10,8 +10,17 @@ from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile import sensors as known
 from scroll_tactile.clients.learning.metrics import calibration_error
 from scroll_tactile.clients.report.channels import channels_of
-from scroll_tactile.clients.report.growing import chosen, growing, soon
-from scroll_tactile.clients.report.knowledge import bins_of, interval, mistakes, separations, trust_in, unknown_by
+from scroll_tactile.clients.report.facts import (
+    bins_of,
+    chosen,
+    growing,
+    interval,
+    mistakes,
+    separations,
+    soon,
+    trust_in,
+    unknown_by,
+)
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
@@ -56,9 +65,8 @@ def grown(learner, touches, rule=None):
     model = learner.model()
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan)
     streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
-    held_out = [touch for touch in held_out_touches(model, 0.05) if touch.key in touches]
-    rule = rule or decision_rule(model, 0.05)
-    return model, growing(learner, model, extractor, rule, held_out, streams)
+    held_out = [(touch, streams[touch.key]) for touch in held_out_touches(model, 0.05) if touch.key in touches]
+    return model, growing(model, extractor, rule or decision_rule(model, 0.05), 0.05, held_out)
 
 
 def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
@@ -66,10 +74,10 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
     touch = SCENE.touch(name, i, seconds=1.0)
     model, found = grown(learner, [touch.key])
     assert found[0].material == name
-    assert found[0].seconds[-1] == 1.0
+    assert found[0].predictions[-1].seconds == 1.0
     other = taught(leave=(name, i))
-    for seconds, prediction in zip(found[0].seconds, found[0].predictions, strict=True):
-        expected = dict(other.predict(touch.first(seconds)).ranking)
+    for prediction in found[0].predictions:
+        expected = dict(other.predict(touch.first(prediction.seconds)).ranking)
         assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
     # The model has not lost the touch.
     assert (name, touch.key) in model.matcher.kept.held
@@ -79,7 +87,7 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
 def test_the_moment_of_decision_is_the_first_that_the_rule_decides(learner):
     key = SCENE.touch(NAMES[0], 0, seconds=1.0).key
     _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.05, sure=0.0, together=0.0, least_new=0.0))
-    assert found[0].seconds == (0.1, 0.3, 0.5, 1.0)
+    assert [at.seconds for at in found[0].predictions] == [0.1, 0.3, 0.5, 1.0]
     assert found[0].decided == 0
     _, found = grown(learner, [key], DecisionRule((10, 30, 50), 0.0, sure=1.1, together=1.1, least_new=1e9))
     assert found[0].decided is None

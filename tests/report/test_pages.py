@@ -15,8 +15,8 @@ from robot_sets import FIELD, robot_set
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.clients.learning.learning import store_model
 from scroll_tactile.clients.report import memory_page, recording_page, save
+from scroll_tactile.clients.report.channels import health_cards, health_section
 from scroll_tactile.clients.report.page import cards, table
-from scroll_tactile.clients.report.sensing import health_cards, health_section
 from scroll_tactile.errors import CapacityError, InputError, RecordingError
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import held_out_touches
@@ -156,12 +156,12 @@ def test_odd_names_are_shown_and_not_run(browser, tmp_path):
 
 def test_what_a_page_says_of_a_memory(learner, html):
     text = words(html)
-    assert "5 materials, 59 touches" in text
-    assert "1 of them were retracted" in text
-    assert learner.digest() in text
-    assert "all 6 alive" in text
+    assert "5 materials, 59 touches" in text and "1 of them were retracted" in text
+    assert learner.digest() in text and "all 6 alive" in text
     assert "What is missing" not in text
     assert text.count("A touch of ") == 6
+    assert "Others of their sittings were learned: tomorrow's touches are harder" in text
+    assert "Touches of another day are harder" in text
     assert len(html) < 400_000
 
 
@@ -176,9 +176,6 @@ def test_an_empty_memory_and_one_material_say_what_is_missing():
     assert "teach a second one" in text
     learner.observe("silk", Scene(sensor=PAD).touch("silk", 0))
     assert "2 materials, 5 touches" in words(memory_page(learner))
-
-
-def test_single_touches_leave_nothing_out():
     learner = TactileLearner(sensor=PAD, embedding=SMALL)
     feel(learner, 1, 3)
     text = words(memory_page(learner))
@@ -235,12 +232,6 @@ def test_a_long_table_says_how_long_it_is():
     short, long = (table(["name", "number"], [["a", i] for i in range(count)], "it") for count in (40, 41))
     assert "long" not in short and "rows" not in short
     assert 'class="table long"' in long and "41 rows: the table scrolls." in long
-
-
-def test_held_out_touches_are_said_to_be_of_learned_sittings(html):
-    text = words(html)
-    assert "Others of their sittings were learned: tomorrow's touches are harder" in text.replace("&#x27;", "'")
-    assert "Touches of another day are harder" in text
 
 
 def test_a_page_of_a_stored_model_fits_nothing_and_says_the_same(tmp_path, monkeypatch):

@@ -111,7 +111,7 @@ def health(
 
     The exit code is 1 where something changed.
     """
-    from scroll_tactile.health.advice import advice, in_words
+    from scroll_tactile.health.diagnosis import advice, in_words
 
     with opened(folder, mode="read") as learner:
         found = learner.health(bound=bound, after=after, source=source)

@@ -18,7 +18,7 @@ from scroll_tactile_store.layout import CURRENT_FILE, holds_store
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import AnnotationError, InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.live.spans import contact_spans
+from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in

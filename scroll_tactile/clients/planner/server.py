@@ -14,7 +14,7 @@ from scroll_tactile import __version__
 from scroll_tactile.clients.planner.served import Columns, File, Place, Readings, Served, Topic
 from scroll_tactile.clients.report.facts import MemoryFacts
 from scroll_tactile.errors import ObservationError, ScrollTactileError
-from scroll_tactile.health.advice import advice, in_words
+from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
 

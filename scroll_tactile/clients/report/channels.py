@@ -1,19 +1,26 @@
-"""Whether each channel of a sensor measures: by the touches that a memory keeps and its health, or by one recording."""
+"""Whether each channel of a sensor measures, by a memory's touches and health or by one recording; and pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile.clients.report.drawing import as_counted, brief, clipped_name, evidence, png, shown
+from scroll_tactile.clients.report.page import Card, figure, name_of, note, table
+from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.results import ChangeKind, Health
-
-__all__ = ["DEAD", "DRIFTING", "LATELY", "SATURATED", "ChannelSummary", "changed_in", "channels_of", "drift"]
+from scroll_tactile.matching.match import KeptTouch
+from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.results import Health
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.image import scaled_down
 
 FloatArray = npt.NDArray[np.float64]
+Pixels = npt.NDArray[np.uint8]
 
 DEAD = 0.8  # of the touches, in which a channel never changes
 SATURATED = 0.05  # of the readings, at an end of the range
@@ -21,16 +28,15 @@ DRIFTING = 0.05  # of the range, from the first part of a recording to the last 
 CERTAIN = 4.0  # … and as many standard errors
 LATELY = 20  # parts: a channel that died is seen in these
 STEADY = 0.5  # of a channel that lives, in as many parts at most it may be still
-CHANGED: dict[ChangeKind, str] = {
-    "gain": "another gain",
-    "offset": "another offset",
-    "dead": "dead",
-    "noisier": "noisier",
-    "slower": "slower",
-    "gains": "another gain",
-    "all gains": "another gain",
-    "all offsets": "another offset",
-}
+MOST_ROWS = 128  # channels, of which all have a row in a table
+MOST_PICTURES = 60
+LONGEST = 160  # columns of a picture
+HIGHEST = 64  # rows
+FRAME = (60, 80)  # of a camera's picture
+COLUMNS = 400  # touches beside each other in the picture of all
+CHANGED = {kind: kind for kind in ("dead", "noisier", "slower")}
+CHANGED |= dict.fromkeys(("gain", "gains", "all gains"), "another gain")
+CHANGED |= dict.fromkeys(("offset", "all offsets"), "another offset")
 
 
 @dataclass(frozen=True)
@@ -69,18 +75,11 @@ class ChannelSummary:
             found.append("died lately")
         elif max(self.top, self.bottom if self.signed else 0.0) >= SATURATED:
             found.append("saturated")
-        if self.drift is not None and not found and self.drifts:
+        if self.drift is not None and not found and abs(self.drift[0]) >= max(DRIFTING, CERTAIN * self.drift[1]):
             found.append("drifting")
         if self.missing >= SATURATED:
             found.append("missing readings")
         return found
-
-    @property
-    def drifts(self) -> bool:
-        """Whether its level moved, and by more than chance."""
-        return (
-            self.drift is not None and abs(self.drift[0]) >= DRIFTING and abs(self.drift[0]) >= CERTAIN * self.drift[1]
-        )
 
 
 def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *, ordered: bool) -> list[ChannelSummary]:
@@ -88,35 +87,33 @@ def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *,
 
     signed: whether zero lies inside the range of each, (C,). ordered: whether they follow each other, as parts do.
     """
-    count = len(touches[0])
+    count, found = len(touches[0]), []
     still = np.array([_still(levels) for levels in touches])
-    means = np.array([_mean(levels) for levels in touches])
     counts = np.zeros((count, 256), np.int64)
     for levels in touches:
         placed = np.arange(count)[:, None] * 256 + levels
         counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
-    drifts = drift(means) if ordered else [None] * count
-    lately = still[-LATELY:].mean(axis=0) if ordered else still.mean(axis=0)
-    return [
-        _channel(i, counts[i], (float(still[:, i].mean()), float(lately[i])), drifts[i], signed=bool(signed[i]))
-        for i in range(count)
-    ]
-
-
-def _channel(
-    i: int,
-    counts: npt.NDArray[np.int64],
-    still: tuple[float, float],
-    moved: tuple[float, float] | None,
-    *,
-    signed: bool,
-) -> ChannelSummary:
-    total, read = int(counts.sum()), counts[:MISSING]
-    reached = np.cumsum(read) / max(int(read.sum()), 1)
-    low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
-    bottom, top = float(read[0]) / max(int(read.sum()), 1), float(read[LEVELS - 1]) / max(int(read.sum()), 1)
-    missing = float(counts[MISSING]) / max(total, 1)
-    return ChannelSummary(i, middle, low, high, *still, bottom, top, signed, missing, moved)
+    drifts = drift(np.array([_mean(levels) for levels in touches]) / (LEVELS - 1)) if ordered else [None] * count
+    lately = (still[-LATELY:] if ordered else still).mean(axis=0)
+    for i, own in enumerate(counts):
+        read = max(int(own[:MISSING].sum()), 1)
+        reached = np.cumsum(own[:MISSING]) / read
+        low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
+        channel = ChannelSummary(
+            number=i,
+            middle=middle,
+            low=low,
+            high=high,
+            still=float(still[:, i].mean()),
+            still_lately=float(lately[i]),
+            bottom=float(own[0]) / read,
+            top=float(own[LEVELS - 1]) / read,
+            signed=bool(signed[i]),
+            missing=float(own[MISSING]) / max(int(own.sum()), 1),
+            drift=drifts[i],
+        )
+        found.append(channel)
+    return found
 
 
 def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
@@ -127,11 +124,11 @@ def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
 
 
 def _mean(levels: LevelArray) -> FloatArray:
-    """The mean of each channel as a share of its range, (C,); NaN where nothing was read."""
+    """The mean level of each channel, (C,); NaN where nothing was read."""
     read = levels != MISSING
     sums = np.where(read, levels, 0).sum(axis=1, dtype=np.int64)
     with np.errstate(invalid="ignore"):
-        return np.asarray(sums / read.sum(axis=1) / (LEVELS - 1))
+        return np.asarray(sums / read.sum(axis=1))
 
 
 def drift(means: FloatArray) -> list[tuple[float, float] | None]:
@@ -154,9 +151,175 @@ def drift(means: FloatArray) -> list[tuple[float, float] | None]:
     return found
 
 
-def changed_in(channels: Sequence[ChannelSummary], health: Health | None) -> list[ChannelSummary]:
-    """The channels, and what a memory's health says became of them."""
+def health_cards(found: Health | None) -> list[Card]:
+    """What is to be seen first of the sensor's health; nothing where it was not told."""
+    if found is None or not found.grew:
+        return []
+    if found.since is None:
+        return [("good", "Its sensor is", "the one that learned", f"{found.touches} touches and rest readings fit it.")]
+    own = "the one that learned: a material changed"
+    what = own if found.kind == "material" else f"another since observation {found.since}"
+    return [("bad" if found.kind == "dead" else "look", "Its sensor is", what, in_words(found))]
+
+
+def health_section(found: Health) -> str:
+    """Whether the sensor is still the one that learned, and how the evidence grew."""
+    if not found.grew:
+        return note("No two touches of a material are alike enough in length and level to be compared.")
+    alarm = -math.log10(found.bound)
+    caption = (
+        f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
+        f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on."
+    )
+    told = note(f"{in_words(found)}. {advice(found)}") if found.since is not None else ""
+    return told + figure(evidence(found.grew, alarm), caption)
+
+
+def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> Card:
+    """What is to be seen first of the channels. health: of the memory; None where it has none."""
+    if sensor.camera:
+        return "none", "Channels", "a camera", "Its pixels are not looked at one by one."
+    if not kept:
+        return "none", "Channels", "not known", "No readings are kept that could show it."
+    compared = f" and the health of {health.touches} touches and rest readings" if health and health.grew else ""
+    return card_of(_channels(sensor, kept, health), f"{len(kept)} kept touches{compared}")
+
+
+def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
+    """How channels stand, of these readings."""
+    wrong: dict[str, list[str]] = {}
+    for channel in found:
+        for fault in channel.faults:
+            wrong.setdefault(fault, []).append(str(channel.number))
+    if not wrong:
+        return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or changed, by {by}."
+    worst = any(fault.startswith(("dead", "died")) for fault in wrong)
+    answer = "; ".join(f"{len(own)} {fault}" for fault, own in sorted(wrong.items()))
+    more = ". ".join(
+        f"{fault.capitalize()}: {', '.join(own[:8])}{f' and {len(own) - 8} more' if len(own) > 8 else ''}"
+        for fault, own in sorted(wrong.items())
+    )
+    return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
+
+
+def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
+    """The channels by kept touches, and what the memory's health says became of them."""
+    low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
+    found = channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False)
     if health is None or health.since is None or health.kind not in CHANGED:
-        return list(channels)
+        return found
     what = f"{CHANGED[health.kind]} since observation {health.since}"
-    return [replace(own, change=what) if own.number in health.channels else own for own in channels]
+    return [replace(own, change=what) if own.number in health.channels else own for own in found]
+
+
+def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None, *, ordered: bool) -> str:
+    """All channels, and their levels over the touches. ordered: whether these come as they were observed."""
+    if sensor.camera:
+        return note("Not shown: a camera has no channels that could be dead one by one; look at its frames below.")
+    if not kept:
+        return note(
+            "Not shown: no readings of touches are kept. A memory has some once it observed touches, unless it was "
+            "made with kept_touches=0."
+        )
+    found = _channels(sensor, kept, health)
+    means = np.nan_to_num(np.stack([_mean(touch.levels) for touch in kept], axis=1))
+    order = "in the order of observation" if ordered else "by material"
+    caption = (
+        f"Each row is a channel, 0 at the top; each column a touch, {order}. Dark is the least mean level that "
+        "the channel had, yellow the most. A dead channel is a stripe of one colour."
+    )
+    words = (
+        f"Dead: never changes in {DEAD:.0%} of the touches (or no touch ever reached it). Saturated: {SATURATED:.0%} "
+        "of its readings lie at the end of its range. Since an observation: what the memory's health says changed."
+    )
+    unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
+    low, high = (np.broadcast_to(limit, (sensor.channels,)).astype(np.float64) for limit in sensor.limits)
+    head = level_picture(means, f"mean level of each channel in each of {len(kept)} touches", caption)
+    return head + note(words) + state_rows(found, low, high, unit)
+
+
+def state_rows(
+    found: Sequence[ChannelSummary], low: npt.NDArray[np.float64], high: npt.NDArray[np.float64], unit: str
+) -> str:
+    """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
+    drifts = any(channel.drift for channel in found)
+    shown_channels = [channel for channel in found if channel.faults or len(found) <= MOST_ROWS]
+    rows = []
+    for channel in sorted(shown_channels, key=lambda channel: not channel.faults)[:MOST_ROWS]:
+        bottom, top = float(low[channel.number]), float(high[channel.number])
+        median, least, most = (
+            brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
+        )
+        moved = None if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
+        state = ", ".join(channel.faults) or "fine"
+        ends = f"{channel.still:.0%}", f"{channel.bottom:.1%}", f"{channel.top:.1%}"
+        rows.append([channel.number, state, median, f"{least} to {most}", *ends, *([moved] if drifts else [])])
+    header = ["channel", "state", f"median ({unit})" if unit else "median", "90% lie in", "never changes", "at bottom"]
+    left = len(found) - len(rows)
+    more = note(f"{left} more channels have no row, those without a fault first.") if left else ""
+    return table([*header, "at top", *(["drift"] if drifts else [])], rows, "channels") + more
+
+
+def _averaged(levels: npt.NDArray[np.number], columns: int) -> npt.NDArray[np.float64]:
+    """Levels (C, T) with their columns averaged down to at most so many."""
+    if levels.shape[1] <= columns:
+        return levels.astype(np.float64)
+    edges = np.linspace(0, levels.shape[1], columns + 1).astype(np.intp)
+    return np.asarray(np.add.reduceat(levels, edges[:-1], axis=1, dtype=np.float64) / np.diff(edges))
+
+
+def _thinned(levels: npt.NDArray[np.floating], columns: int) -> Pixels:
+    """Levels (C, T) as a picture, the columns averaged down to so many."""
+    levels = _averaged(_averaged(levels, columns).T, 4 * HIGHEST).T
+    return np.rint(np.clip(levels, 0, LEVELS - 1) * (255 / (LEVELS - 1))).astype(np.uint8)
+
+
+def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str) -> str:
+    """A picture of levels (C, T), each channel from its least to its most but for the outermost hundredths.
+
+    alternative: for who cannot see it.
+    """
+    few = _averaged(levels, COLUMNS)
+    low, high = (np.quantile(few, share, axis=1, keepdims=True) for share in (0.01, 0.99))
+    pixels = _thinned((few - low) / np.maximum(high - low, 1.0) * (LEVELS - 1), COLUMNS)
+    height = max(60, min(260, 9 * len(pixels)))
+    drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="height:{height}px">'
+    return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
+
+
+def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapping[str, Sequence[Exemplar]]) -> str:
+    """A small picture of one touch of each material, of as many as there is room for."""
+    found: dict[str, str] = {}
+    if sensor.camera:
+        for name, ranked in exemplars.items():
+            if ranked and len(found) < MOST_PICTURES:
+                frames, (low, high) = ranked[0].readings, sensor.limits
+                small = scaled_down(frames[len(frames) // 2][None], *FRAME)[0]
+                found[name] = png(np.rint(np.clip((small - low) / (high - low), 0, 1) * 255).astype(np.uint8))
+    else:
+        for touch in kept:
+            if touch.material not in found and len(found) < MOST_PICTURES:
+                found[touch.material] = png(_thinned(_touch(touch.levels), LONGEST))
+    if not found:
+        return note("Not shown: no readings are kept, neither as exemplars nor to match with.")
+    names = {*exemplars, *(touch.material for touch in kept)}
+    what = (
+        "The middle frame of one touch of each material."
+        if sensor.camera
+        else "One touch of each material: rows are channels, from least (dark) to most each; time runs to the right."
+    )
+    more = f" {len(names) - len(found)} more are not shown." if len(names) > len(found) else ""
+    items = "".join(
+        f'<figure><img src="{data}" alt="a touch of {shown(name)}">'
+        f"<figcaption>{name_of(clipped_name(name, 260))}</figcaption></figure>"
+        for name, data in sorted(found.items(), key=lambda pair: as_counted(pair[0]))
+    )
+    return note(what + more) + f'<div class="pictures{" frames" if sensor.camera else ""}">{items}</div>'
+
+
+def _touch(levels: LevelArray) -> npt.NDArray[np.float64]:
+    """A touch's levels, each channel from its own least to its own most, so that what moves is seen."""
+    read = levels != MISSING
+    low = np.where(read, levels, LEVELS).min(axis=1, keepdims=True)
+    high = np.where(read, levels, 0).max(axis=1, keepdims=True)
+    return np.asarray((np.where(read, levels, low) - low) / np.maximum(high - low, 1) * (LEVELS - 1), dtype=np.float64)

@@ -1,17 +1,21 @@
-"""All that the page of a memory rests on, each found once and when it is first needed."""
+"""What a memory's page rests on: how alike its materials are, and how it judges touches that it never observed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.clients.report.drawing import as_counted
-from scroll_tactile.clients.report.growing import Growing, Soon, chosen, growing, soon
-from scroll_tactile.clients.report.knowledge import MOST_NEAR, Mistake, Trust, mistakes, separations, trust_in
+from scroll_tactile.clients.report.drawing import Bin, as_counted
 from scroll_tactile.clients.report.page import note
+from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.errors import (
     CapacityError,
     EmbeddingError,
@@ -29,15 +33,299 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.current import estimator_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
+from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches
 from scroll_tactile.prediction.model import Model, enough_memory
+from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.readouts.estimation import Estimator
-from scroll_tactile.results import Observation
-from scroll_tactile.signals.stream import validate
+from scroll_tactile.readouts.leave_one_out import rows_at
+from scroll_tactile.results import Observation, Prediction
+from scroll_tactile.signals.stream import Stream, fewest_readings, validate
+from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["MemoryFacts"]
+__all__ = ["MOST_NEAR", "Growing", "MemoryFacts", "bins_of", "unknown_by"]
 
+FloatArray = npt.NDArray[np.float64]
+
+Streams = Sequence[tuple[HeldOutTouch, Stream]]
+
+MOST_NEAR = 1024  # materials: the separation of each two of more takes minutes
+PRIOR = 0.1  # of a readout's scores, where the calibration is that of another kind
+BINS = 10
+
+
+def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatArray]:
+    """The separation of materials: names, and the log-odds that a typical touch of one has over another, (C, C).
+
+    Half the squared Mahalanobis distance of their means, of each scale that judges whole touches, as far as the
+    calibration believes it. Materials that were never touched long enough are left out. None are there before a
+    calibration is.
+    """
+    if model.fusion is None:
+        return [], np.zeros((0, 0))
+    scales = model.scales("complete", len(model.calibrations) - 1)
+    weights = np.full(len(scales), PRIOR / len(scales))
+    if model.kind == "lda":
+        weights = model.fusion.complete.calibration.weights
+    names = [name for name in model.names if all(name in model.readouts[scale].places for scale in scales)]
+    total = np.zeros((len(names), len(names)))
+    with one_thread():
+        for scale, weight in zip(scales, weights.tolist(), strict=True):
+            readout = model.readouts[scale]
+            solved, _ = readout.linear(names, "lda")
+            means = statistics.sums(scale, names) / statistics.counts(scale, names)[:, None] - readout.origin
+            products = means @ solved
+            products = (products + products.T) / 2
+            sizes = np.diagonal(products)
+            total += weight * np.maximum(sizes[:, None] + sizes - 2 * products, 0.0) / 2
+    np.fill_diagonal(total, 0.0)
+    return names, total
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """Left-out touches of one material that were called another: how many, of how many, and their mean probability."""
+
+    material: str
+    answer: str
+    count: int
+    tested: int
+    confidence: float
+
+
+def mistakes(held_out: Sequence[HeldOutTouch]) -> list[Mistake]:
+    """All confusions, the most frequent first."""
+    tested = Counter(touch.material for touch in held_out)
+    wrong: dict[tuple[str, str], list[float]] = {}
+    for touch in held_out:
+        if touch.answer != touch.material:
+            wrong.setdefault((touch.material, touch.answer), []).append(touch.confidence)
+    found = [Mistake(*pair, len(sure), tested[pair[0]], float(np.mean(sure))) for pair, sure in wrong.items()]
+    return sorted(found, key=lambda m: (-m.count, -m.count / m.tested, m.material, m.answer))
+
+
+def interval(right: int, count: int) -> tuple[float, float]:
+    """The 95 % interval of a share (Wilson 1927)."""
+    if not count:
+        return 0.0, 1.0
+    z, share = 1.96, right / count
+    middle = (share + z * z / (2 * count)) / (1 + z * z / count)
+    half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How right and how well calibrated answers to left-out touches are.
+
+    count: of touches. right: share, between low and high with 95 %. confidence: the mean probability that was given.
+    error: the expected calibration error, of equal steps of probability. chance: what that would be on average of
+    answers that are right as often as they say. unknown: share called unknown.
+    """
+
+    count: int
+    right: float
+    low: float
+    high: float
+    confidence: float
+    error: float
+    chance: float
+    unknown: float
+
+    @property
+    def miscalibrated(self) -> bool:
+        """Whether the error is more than chance and matters."""
+        return self.error > max(0.05, 2 * self.chance)
+
+
+def trust_in(held_out: Sequence[HeldOutTouch]) -> Trust:
+    """How far answers can be believed, by one or more touches left out."""
+    confidence, right = _answered(held_out)
+    low, high = interval(int(right.sum()), len(held_out))
+    draws = np.random.default_rng(0).random((200, len(held_out))) < confidence
+    return Trust(
+        count=len(held_out),
+        right=float(right.mean()),
+        low=low,
+        high=high,
+        confidence=float(confidence.mean()),
+        error=_error(confidence, right),
+        chance=float(np.mean([_error(confidence, drawn) for drawn in draws])),
+        unknown=float(np.mean([not touch.known for touch in held_out])),
+    )
+
+
+def _answered(held_out: Sequence[HeldOutTouch]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """How sure each answer was, and whether it was right."""
+    sure = np.array([touch.confidence for touch in held_out])
+    return sure, np.array([touch.answer == touch.material for touch in held_out])
+
+
+def _places(confidence: FloatArray) -> npt.NDArray[np.intp]:
+    return np.clip(np.ceil(confidence * BINS).astype(np.intp) - 1, 0, BINS - 1)
+
+
+def _error(confidence: FloatArray, right: npt.NDArray[np.bool_]) -> float:
+    """Expected calibration error: Σ_b (n_b / N) · |right_b − confidence_b|."""
+    gaps = np.bincount(_places(confidence), right - confidence, BINS)
+    return float(np.abs(gaps).sum() / len(confidence))
+
+
+def bins_of(held_out: Sequence[HeldOutTouch]) -> list[Bin]:
+    """Answers by their probability, in equal steps of it."""
+    confidence, right = _answered(held_out)
+    places, found = _places(confidence), []
+    for place in np.unique(places):
+        own = places == place
+        count, hits = int(own.sum()), int(right[own].sum())
+        found.append(Bin(count, float(confidence[own].mean()), hits / count, *interval(hits, count)))
+    return found
+
+
+def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
+    """Material, its left-out touches that were called unknown, and all of them; the largest share first."""
+    tested = Counter(touch.material for touch in held_out)
+    unknown_touches = Counter(touch.material for touch in held_out if not touch.known)
+    found = [(name, unknown_touches[name], count) for name, count in tested.items()]
+    return sorted(found, key=lambda row: (-row[1] / row[2], row[0]))
+
+
+# Parts of a touch, where a rule has no moments before its end.
+PARTS = (0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
+CAMERA_PARTS = (0.2, 0.4, 0.7, 1.0)
+TOUCHES, CAMERA_TOUCHES = 6, 3
 CANNOT_EMBED = EmbeddingError, MismatchError, StreamError, WeightsError
+
+
+class Growing(NamedTuple):
+    """The answers to one touch, one after the other. decided: by which of them; None if by none."""
+
+    material: str
+    predictions: tuple[Prediction, ...]
+    decided: int | None
+
+
+@dataclass(frozen=True)
+class Soon:
+    """How soon held-out touches are decided, and how many of the decisions are wrong.
+
+    seconds: of touch, at each moment. right: the share of touches of that length whose likeliest material is the true
+    one. decided, wrong: the share of all touches that are decided by then, and that are decided wrongly. count: the
+    touches.
+    """
+
+    seconds: tuple[float, ...]
+    right: tuple[float, ...]
+    decided: tuple[float, ...]
+    wrong: tuple[float, ...]
+    count: int
+
+    @property
+    def median(self) -> float | None:
+        """The first of these moments at which half of the touches are decided."""
+        return next((at for at, share in zip(self.seconds, self.decided, strict=True) if share >= 0.5), None)
+
+
+def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float) -> Soon | None:
+    """How soon answers come, by prefixes of held-out touches; None where too few touches were held out."""
+    if model.fusion is None or len(model.fusion.trajectories.targets) < FEWEST:
+        return None
+    held_out, moments, rate = model.fusion.trajectories, model.fusion.moments[:-1], extractor.sensor.rate
+    done, wrong = np.zeros(len(held_out.targets), bool), np.zeros(len(held_out.targets), bool)
+    right, decided, mistaken = [], [], []
+    for i, moment in enumerate(moments):
+        threshold = moment.threshold(false_alarms)
+        chances, novelty = held_out.chances[:, i], held_out.novelty[:, i]
+        reached = np.isfinite(novelty)
+        best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
+        for touch in np.flatnonzero(reached & ~done).tolist():
+            name, chance = str(best[touch]), float(chances[touch].max())
+            prediction = Prediction(
+                material=name,
+                probability=chance,
+                ranking=((name, chance),),
+                novelty=float(novelty[touch]),
+                known=bool(novelty[touch] <= threshold),
+                seconds=moment.steps / rate,
+            )
+            if rule.decided(prediction, moment.steps):
+                done[touch], wrong[touch] = True, not prediction.known or best[touch] != held_out.targets[touch]
+        right.append(float((best == held_out.targets)[reached].mean()) if reached.any() else 0.0)
+        decided.append(float(done.mean()))
+        mistaken.append(float(wrong.mean()))
+    return Soon(
+        seconds=tuple(moment.steps / rate for moment in moments),
+        right=tuple(right),
+        decided=tuple(decided),
+        wrong=tuple(mistaken),
+        count=len(held_out.targets),
+    )
+
+
+def chosen(held_out: Sequence[HeldOutTouch], keys: Iterable[bytes], camera: bool) -> list[HeldOutTouch]:
+    """A few touches to look at: the two hardest, and others from hard to easy, of different materials if there are."""
+    known = set(keys)
+    ranked = sorted(
+        (touch for touch in held_out if touch.key in known),
+        key=lambda touch: (touch.probability[touch.names.index(touch.material)], touch.key),
+    )
+    count, picked, materials = CAMERA_TOUCHES if camera else TOUCHES, list[HeldOutTouch](), set[str]()
+    wanted = [0, 1, *(round(i) for i in np.linspace(0.1, 0.95, count - 2) * (len(ranked) - 1))] if ranked else []
+    for place in wanted[:count]:
+        rest = [touch for touch in ranked[place:] if touch not in picked]
+        if rest:
+            fresh = next((touch for touch in rest if touch.material not in materials), rest[0])
+            picked.append(fresh)
+            materials.add(fresh.material)
+    return picked
+
+
+def growing(
+    model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float, touches: Streams
+) -> list[Growing]:
+    """The answers to some touches, each as if it had never been observed, at the rule's moments or at parts of it.
+
+    Raises EmbeddingMismatchError where only its user can make the memory's embedding, and what that raises.
+    """
+    sensor, names, found = extractor.sensor, model.names, list[Growing]()
+    first = 1 if sensor.camera and capabilities_of(extractor.embedding).rest is not None else 0  # the frame at rest
+    for touch, readings in touches:
+        stream, predictions, decided = extractor.stream(readings), list[Prediction](), None
+        parts = CAMERA_PARTS if sensor.camera else PARTS
+        moments = rule.moments if len(rule.moments) > 1 else [round(part * len(stream)) for part in parts]
+        least, most = max(fewest_readings(sensor), first + 1), len(stream)
+        with _without(model, touch) as other:
+            for count in sorted({min(max(least, moment), most) for moment in (*moments, most)}):
+                prefix = stream.first(count / sensor.rate)
+                encoded = extractor.encode(prefix, other.longest, lambda steps: model.scales_for(names, steps))
+                predictions.append(answer(other, extractor, names, [(encoded, None)], false_alarms))
+                if decided is None and rule.decided(predictions[-1], encoded.steps):
+                    decided = len(predictions) - 1
+        found.append(Growing(touch.material, tuple(predictions), decided))
+    return found
+
+
+@contextmanager
+def _without(model: Model, touch: HeldOutTouch) -> Iterator[Model]:
+    """The model as if it had never observed a touch, nor kept it, but for how it is calibrated."""
+    sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
+    stages, readouts = [[*stage, *model.views] for stage in model.stages], dict(model.readouts)
+    with one_thread():
+        for scale, readout in model.readouts.items():
+            if own := rows_at(sampled, stages, scale):
+                # As many rows as it added: of windows that are learned one by one the sample has the mean.
+                times = max(1, round(sampled.pairs[own[0], 2] / len(own)))
+                readouts[scale] = readout.without(touch.material, np.repeat(sampled.rows[own], times, axis=0))
+    other, matcher = replace(model, readouts=readouts), model.matcher
+    if matcher is None or (touch.material, touch.key) not in matcher.kept.held:
+        yield other
+        return
+    kept = KeptTouch(touch.material, touch.key, matcher.kept.levels(matcher.kept.rows()[touch.key]))
+    matcher.kept.follow((), [(touch.material, touch.key)])
+    try:
+        yield other
+    finally:
+        matcher.kept.follow([kept])
 
 
 @dataclass
@@ -45,8 +333,8 @@ class MemoryFacts:
     """What a memory knows.
 
     risk: the share of wrong answers among those decided. of: an axis, whose labels it then knows in place of materials.
-    missing: what the page lacks and why, filled as it is made. unread: whether the embedding is not at hand, and
-    nothing was fitted to beginnings.
+    names: what touches are called by. missing: what the page lacks and why, filled as it is made. unread: whether the
+    embedding is not at hand, and nothing was fitted to beginnings.
     """
 
     learner: TactileLearner
@@ -69,10 +357,8 @@ class MemoryFacts:
         """What was learned, by materials or by labels."""
         return self.learner.memory if self.of is None else axis_memory(self.learner.memory, self.of)
 
-    @property
-    def names(self) -> str:
-        """What touches are called by."""
-        return "materials" if self.of is None else f"labels on {self.of}"
+    def __post_init__(self) -> None:
+        self.names = "materials" if self.of is None else f"labels on {self.of}"
 
     @cached_property
     def counts(self) -> dict[str, int]:
@@ -88,21 +374,18 @@ class MemoryFacts:
     def model(self) -> Model | None:
         """The model that answers, touches held out of it; None of an empty memory, and where none can be fitted."""
         try:
-            return self._fitted() if self.counts else None
+            try:
+                return self.learner._by(self.of).examined() if self.counts else None
+            except CANNOT_EMBED as error:
+                self.missing.append(f"When answers are decided: {error}")
+                self.unread = True
+                with enough_memory():
+                    return Draft.of(self.memory, self.learner.settings.readout).fit(None)
         except CapacityError:
             raise
         except ScrollTactileError as error:  # sums that came from elsewhere have no readout, and the ridge has a limit
             self.missing.append(f"Nothing could be fitted: {error}")
             return None
-
-    def _fitted(self) -> Model:
-        try:
-            return self.learner._by(self.of).examined()
-        except CANNOT_EMBED as error:
-            self.missing.append(f"When answers are decided: {error}")
-            self.unread = True
-            with enough_memory():
-                return Draft.of(self.memory, self.learner.settings.readout).fit(None)
 
     @cached_property
     def held_out(self) -> list[HeldOutTouch]:
@@ -132,11 +415,6 @@ class MemoryFacts:
         touches = self.memory.kept.touches() if self.memory.kept is not None else []
         place = {row.key: row.sequence for row in self.journal}
         return sorted(touches, key=lambda touch: (place.get(touch.key, 0), touch.material, touch.key))
-
-    @property
-    def ordered(self) -> bool:
-        """Whether that order is known."""
-        return bool(self.journal)
 
     @cached_property
     def exemplars(self) -> dict[str, list[Exemplar]]:
@@ -180,12 +458,12 @@ class MemoryFacts:
         touches = chosen(self.held_out, kept or held, sensor.camera)
         if not touches:
             return [], "of no touch that could be left out the readings are kept."
-        streams = {
-            touch.key: stream_of(kept[touch.key].levels, sensor) if kept else validate(held[touch.key].readings, sensor)
-            for touch in touches
-        }
+        streams = [
+            (own, stream_of(kept[own.key].levels, sensor) if kept else validate(held[own.key].readings, sensor))
+            for own in touches
+        ]
         try:
-            return growing(self.learner, self.model, self.extractor, self.rule, touches, streams), ""
+            return growing(self.model, self.extractor, self.rule, self.learner.settings.false_alarms, streams), ""
         except CANNOT_EMBED as error:
             return [], str(error)
 

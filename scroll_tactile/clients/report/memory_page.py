@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
 
 from scroll_tactile import __version__
-from scroll_tactile.clients.report.charts import dated, histogram, timeline
-from scroll_tactile.clients.report.drawing import shown
-from scroll_tactile.clients.report.facts import MemoryFacts
-from scroll_tactile.clients.report.judgement import ROWS, alike, calibration_plots, estimated, growing_answers, mixed_up
-from scroll_tactile.clients.report.page import Card, State, cards, figure, page, side_by_side, table
-from scroll_tactile.clients.report.sensing import (
+from scroll_tactile.clients.report import drawing
+from scroll_tactile.clients.report.channels import (
     channel_card,
     channel_section,
     exemplar_pictures,
     health_cards,
     health_section,
 )
+from scroll_tactile.clients.report.drawing import dated, shown
+from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts, bins_of, unknown_by
+from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
+from scroll_tactile.errors import printable
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.readouts.estimation import Heads
+from scroll_tactile.readouts.regression import RegressionHead
 
 __all__ = ["memory_page"]
 
+ROWS = 40  # materials, of which each has a row in a figure; of more there are tables
+SQUARE = 30  # materials, of which all pairs have a cell in a figure
+MOST_MISTAKES = 60
+PAIRS = 20
 FEW = 30  # touches left out: with fewer, no figure of them is certain
 FEW_TOUCHES = 3  # of a material
 RIGHT, POOR = 0.95, 0.8  # shares: what is fine, and what is bad
@@ -50,41 +57,38 @@ def memory_page(
 
     Raises InputError for a risk that is no share; CapacityError; and StoreError where a memory on disk cannot be read.
     """
-    facts = MemoryFacts(learner, risk)
+    facts, sensor = MemoryFacts(learner, risk), learner.sensor
     title = name or ("A memory without a path" if learner.path is None else learner.path.name)
     show = progress or (lambda what, done, of: None)
     show("touches left out", 0, STEPS)
-    near, order = alike(facts)
-    known, mixed, calibrated = _known(facts), mixed_up(facts, order), calibration_plots(facts)
+    near, order = _alike(facts)
+    known, mixed, calibrated = _known(facts), _mixed_up(facts, order), _calibration(facts)
     show("beginnings of touches", 1, STEPS)
-    grown = growing_answers(facts)
+    grown = _growing_answers(facts)
     show("channels", 2, STEPS)
-    sensor = learner.sensor
     found = learner.health() if learner.has_health else None
     # What tells most comes first; when it was taught is of use to few.
-    exemplars = facts.exemplars if sensor.camera else {}
-    strips = exemplar_pictures(sensor, facts.kept, exemplars)
+    strips = exemplar_pictures(sensor, facts.kept, facts.exemplars if sensor.camera else {})
     sections = [
         ("known", "What it knows", side_by_side(f"<div>{strips}</div>", f"<div>{known}</div>")),
         ("mixed", "What it mixes up", mixed),
         ("alike", "Who is near whom", near),
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
-        *([("estimated", "What it measures", estimated(facts))] if facts.estimator is not None else []),
+        *([("estimated", "What it measures", _estimated(facts))] if facts.estimator is not None else []),
         *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
-        ("channels", "Channels", channel_section(sensor, facts.kept, found, ordered=facts.ordered)),
-        ("when", "When it was taught", _over_time(facts)),
+        ("channels", "Channels", channel_section(sensor, facts.kept, found, ordered=bool(facts.journal))),
+        ("when", "When it was taught", _when(facts)),
     ]
     for i, axis in enumerate(learner.axes):
         by = facts.by(axis)
-        sections.append((f"axis-{i}", f"By {axis}", mixed_up(by, alike(by)[1]) + calibration_plots(by)))
-    channels = channel_card(sensor, facts.kept, found)
-    summary = cards([_knows(facts), _mixes(facts), _trusts(facts), _soon(facts), channels, *health_cards(found)])
+        sections.append((f"axis-{i}", f"By {axis}", _mixed_up(by, _alike(by)[1]) + _calibration(by)))
+    first = [_knows(facts), _mixes(facts), _trusts(facts), _decides(facts), channel_card(sensor, facts.kept, found)]
     if facts.missing:
         reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))
         sections.append(("missing", "What is missing, and why", f"<ul>{reasons}</ul>"))
     show("written", STEPS, STEPS)
-    return page(title, _under(learner), summary, sections, _foot(learner))
+    return page(title, _under(learner), cards([*first, *health_cards(found)]), sections, _foot(learner))
 
 
 def _under(learner: TactileLearner) -> str:
@@ -121,7 +125,7 @@ def _knows(facts: MemoryFacts) -> Card:
 def _mixes(facts: MemoryFacts) -> Card:
     trust, heading = facts.trust, "It mixes up"
     if trust is None:
-        return "none", heading, "not known", _sentence(facts.nothing_left_out)
+        return _not_known(facts, heading)
     wrong = round((1 - trust.right) * trust.count)
     if not wrong:
         return "good", heading, "nothing", f"All {trust.count} touches left out got their own name."
@@ -133,7 +137,7 @@ def _mixes(facts: MemoryFacts) -> Card:
 def _trusts(facts: MemoryFacts) -> Card:
     trust, heading = facts.trust, "Touches held out"
     if trust is None:
-        return "none", heading, "not known", _sentence(facts.nothing_left_out)
+        return _not_known(facts, heading)
     more = (
         f"Mean probability {trust.confidence:.1%}, ECE {trust.error:.3f}, {trust.unknown:.0%} called unknown. Others "
         "of their sittings were learned: tomorrow's touches are harder."
@@ -148,7 +152,7 @@ def _trusts(facts: MemoryFacts) -> Card:
     return _state(trust.right), heading, f"{trust.right:.1%} right, calibrated", more
 
 
-def _soon(facts: MemoryFacts) -> Card:
+def _decides(facts: MemoryFacts) -> Card:
     measured, heading = facts.soon, "It decides"
     if measured is None:
         return "none", heading, "not known", "Too few touches are kept to measure it."
@@ -159,27 +163,26 @@ def _soon(facts: MemoryFacts) -> Card:
     return "good" if wrong <= 2 * facts.risk else "look", heading, f"half of touches in {measured.median:.2g} s", more
 
 
+def _not_known(facts: MemoryFacts, heading: str) -> Card:
+    why = facts.nothing_left_out
+    return "none", heading, "not known", why[:1].upper() + why[1:]
+
+
 def _state(right: float) -> State:
     return "good" if right >= RIGHT else "look" if right >= POOR else "bad"
-
-
-def _sentence(why: str) -> str:
-    return why[:1].upper() + why[1:]
 
 
 def _known(facts: MemoryFacts) -> str:
     """The materials."""
     if not facts.counts:
         return facts.lacks("What it knows", "no touch was observed yet.")
-    names, separation = facts.near
     nearest: dict[str, tuple[str, float]] = {}
-    if len(names) > 1:
-        far = separation + np.diag(np.full(len(names), np.inf))
-        nearest = {name: (names[int(row.argmin())], float(row.min())) for name, row in zip(names, far, strict=True)}
-    first: dict[str, float] = {}
+    for first, second, apart in reversed(_pairs(facts)):
+        nearest[first], nearest[second] = (second, apart), (first, apart)
+    began: dict[str, float] = {}
     for row in facts.journal:
         if row.state != "retracted":
-            first.setdefault(row.material, row.time)
+            began.setdefault(row.material, row.time)
     tested = Counter(touch.material for touch in facts.held_out)
     right = Counter(touch.material for touch in facts.held_out if touch.answer == touch.material)
     rows = [
@@ -188,7 +191,7 @@ def _known(facts: MemoryFacts) -> str:
             count,
             f"{right[name]} of {tested[name]}" if tested[name] else None,
             *nearest.get(name, (None, None)),
-            dated(first[name]) if name in first else None,
+            dated(began[name]) if name in began else None,
         ]
         for name, count in facts.counts.items()
     ]
@@ -196,23 +199,227 @@ def _known(facts: MemoryFacts) -> str:
     return table(header, rows, "materials")
 
 
-def _over_time(facts: MemoryFacts) -> str:
+def _pairs(facts: MemoryFacts) -> list[tuple[str, str, float]]:
+    """Each two materials and their separation, the nearest first."""
+    names, separation = facts.near
+    first, second = np.triu_indices(len(names), 1)
+    order = np.argsort(separation[first, second], kind="stable")
+    return [
+        (names[i], names[j], float(separation[i, j]))
+        for i, j in zip(first[order].tolist(), second[order].tolist(), strict=True)
+    ]
+
+
+def _when(facts: MemoryFacts) -> str:
     if not facts.journal:
         alone = facts.learner.path is None
         why = "this memory has no path, so that nobody noted when." if alone else "its journal names no touches."
         return facts.lacks("Touches over time", why)
-    times = [row.time for row in facts.journal if math.isfinite(row.time)] or [0.0]
+    timed = [row for row in facts.journal if math.isfinite(row.time)]
+    times = [row.time for row in timed] or [0.0]
     begin, end = min(times), max(times)
+    if len(facts.counts) > ROWS:
+        counts, _ = np.histogram(times, bins=BARS, range=(begin, end if end > begin else begin + 1))
+        label = f"seconds since {dated(begin)} UTC"
+        drawn = drawing.histogram(counts.tolist(), 0, max(end - begin, 1.0), label, "touches")
+        return figure(drawn, f"How many touches were observed when; {len(times)} in all, the last {dated(end)} UTC.")
+    rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
+    for row in timed:
+        rows.setdefault(row.material, ([], []))[row.state == "retracted"].append(row.time)
+    drawn = drawing.timeline([(name, *both) for name, both in rows.items()][: 2 * ROWS], begin, end)
     retracted = sum(row.state == "retracted" for row in facts.journal)
     also = f" {retracted} of them were retracted: dashed." if retracted else ""
-    if len(facts.counts) <= ROWS:
-        rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
-        for row in facts.journal:
-            if math.isfinite(row.time):
-                rows.setdefault(row.material, ([], []))[row.state == "retracted"].append(row.time)
-        drawn = timeline([(name, *both) for name, both in rows.items()][: 2 * ROWS], begin, end)
-        caption = f"Each upright line is a touch, or several at nearly one time; {len(times)} in all.{also}"
-        return figure(drawn, caption)
-    counts, _ = np.histogram(times, bins=BARS, range=(begin, end if end > begin else begin + 1))
-    drawn = histogram(counts.tolist(), 0, max(end - begin, 1.0), f"seconds since {dated(begin)} UTC", "touches")
-    return figure(drawn, f"How many touches were observed when; {len(times)} in all, the last {dated(end)} UTC.")
+    return figure(drawn, f"Each upright line is a touch, or several at nearly one time; {len(times)} in all.{also}")
+
+
+def _alike(facts: MemoryFacts) -> tuple[str, list[str]]:
+    """Who is near whom, and the order of materials that brings near ones together; empty where there are many."""
+    names, separation = facts.near
+    if len(names) < 2:
+        many = len(facts.counts) > MOST_NEAR
+        why = f"there are more than {MOST_NEAR} materials." if many else "it takes two materials, touched long enough."
+        return facts.lacks("Who is near whom", why), []
+    pairs = table(["material", "feels like", "separation"], _pairs(facts)[:PAIRS], "nearest pairs")
+    found = f"<div><h3>Nearest pairs</h3>{pairs}</div>"
+    words = (
+        "Separation is the log-odds that a typical touch of one has over the other. Of touches that scatter as a bell "
+        "curve, at 3 one in nine is taken for the other, at 10 one in eighty, at 20 one in a thousand."
+    )
+    if len(names) > ROWS:
+        return note(words) + found, []
+    from scipy.cluster.hierarchy import linkage
+    from scipy.spatial.distance import squareform
+
+    drawn, order = drawing.tree(names, np.asarray(linkage(squareform(separation, checks=False), "average")))
+    caption = f"Materials that join further to the left feel more alike (average linkage). {words}"
+    return side_by_side(figure(drawn, caption), found), order
+
+
+def _mixed_up(facts: MemoryFacts, order: list[str]) -> str:
+    """Confusions of touches left out. order: of the materials in the figure."""
+    trust = facts.trust
+    if trust is None:
+        return facts.lacks("What it mixes up", facts.nothing_left_out)
+    tested = {touch.material for touch in facts.held_out}
+    words = (
+        f"{trust.count} touches of {len(tested)} {facts.names} were left out one by one: {trust.right:.1%} right "
+        f"(95% interval {trust.low:.1%} to {trust.high:.1%})."
+    )
+    if len(tested) < len(facts.counts):
+        words += (
+            f" Of {len(facts.counts) - len(tested)} others no touch could be left out, or none is among those sampled;"
+            " nothing is called by their names here."
+        )
+    rows = [[m.material, m.answer, m.count, m.tested, f"{m.confidence:.0%}"] for m in facts.mistakes[:MOST_MISTAKES]]
+    rest = len(facts.mistakes) - len(rows)
+    listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
+    more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
+    found = f"<div><h3>Worst confusions</h3>{listed}{more}{_one_by_one(facts)}</div>"
+    found = found if rows else note("None was called by another name.")
+    if len(tested) > SQUARE:
+        return note(words) + found
+    names = [name for name in order or facts.counts if name in tested]
+    names += sorted(tested - set(names))
+    counts = np.zeros((len(names), len(names)), np.int64)
+    for touch in facts.held_out:
+        if touch.answer in names:
+            counts[names.index(touch.material), names.index(touch.answer)] += 1
+    caption = (
+        "Rows: what was touched; columns, by number: what it was called. Right answers lie on the diagonal, and "
+        f"{facts.names} that feel alike stand side by side."
+    )
+    return note(words) + side_by_side(figure(drawing.confusions(names, counts), caption), found)
+
+
+def _one_by_one(facts: MemoryFacts) -> str:
+    """The touches that were called something else, the surest first, and the lines that name them so; nothing of a
+    memory whose observations nobody noted. Those that are compacted stay what they are."""
+    noted = {
+        (row.material if facts.of is None else row.labels.get(facts.of), row.key): row
+        for row in facts.journal
+        if row.state != "retracted"
+    }
+    wrong = [
+        (touch, row)
+        for touch in sorted(facts.held_out, key=lambda touch: (-touch.confidence, touch.key))
+        if touch.answer != touch.material and (row := noted.get((touch.material, touch.key))) is not None
+    ][:MOST_MISTAKES]
+    if not wrong:
+        return ""
+    rows = [[row.sequence, row.source, t.material, t.answer, f"{t.confidence:.0%}"] for t, row in wrong]
+    listed = table(["observation", "touch", "of", "called", "probability"], rows, "wrong touches")
+    words = [
+        ["scroll-tactile", "memory", "relabel", str(facts.learner.path), str(row.sequence), touch.answer]
+        for touch, row in wrong
+        if row.state == "kept" and facts.of is None and facts.learner.path is not None
+    ]
+    commands = [shlex.join(line) for line in words if all(printable(word) == word for word in line)]
+    put_right = note("Where the name was wrong, and not the answer, this puts it right, exactly:") + lines(commands)
+    return f"<h3>Touches it got wrong, the surest first</h3>{listed}{put_right if commands else ''}"
+
+
+def _calibration(facts: MemoryFacts) -> str:
+    """Calibration, and what would be called unknown."""
+    trust, alarms = facts.trust, facts.learner.settings.false_alarms
+    if trust is None:
+        return facts.lacks("Whether to trust it", facts.nothing_left_out)
+    verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
+    of = (
+        "Each touch was held out alone: others of the same sitting, sensor and hand stayed learned. Touches of "
+        "another day are harder: expect more wrong ones, and more called unknown. To measure these: scroll-tactile "
+        "evaluate."
+    )
+    caption = (
+        "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
+        f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is the mean of perfect answers. "
+        "Upright lines are 95% intervals."
+    )
+    drawn = drawing.reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out])
+    unknown_touches = unknown_by(facts.held_out)
+    words = (
+        f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} are meant to be. A "
+        "material far above that varies more than it was shown to: teach more of it."
+    )
+    if len(unknown_touches) <= ROWS:
+        bars = [(name, unknown / count, f"{unknown} of {count} touches") for name, unknown, count in unknown_touches]
+        beside = figure(drawing.shares(bars, alarms, "called unknown, left out"), words)
+    else:
+        rows = [[name, unknown, count] for name, unknown, count in unknown_touches if unknown]
+        listed = table(["material", "called unknown", "of"], rows, "touches called unknown") if rows else ""
+        beside = f"<div>{note(words)}{listed}</div>"
+    return note(of) + side_by_side(figure(drawn, caption), beside)
+
+
+def _growing_answers(facts: MemoryFacts) -> str:
+    """How soon answers come, and how those to a few touches grow while they are felt."""
+    found, why = facts.growing
+    if not found:
+        return facts.lacks("How answers grow", why)
+    words = (
+        "The probability of each material while a touch goes on, as if it had never been observed. Solid: its own "
+        "material; dashed: the strongest other at any moment; upright: when it is decided, at a risk of "
+        f"{facts.risk:.0%}. The first two are the hardest touches there are."
+    )
+    return note(words) + side_by_side(_soon(facts), *(_grown(touch) for touch in found))
+
+
+def _soon(facts: MemoryFacts) -> str:
+    measured = facts.soon
+    if measured is None:
+        return facts.lacks("How soon answers come", "too few touches are kept to measure it.")
+    curves = {"right": measured.right, "decided": measured.decided, "decided and wrong": measured.wrong}
+    caption = (
+        f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, "
+        "the share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
+    )
+    return figure(drawing.over_time(measured.seconds, curves), caption)
+
+
+def _grown(touch: Growing) -> str:
+    names = sorted({touch.material, *(name for at in touch.predictions for name, _ in at.ranking[:3])})
+    chances = [dict(prediction.ranking) for prediction in touch.predictions]
+    curves = {name: [of[name] for of in chances] for name in names}
+    end, decided = touch.predictions[-1], None
+    verdict = "right" if end.material == touch.material else f"wrong, {end.material}"
+    unknown = ", and called unknown" if end.known is False else ""
+    if touch.decided is not None:
+        at = touch.predictions[touch.decided]
+        how = "unknown" if at.known is False else "right" if at.material == touch.material else "wrong"
+        decided = at.seconds, f"decided after {at.seconds:.2g} s: {how}"
+    drawn = drawing.answers([at.seconds for at in touch.predictions], curves, touch.material, decided)
+    return figure(drawn, f"A touch of {touch.material}. At its end: {verdict}{unknown}.")
+
+
+def _estimated(facts: MemoryFacts) -> str:
+    """Quantities of complete touches: what was said of them held out, and how many lie in their intervals."""
+    estimator = facts.estimator
+    assert estimator is not None
+    parts = []
+    for name, heads in sorted(estimator.heads(estimator.last).items()):
+        parts.append(f"<h3>{shown(name)}</h3>")
+        if isinstance(heads, str):
+            parts.append(facts.lacks(f"How {name} is estimated", f"{heads}."))
+            continue
+        unit = estimator.quantities[name].unit
+        parts.append(_against_truth(heads.known, heads, facts.risk, unit, "each touch held out"))
+        parts.append(_against_truth(heads.new, heads, facts.risk, unit, "each material held out, as if it were new"))
+    return "".join(parts)
+
+
+def _against_truth(head: RegressionHead, heads: Heads, risk: float, unit: str, of: str) -> str:
+    half, off = float(head.half_width(risk)), np.abs(head.residuals)
+    rows: list[tuple[str, float, str]] = []
+    for name in sorted(set(heads.materials)):
+        held: Sequence[bool] = (off[np.array(heads.materials) == name] <= half).tolist()
+        rows.append((name, sum(held) / len(held), f"{sum(held)} of {len(held)} touches"))
+    width = "unbounded: there are too few touches" if math.isinf(half) else f"{2 * half:.3g} {unit} wide"
+    caption = (
+        f"{len(off)} sampled touches, {of}: off by {off.mean():.3g} {unit} on average. Intervals that "
+        f"are to hold {1 - risk:.0%} are {width}."
+    )
+    said = (heads.targets - head.residuals).tolist()
+    drawn = drawing.against_truth(heads.targets.tolist(), said, half, heads.materials, unit)
+    covered = drawing.shares(rows[:ROWS], 1 - risk, "held by their interval")
+    return side_by_side(
+        figure(drawn, caption), figure(covered, "By material. A material far below is unlike the others.")
+    )

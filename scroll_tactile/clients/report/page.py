@@ -12,29 +12,15 @@ from typing import Literal
 from scroll_tactile.clients.report.drawing import brief, shown
 from scroll_tactile.errors import InputError
 
-__all__ = [
-    "Card",
-    "State",
-    "cards",
-    "figure",
-    "lines",
-    "name_of",
-    "note",
-    "page",
-    "require_page",
-    "save",
-    "section",
-    "side_by_side",
-    "table",
-]
+__all__ = ["Card", "State", "cards", "figure", "lines", "name_of", "note", "page", "require_page", "save", "table"]
 
 State = Literal["good", "look", "bad", "none"]
 Card = tuple[State, str, str, str]
 """How it stands, a heading, the answer in few words, and a sentence more."""
 
 LONG = 40  # rows, from which on a table scrolls inside itself, and says so
-HALF = ("when", "health", "time", "holds")  # sections of one figure or table, two of which stand side by side
-BESIDE = ("channels",)  # sections of which the table stands beside the picture
+# Sections of one figure or table, two of which stand side by side; one of which the table stands beside the picture.
+KINDS = dict.fromkeys(("when", "health", "time", "holds"), ' class="half"') | {"channels": ' class="beside"'}
 
 SIGNS = {"good": ("✓", "fine"), "look": ("!", "look at it"), "bad": ("✕", "bad"), "none": ("–", "not measured")}
 
@@ -111,7 +97,10 @@ def page(title: str, under: str, summary: str, sections: Sequence[tuple[str, str
     """The whole page. under: what stands below the title; sections: anchor, heading and HTML of each; all but names are
     HTML already."""
     links = "".join(f'<a href="#{anchor}">{shown(heading)}</a>' for anchor, heading, _ in sections)
-    body = "".join(section(anchor, heading, inside) for anchor, heading, inside in sections)
+    body = "".join(
+        f'<section id="{anchor}"{KINDS.get(anchor, "")}><h2>{shown(heading)}</h2>{inside}</section>\n'
+        for anchor, heading, inside in sections
+    )
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -127,12 +116,6 @@ def page(title: str, under: str, summary: str, sections: Sequence[tuple[str, str
 def name_of(text: object) -> str:
     """A name, isolated from the text around it, in which direction it may be read."""
     return f"<bdi>{shown(text)}</bdi>"
-
-
-def section(anchor: str, heading: str, inside: str) -> str:
-    """A section with its heading."""
-    kind = ' class="half"' if anchor in HALF else ' class="beside"' if anchor in BESIDE else ""
-    return f'<section id="{anchor}"{kind}><h2>{shown(heading)}</h2>{inside}</section>\n'
 
 
 def cards(found: Iterable[Card]) -> str:

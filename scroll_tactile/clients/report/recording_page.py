@@ -2,38 +2,156 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from os import PathLike, fspath
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import __version__
-from scroll_tactile.clients.report.channels import DEAD, DRIFTING, SATURATED, ChannelSummary, channels_of
-from scroll_tactile.clients.report.charts import FIRST_DATE, MOST_TRACES, counted_from, dated, histogram, trace
-from scroll_tactile.clients.report.cutting import Cutting, Whose, cut_of, learning, whose_readings
-from scroll_tactile.clients.report.drawing import shown
-from scroll_tactile.clients.report.page import Card, State, cards, figure, note, page, side_by_side, table
-from scroll_tactile.clients.report.sensing import card_of, level_picture, state_rows
-from scroll_tactile.errors import FieldError, InputError
+from scroll_tactile.clients.report.channels import (
+    DEAD,
+    DRIFTING,
+    SATURATED,
+    ChannelSummary,
+    card_of,
+    channels_of,
+    level_picture,
+    state_rows,
+)
+from scroll_tactile.clients.report.drawing import FIRST_DATE, MOST_TRACES, counted_from, dated, histogram, shown, trace
+from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
+from scroll_tactile.errors import FieldError, InputError, printable
+from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
-from scroll_tactile.recordings import Contents, Interval, Recording, describe, read
-from scroll_tactile.sensors import Sensor
+from scroll_tactile.recordings import PRESETS, Contents, Interval, Recording, Touch, describe, read, touches
+from scroll_tactile.recordings.presets import find, names_for
+from scroll_tactile.sensors import Sensor, known
 
 __all__ = ["recording_page"]
 
 FloatArray = npt.NDArray[np.float64]
 
+MOST_READINGS = 1_000_000  # in which contacts are looked for
 STRETCHES = 40  # that a recording is cut into, to see in which of them a channel is still
 MOST_ROWS = 60
 MOST_TOUCHES = 1000
 MARGIN = 0.1  # of the range that was seen, beyond it at both ends
 LARGEST = 1e30  # of readings in which contacts are looked for
 LOST = 0.001  # of the readings: more is worth a look
+
+
+class Whose(NamedTuple):
+    """The sensor of a recording, None where nothing says it; the preset it is of; and how that is known, in words."""
+
+    sensor: Sensor | None
+    preset: str | None
+    how: str
+
+
+def whose_readings(contents: Contents, recording: Recording, sensor: Sensor | None, preset: str | None) -> Whose:
+    """The sensor that was given, or the preset's, or the one whose messages these are.
+
+    Raises ChannelCountError for a sensor of other channels.
+    """
+    if sensor is not None:
+        if recording.readings[:1].size != sensor.channels:
+            recording.stream(sensor)
+        return Whose(sensor, None, f"that of sensor {sensor.name}")
+    if preset is not None:
+        return Whose(find(preset).sensor, preset, f"that of preset {preset}")
+    for entry in contents.entries:
+        if (entry.topic, entry.field) == (recording.topic, recording.field):
+            for name in names_for(entry.kind, entry.field, recording.readings.shape[1:]):
+                return Whose(find(name).sensor, name, f"that of preset {name}, of messages {entry.kind}")
+    return Whose(None, None, "")
+
+
+class Cutting(NamedTuple):
+    """The touches in a recording; by what it was cut; whether all have a name; and how they were found, or why there
+    are none."""
+
+    touches: tuple[Touch, ...]
+    by: Literal["labels", "episodes", "contact"]
+    named: bool
+    why: str
+
+
+def cut_of(recording: Recording, intervals: Sequence[Interval] | None, sensor: Sensor | None) -> Cutting:
+    """Touches by a table, by episodes, or else by contact. sensor: of the readings, as far as it is known."""
+    if intervals is not None or recording.episodes:
+        by: Literal["labels", "episodes"] = "episodes" if intervals is None else "labels"
+        try:
+            found = touches(recording, "episodes" if intervals is None else intervals)
+        except InputError as error:
+            return Cutting((), by, False, f"Not cut: {error}")
+        named = all(touch.material is not None for touch in found)
+        return Cutting(found, by, named, "" if named else "its episodes, of which some have no name")
+    why = ""
+    if sensor is not None and sensor.camera:
+        why = "these are pictures."
+    elif len(recording) > MOST_READINGS:
+        why = f"it has more than {MOST_READINGS} readings."
+    elif not np.isfinite(recording.readings).all():
+        why = "readings are missing."
+    elif sensor is None:
+        why = "it has no clock (give --rate), or its numbers are no sensor's."
+    if sensor is None or why:
+        why = f"Not cut: the file has no episodes or labels, and contacts are not looked for: {why}"
+        return Cutting((), "contact", False, why)
+    spans = contact_spans(sensor, None, recording.readings, [gap.index for gap in recording.report.gaps])
+    if not spans:
+        why = "None were found by contact: for that it begins at rest, for two seconds or more. It may be one touch."
+        return Cutting((), "contact", False, why)
+    proposed = "proposed by contact, as learn --cut contact takes them"
+    return Cutting(touches(recording, lambda _: spans), "contact", False, proposed)
+
+
+def learning(
+    recording: Recording, path: str, whose: Whose, cut: Cutting, chosen: Mapping[str, Any], given: Mapping[str, str]
+) -> str:
+    """The command that learns it, to be copied, and what is to be put into it.
+
+    chosen: as of `read`, with the field that was read. given: as of `recording_page`.
+    """
+    name = given.get("sensor") or next((name for name, sensor in known().items() if sensor == whose.sensor), None)
+    missing = []
+    words = ["scroll-tactile", "learn", "memory", path]
+    if whose.preset is not None:
+        words += ["--preset", whose.preset]
+    else:
+        words += ["--sensor", name or "sensor.json"]
+        missing += [] if name else ["sensor.json, its name, channels, rate, low, high, unit and duration"]
+    words += _where(recording, whose, chosen)
+    if cut.by == "labels":
+        words += ["--labels", given.get("labels") or "labels.csv"]
+        missing += [] if given.get("labels") else ["labels.csv, the table of its touches"]
+    elif not cut.named:
+        words += ["--cut", "contact"] if cut.by == "contact" and cut.touches else []
+        words += ["--label", "MATERIAL"]
+        missing.append("MATERIAL, what was touched")
+    if any(printable(word) != word for word in words):
+        return ""
+    put_in = note(f" Put in: {'; '.join(missing)}.") if missing else ""
+    return f"<h3>To learn it</h3>{lines([shlex.join(words)])}{put_in}"
+
+
+def _where(recording: Recording, whose: Whose, chosen: Mapping[str, Any]) -> list[str]:
+    """The options that say where its readings are, but for what the preset says."""
+    usual = None if whose.preset is None else PRESETS[whose.preset]
+    field = chosen.get("field") if recording.topic is None else recording.field
+    words = []
+    if recording.topic is not None and (usual is None or recording.topic != usual.topic):
+        words += ["--topic", recording.topic]
+    if field and (usual is None or recording.topic is None or field != usual.field):
+        words += ["--field", field]
+    for name in ("clock", "columns"):
+        words += [f"--{name}", str(chosen[name])] if chosen.get(name) else []
+    return words
 
 
 def recording_page(
@@ -100,11 +218,8 @@ def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Record
             raise
     first = contents.entries[0]
     chosen = chosen | {"topic": first.topic, "field": first.field}
-    return (
-        read(path, **chosen),
-        chosen,
-        f" It is the first of {len(contents.entries)} below; --topic and --field choose another.",
-    )
+    why = f" It is the first of {len(contents.entries)} below; --topic and --field choose another."
+    return read(path, **chosen), chosen, why
 
 
 def _shape(recording: Recording) -> str:
@@ -112,22 +227,18 @@ def _shape(recording: Recording) -> str:
     return f"{shape[0]} channels" if len(shape) == 1 else f"pictures of {' × '.join(map(str, shape))}"
 
 
-def _seconds(recording: Recording) -> float | None:
+def _steps(recording: Recording) -> FloatArray:
+    """The seconds from each reading to the next, as far as they are known."""
     steps = np.diff(recording.times)
-    steps = steps[np.isfinite(steps)]
-    return float(steps[steps > 0].sum()) if len(steps) else None  # of an episode each, where they begin anew
+    return np.asarray(steps[np.isfinite(steps)])
 
 
 def _length(recording: Recording) -> Card:
-    lasts = _seconds(recording)
-    count = len(recording)
-    cut = (
-        "The file ends before its end: what was whole was read."
-        if recording.report.cut_off
-        else "It was read to its end."
-    )
-    answer = f"{count} readings" + ("" if lasts is None else f", {lasts:.4g} s")
-    return "bad" if not count else "look" if recording.report.cut_off else "good", "How much", answer, cut
+    steps, count = _steps(recording), len(recording)
+    lasts = f", {steps[steps > 0].sum():.4g} s" if len(steps) else ""  # of an episode each, where times begin anew
+    state: State = "look" if recording.report.cut_off else "good"
+    whole = "The file ends before its end: what was whole was read." if state == "look" else "It was read to its end."
+    return state if count else "bad", "How much", f"{count} readings{lasts}", whole
 
 
 def _clock(recording: Recording) -> Card:
@@ -147,9 +258,9 @@ def _clock(recording: Recording) -> Card:
 
 def _losses(recording: Recording) -> Card:
     report = recording.report
-    counted = (
-        "No counter shows whether readings were lost." if report.lost is None else "By the counter in its messages."
-    )
+    counted = "By the counter in its messages."
+    if report.lost is None:
+        counted = "No counter shows whether readings were lost."
     if report.lost is None and not report.repeated and not report.unset:
         return "none", "What was lost", "not counted", counted
     parts = {"lost": report.lost or 0, "repeated": report.repeated, "without a stamp": report.unset}
@@ -158,8 +269,7 @@ def _losses(recording: Recording) -> Card:
     return "look" if bad > LOST * len(recording) else "good", "What was lost", answer, counted
 
 
-@dataclass(frozen=True)
-class _Seen:
+class _Seen(NamedTuple):
     """The readings as levels (C, T), the range of each channel, (C,), and the channels."""
 
     levels: LevelArray
@@ -192,14 +302,10 @@ class _Seen:
         low, high = float(self.low.min()), float(self.high.max())
         if recording.report.rate is None or max(-low, high) > LARGEST or not 1e-3 <= recording.report.rate <= 1e5:
             return None
-        about: dict[str, Any] = {
-            "rate": float(f"{recording.report.rate:.4g}"),
-            "low": low,
-            "high": high,
-            "unit": "",
-            "duration": 4.0,
-        }
-        return Sensor(name="own-sensor", channels=len(self.levels), **about)
+        rate = float(f"{recording.report.rate:.4g}")
+        return Sensor(
+            name="own-sensor", channels=len(self.levels), rate=rate, low=low, high=high, unit="", duration=4.0
+        )
 
 
 def _range(readings: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -243,8 +349,7 @@ def _channels(seen: _Seen | None, whose: Whose) -> str:
 
 
 def _time(recording: Recording) -> str:
-    steps = np.diff(recording.times)
-    steps = steps[np.isfinite(steps)]
+    steps = _steps(recording)
     if not len(steps):
         return note("Not shown: its readings have no times. Give --clock, or --rate to count them.")
     longest = float(np.quantile(steps, 0.999)) * 1e3

@@ -15,7 +15,7 @@ from scroll_tactile.clients.ros2.answer_fields import Answer, answer_of, ended, 
 from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState
-from scroll_tactile.live.health_notes import HealthNotes
+from scroll_tactile.live.session import HealthNotes
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture

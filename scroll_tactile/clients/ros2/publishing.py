@@ -12,7 +12,7 @@ from scroll_tactile.clients.ros2.answer_fields import Answer
 from scroll_tactile.clients.ros2.bridge import RESTLESS, Bridge
 from scroll_tactile.clients.ros2.interfaces import interface, kept
 from scroll_tactile.errors import InputError, ScrollTactileError
-from scroll_tactile.health.advice import advice, in_words
+from scroll_tactile.health.diagnosis import advice, in_words
 
 __all__ = ["AnswerTopics", "Diagnostics", "stamp_of"]
 

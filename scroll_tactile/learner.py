@@ -318,12 +318,10 @@ class TactileLearner:
         """Give an observation another name: retract it and observe its readings under the new one, durable as one.
 
         Returns its new sequence; it keeps its time and source. Where the memory has these very readings under the new
-        name, it is retracted alone, and the sequence is that of the observation that is there. A description stays with
-        the name that it was given to.
+        name it is retracted alone, and the sequence is that of the one there. A description stays with its name.
 
         Raises what `retract` raises (nothing was changed), also MaterialError for an invalid name; InputError where
-        it has that name already, and in a batch; AnnotationError where the observation that is there has other values
-        or labels.
+        it has that name already, and in a batch; AnnotationError where the one there has other values or labels.
         """
         return self._ledger.relabel(receipt, require_name(material))
 

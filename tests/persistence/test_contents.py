@@ -14,7 +14,6 @@ from touches import SETTINGS, fed, filled, held, stream
 from scroll_tactile import TactileLearner
 from scroll_tactile.clients.learning.classification import observe_all
 from scroll_tactile.clients.learning.fleet import learn
-from scroll_tactile.clients.learning.learning import learn_sources
 from scroll_tactile.clients.learning.sources import SourceOptions
 from scroll_tactile.errors import AnnotationError
 from scroll_tactile.quantities import Quantity
@@ -152,11 +151,6 @@ def _python(home):
     assert [receipt.repeated for receipt in receipts] == [False, True]
 
 
-def _batch(home):
-    with TactileLearner.open(home / "m", **SETTINGS) as learner, learner.batch():
-        assert [learner.observe("felt", touch()).repeated for _ in range(2)] == [False, True]
-
-
 def _a_pass(home):
     with TactileLearner.open(home / "m", **SETTINGS) as learner:
         assert observe_all(learner, [("felt", learner.stream(touch()))] * 2) == 2
@@ -172,22 +166,8 @@ def _learn_command(home):
     assert "1 touch that it had already" in run("learn", home / "m", home / "felt", "--label-by", "folder").output
 
 
-def _learn(home):
-    with TactileLearner.open(home / "m", **SETTINGS) as learner:
-        done = learn_sources(learner, [str(path) for path in sorted((home / "felt").iterdir())], BY_FOLDER)
-    assert (done.learned["felt"], done.skipped, done.refused) == (1, 1, [])
-
-
 def _fleet(home):
     done = learn(home / "m", [home / "felt"], BY_FOLDER, workers=2, **SETTINGS)
-    assert (done.observations, done.repeated, done.refused) == (1, 1, [])
-
-
-def _fleet_of_memories(home):
-    for name in "op":
-        with TactileLearner.open(home / name, **SETTINGS) as other:
-            other.observe("felt", touch())
-    done = learn(home / "m", [home / "o", home / "p"], BY_FOLDER, workers=1, **SETTINGS)
     assert (done.observations, done.repeated, done.refused) == (1, 1, [])
 
 
@@ -220,18 +200,7 @@ BY_FOLDER = SourceOptions(by="folder")
 
 @pytest.mark.parametrize(
     "learned",
-    [
-        _python,
-        _batch,
-        _a_pass,
-        _observe_command,
-        _learn_command,
-        _learn,
-        _fleet,
-        _fleet_of_memories,
-        _merge,
-        _merge_of_a_forged_memory,
-    ],
+    [_python, _a_pass, _observe_command, _learn_command, _fleet, _merge, _merge_of_a_forged_memory],
     ids=lambda way: way.__name__.strip("_"),
 )
 def test_a_touch_that_comes_twice_is_one_and_it_is_said(tmp_path, learned):

@@ -23,16 +23,9 @@ def ros2(
     memory: Annotated[
         Path | None, typer.Option(help="The folder of the memory; here or as the parameter memory.")
     ] = None,
-    topic: Annotated[
-        list[str] | None,
-        typer.Option(help="Where the readings are sent; a preset may know it. Several times for several fingers."),
-    ] = None,
+    topic: Annotated[str | None, typer.Option(help="Where the readings are sent; a preset may know it.")] = None,
     field: Annotated[
-        list[str] | None,
-        typer.Option(help="The path to a message's numbers, such as tactiles[0].electrodes; of several fingers each."),
-    ] = None,
-    finger: Annotated[
-        list[str] | None, typer.Option(help="A finger's name, for each of several; otherwise finger0, finger1, …")
+        str | None, typer.Option(help="The path to a message's numbers, such as tactiles[0].electrodes.")
     ] = None,
     preset: Annotated[
         str | None,
@@ -65,7 +58,7 @@ def ros2(
 
     Topics, of which late subscribers get the last: ~/answer (JSON), ~/status (by name, with a header), ~/material,
     ~/probability, ~/novelty and ~/known (plain numbers, for plots), ~/tactile_answer (where scroll_tactile_msgs is
-    built), and /diagnostics. Of several fingers each has its own: ~/finger0/answer …
+    built), and /diagnostics.
 
     Services that take a name, as load_namespace of diagnostic_msgs/srv/AddDiagnostics: ~/learn, ~/forget, ~/retract
     (an observation's number), ~/save (a file beside the memory). Services of std_srvs/srv/Trigger: ~/undo, ~/materials,
@@ -77,7 +70,7 @@ def ros2(
         raise InputError(f"there is no option {context.args[0]!r}: see --help. Options of ROS follow --ros-args")
     from scroll_tactile.clients.ros2.serving import serve
 
-    how: dict[str, Any] = {"finger": finger, "preset": preset, "type": kind, "risk": risk, "scene": scene}
+    how: dict[str, Any] = {"preset": preset, "type": kind, "risk": risk, "scene": scene}
     how |= {"contact": contact, "of": of, "watch": watch, "sensor": sensor}
     met = serve(memory, topic or "", field or "", arguments=context.args, **how)
     count = met.pop("materials", 0)

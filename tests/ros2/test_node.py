@@ -1,6 +1,7 @@
 """The node over a real ROS 2: Fast DDS on this machine, publishers in other processes."""
 
 import json
+import re
 
 import pytest
 from live_touches import shift
@@ -185,7 +186,7 @@ def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_c
     spinning.until(lambda: listener.subscription is not None)
     assert listener.kind == KIND and listener.subscription.msg_type is JointState
     spinning.node("finger").create_publisher(JointState, TOPIC, 10)
-    spinning.until(lambda: f"no reading for 0 s from the publisher of {TOPIC}" in listener.absent())
+    spinning.until(lambda: re.match(f"no reading for . s from the publisher of {TOPIC}", listener.absent()))
 
 
 def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkeypatch):

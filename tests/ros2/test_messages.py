@@ -113,7 +113,6 @@ def test_answers_fill_the_message_package_of_the_examples(spinning, monkeypatch)
     create = node.create_publisher
     double = SimpleNamespace(publish=sent.append)
     monkeypatch.setattr(node, "create_publisher", lambda of, *how: double if of is kind else create(of, *how))
-    monkeypatch.setattr(node, "destroy_publisher", lambda publisher: None)
     served = TactileNode(node, learner(), TOPIC, "data", kind="std_msgs/msg/Float32MultiArray")
     bare = {"event": "began", "stamp": 3.25, "contact": True, "seconds": 0.0, "decided": False}
     estimate = {"value": 1.5, "low": None, "high": 2.0, "unit": "N"}

@@ -228,16 +228,17 @@ class TactileNode:
 
     def _offered(self) -> list[Any]:
         named, plain = interface("diagnostic_msgs/srv/AddDiagnostics"), interface("std_srvs/srv/Trigger")
-        calls: dict[str, tuple[Any, Callable[..., Any]]] = {}
-        calls |= {name: (named, partial(_by_name, getattr(self.bridge, name))) for name in BY_NAME}
-        calls |= {name: (plain, partial(_plain, getattr(self.bridge, name))) for name in PLAIN}
+        kinds = dict.fromkeys(BY_NAME, (named, "load_namespace")) | dict.fromkeys(PLAIN, (plain, ""))
+        calls: dict[str, tuple[Any, Callable[..., Any]]] = {
+            name: (kind, partial(_reply, getattr(self.bridge, name), field)) for name, (kind, field) in kinds.items()
+        }
         if _is_there(f"{OWN}srv/Learn"):
             calls["tactile_learn"] = interface(f"{OWN}srv/Learn"), self._learn
         return [self.node.create_service(kind, f"~/{name}", call) for name, (kind, call) in calls.items()]
 
     def _learn(self, request: Any, response: Any) -> Any:
         """Serve scroll_tactile_msgs/srv/Learn."""
-        _replied(response, lambda: self.bridge.learn(request.material))
+        _reply(self.bridge.learn, "material", request, response)
         if response.success and self.bridge.receipt is not None:
             response.observation = self.bridge.receipt.sequence
         return response
@@ -272,26 +273,16 @@ def _is_there(name: str) -> bool:
         return False
 
 
-def _replied(response: Any, call: Callable[[], str]) -> Any:
-    """A response with success and message: what was done, or the error."""
+def _reply(call: Callable[..., str], field: str, request: Any, response: Any) -> Any:
+    """Serve a call: success, and what was done or why not. field: of the request, the call's argument; "" for none."""
     try:
-        response.message, response.success = call(), True
+        given = [getattr(request, field)] if field else []
+        if given and not given[0].strip():
+            raise InputError(f"expected a name, in the request's {field}; came none")
+        response.message, response.success = call(*given), True
     except (ScrollTactileError, StoreError, OSError) as error:
         response.message, response.success = str(error), False
     return response
-
-
-def _plain(call: Callable[[], str], request: Any, response: Any) -> Any:
-    return _replied(response, call)
-
-
-def _by_name(call: Callable[[str], str], request: Any, response: Any) -> Any:
-    def named() -> str:
-        if not request.load_namespace.strip():
-            raise InputError("expected a name, in the request's load_namespace; came none")
-        return call(request.load_namespace)
-
-    return _replied(response, named)
 
 
 def _time_of(seconds: float) -> Any:

@@ -223,12 +223,10 @@ def serve(
     `risk`, `scene`, `autostart`, …): what ROS is given wins, by `--ros-args -p risk:=0.02`, `--params-file` or a launch
     file. arguments: of ROS. Topics and services: see `TactileNode`.
 
-    The node has a lifecycle (https://design.ros2.org/articles/node_lifecycle.html): configure opens the memory and
-    offers services, activate takes readings, deactivate ends a touch under way, cleanup closes the memory. It brings
-    itself up to active, unless `autostart` is False or a manager configures it while the memory opens, and hears the
-    topic before the memory is open: what comes meanwhile waits.
-
-    A callback under way is finished first; a second ctrl-C interrupts it.
+    The node has a lifecycle: configure opens the memory and offers services, activate takes readings, deactivate ends a
+    touch under way, cleanup closes the memory. It brings itself up to active, unless `autostart` is False or a manager
+    configures it while the memory opens, and hears the topic before the memory is open: what comes meanwhile waits.
+    At ctrl-C a callback under way is finished first; a second ctrl-C interrupts it.
 
     Raises what `TactileNode` and `TactileLearner.open` raise, FieldError for a field that the first message does not
     have, and InputError for parameters that there are not or that cannot be, and for arguments that ROS refuses.

@@ -22,7 +22,7 @@ from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.clients.ros2 import Listener, TactileNode
-from scroll_tactile.clients.ros2.interfaces import interface, require_rclpy
+from scroll_tactile.clients.ros2.inputs import interface, require_rclpy
 from scroll_tactile.errors import InputError
 from scroll_tactile.simulation.scene import Scene
 

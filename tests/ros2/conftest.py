@@ -22,6 +22,14 @@ def memory(tmp_path_factory):
     return taught(tmp_path_factory.mktemp("ros2") / "memory", PAD, SMALL)
 
 
+@pytest.fixture
+def own(memory, tmp_path):
+    """The folder of a copy of the memory."""
+    with TactileLearner.open(memory, mode="read") as source:
+        source.backup(tmp_path / "own")
+    return tmp_path / "own"
+
+
 @pytest.fixture(scope="module")
 def learner(memory, tmp_path_factory):
     folder = tmp_path_factory.mktemp("learning") / "own"
@@ -45,8 +53,8 @@ def spinning(alone):
     executor = SingleThreadedExecutor(context=context)
 
     class Nodes:
-        def node(self, name):
-            made = rclpy.create_node(name, context=context)
+        def node(self, name, make=rclpy.create_node):
+            made = make(name, context=context)
             executor.add_node(made)
             return made
 

@@ -17,6 +17,7 @@ from scroll_tactile import TactileLearner
 
 TOPIC = "/finger/tactile"
 ROBOT = Path(__file__)
+EXAMPLES = ROBOT.parents[2] / "examples"
 
 
 @dataclass

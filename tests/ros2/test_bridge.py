@@ -22,6 +22,12 @@ from scroll_tactile.signals.correction import Correction
 ROWS, PLACES = shift("ab")
 
 
+@pytest.fixture
+def own(tmp_path):
+    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as opened:
+        yield opened
+
+
 def bridge(field="values", source=None, **how):
     answers, warnings = [], []
     made = Bridge(source or learner(), field, answer=answers.append, warn=warnings.append, **how)
@@ -101,9 +107,10 @@ def test_a_full_disk_keeps_a_watched_sensor_from_being_noted_and_nothing_else(tm
         assert len(warnings) == 1 and "health of the sensor" in warnings[0] and "no space left" in warnings[0]
 
 
-def test_the_first_message_without_the_field_says_what_there_is():
-    made, _, _ = bridge("value")
-    with pytest.raises(errors.FieldError, match="nearest is 'values'"):
+@pytest.mark.parametrize(("field", "said"), [("value", "nearest is 'values'"), ("header", "leads to a message")])
+def test_the_first_message_without_the_field_says_what_there_is(field, said):
+    made, _, _ = bridge(field)
+    with pytest.raises(errors.FieldError, match=said):
         made.receive(stamped(ROWS[0], 1.0), 1.0)
 
 
@@ -123,12 +130,6 @@ def test_messages_without_a_reading_are_left_out_and_said_once(values):
         made.receive(stamped(values, 1000 + i / 50), i / 50)
     assert made.report.refused == len(ROWS) and len(warnings) == 1
     assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
-
-
-def test_text_is_no_reading():
-    made, _, _ = bridge("header")
-    with pytest.raises(errors.FieldError, match="leads to a message"):
-        made.receive(stamped(ROWS[0], 1.0), 1.0)
 
 
 def test_without_a_stamp_the_time_of_publishing_counts():
@@ -162,53 +163,50 @@ def test_time_that_goes_back_ends_a_touch():
     assert made.status()["steps_back"] == 1
 
 
-def test_a_touch_is_learned_once_and_forgotten(tmp_path):
-    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as own:
-        made, _, _ = bridge(source=own)
-        with pytest.raises(errors.InputError, match="none has ended"):
-            made.learn("felt")
-        run(made)
-        assert made.learn("felt").startswith("felt: ")
-        assert own.materials["felt"] == 1
-        assert "learned already, as observation" in made.learn("felt") and own.materials["felt"] == 1
-        again, _, _ = bridge(source=own)  # as after a restart
-        run(again)
-        assert "learned already" in again.learn("felt") and again.learned is None
-        assert again.receipt == made.receipt == made.learned is not None
-        with pytest.raises(errors.InputError, match="already, as 'felt' and not as 'denim': relabel one of them"):
-            made.learn("denim")
-        assert made.forget("felt") == "felt: 1 observation forgotten"
-        with pytest.raises(errors.UnknownMaterialError):
-            made.forget("felt")
-        with pytest.raises(errors.InputError, match="manual"):
-            made.begin()
+def test_a_touch_is_learned_once_and_forgotten(own):
+    made, _, _ = bridge(source=own)
+    with pytest.raises(errors.InputError, match="none has ended"):
+        made.learn("felt")
+    run(made)
+    assert made.learn("felt").startswith("felt: ")
+    assert own.materials["felt"] == 1
+    assert "learned already, as observation" in made.learn("felt") and own.materials["felt"] == 1
+    again, _, _ = bridge(source=own)  # as after a restart
+    run(again)
+    assert "learned already" in again.learn("felt") and again.learned is None
+    assert again.receipt == made.receipt == made.learned is not None
+    with pytest.raises(errors.InputError, match="already, as 'felt' and not as 'denim': relabel one of them"):
+        made.learn("denim")
+    assert made.forget("felt") == "felt: 1 observation forgotten"
+    with pytest.raises(errors.UnknownMaterialError):
+        made.forget("felt")
+    with pytest.raises(errors.InputError, match="manual"):
+        made.begin()
 
 
-def test_what_was_learned_last_is_taken_back_first_and_once(tmp_path):
-    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as own:
-        made, _, _ = bridge(source=own)
-        for start, name in ((1000.0, "felt"), (2000.0, "cork"), (3000.0, "silk")):
-            run(made, ROWS + 0.001 * start / 1000, start=start)
-            made.learn(name)
-        made.retract(str(made.learned.sequence))
-        assert made.undo().startswith("cork: ") and made.undo().startswith("felt: ")
-        with pytest.raises(errors.InputError, match="there is none"):
-            made.undo()
-        assert set(own.materials) == {*"abc"}
+def test_what_was_learned_last_is_taken_back_first_and_once(own):
+    made, _, _ = bridge(source=own)
+    for start, name in ((1000.0, "felt"), (2000.0, "cork"), (3000.0, "silk")):
+        run(made, ROWS + 0.001 * start / 1000, start=start)
+        made.learn(name)
+    made.retract(str(made.learned.sequence))
+    assert made.undo().startswith("cork: ") and made.undo().startswith("felt: ")
+    with pytest.raises(errors.InputError, match="there is none"):
+        made.undo()
+    assert set(own.materials) == {*"abc"}
 
 
-def test_paused_a_touch_can_be_learned_and_resumed_it_answers_as_it_was_adjusted(tmp_path):
-    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as own:
-        made, answers, _ = bridge(source=own)
-        run(made, ROWS[: PLACES[0][1] - 5])
-        made.pause()
-        assert answers[-1]["event"] == "paused" and not answers[-1]["contact"]
-        made.adjust(risk=0.05, scene=["b", "c"])
-        made.resume()
-        assert made.learn("felt").startswith("felt: ")
-        answers.clear()
-        run(made, start=2000.0)
-        assert {name for answer in answers for name, _ in answer.get("ranking", ())} == {"b", "c"}
+def test_paused_a_touch_can_be_learned_and_resumed_it_answers_as_it_was_adjusted(own):
+    made, answers, _ = bridge(source=own)
+    run(made, ROWS[: PLACES[0][1] - 5])
+    made.pause()
+    assert answers[-1]["event"] == "paused" and not answers[-1]["contact"]
+    made.adjust(risk=0.05, scene=["b", "c"])
+    made.resume()
+    assert made.learn("felt").startswith("felt: ")
+    answers.clear()
+    run(made, start=2000.0)
+    assert {name for answer in answers for name, _ in answer.get("ranking", ())} == {"b", "c"}
 
 
 def test_touches_that_somebody_else_begins_and_ends():
@@ -284,12 +282,6 @@ def test_answers_are_by_an_axis_of_labels_where_one_is_named():
     assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["north", "south"]
     with pytest.raises(errors.AnnotationError, match="expected an axis that touches have labels on"):
         bridge(source=source, of="way")
-
-
-@pytest.fixture
-def own(tmp_path):
-    with TactileLearner.open(taught(tmp_path / "memory", PAD, SMALL)) as learner:
-        yield learner
 
 
 def learned(made, names):

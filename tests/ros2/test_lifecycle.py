@@ -3,18 +3,20 @@
 import json
 import signal
 import subprocess
+import sys
 import threading
-from pathlib import Path
 
-import launching
 import pytest
-from robot import TOPIC, command, ended_by_ctrl_c, publishing
+from commands import refused
+from launching import launched
+from readme import command_lines
+from robot import EXAMPLES, TOPIC, command, ended_by_ctrl_c, publishing
 from scroll_tactile_store import DamageError
 
 from scroll_tactile import TactileLearner, errors
-from scroll_tactile.clients.ros2.fingers import Finger, fingers_of, new_sensor
-from scroll_tactile.clients.ros2.parameters import DYNAMIC, refused, texts
-from scroll_tactile.clients.ros2.serving import _node, _Served, _start, serve
+from scroll_tactile.clients.ros2.inputs import interface, names_in, require_rclpy
+from scroll_tactile.clients.ros2.node import TactileNode
+from scroll_tactile.clients.ros2.serving import _new_sensor, _node, _place, _start, serve
 from scroll_tactile.recordings import PRESETS
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
@@ -27,23 +29,17 @@ from std_msgs.msg import String  # noqa: E402
 # Of the parser that rosidl imports with the first message.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 
-EXAMPLES = Path(__file__).parents[2] / "examples" / "ros2"
-PLAIN = "import sys; sys.modules['rclpy.lifecycle'] = None; from scroll_tactile.clients.cli import main; main()"
-
 
 class Remote:
-    """A node in another process, from a node here."""
+    """A node in another process, from a node here, which hears its answers."""
 
     def __init__(self, nodes, name="/scroll_tactile"):
         self.nodes, self.name = nodes, name
         self.node = nodes.node("operator")
         self.answers = []
-
-    def listen(self, place="answer"):
-        def take(text):
-            self.answers.append(json.loads(text.data))
-
-        self.node.create_subscription(String, f"{self.name}/{place}", take, 50)
+        self.node.create_subscription(
+            String, f"{name}/answer", lambda text: self.answers.append(json.loads(text.data)), 50
+        )
 
     def ask(self, kind, name, **request):
         return self.nodes.ask(self.node, kind, f"{self.name}/{name}", **request)
@@ -65,14 +61,7 @@ class Remote:
         return "" if result.successful else result.reason or "no reason"
 
     def ended(self):
-        return [answer for answer in self.answers if answer["event"] == "ended"]
-
-
-@pytest.fixture
-def own(memory, tmp_path):
-    with TactileLearner.open(memory, mode="read") as source:
-        source.backup(tmp_path / "own")
-    return tmp_path / "own"
+        return [answer["material"] for answer in self.answers if answer["event"] == "ended"]
 
 
 def node_command(memory, *words, **more):
@@ -83,7 +72,6 @@ def node_command(memory, *words, **more):
 def test_a_manager_takes_the_node_through_its_states_and_parameters_are_checked(spinning, own):
     with node_command(own, "--ros-args", "-p", "autostart:=false", "-p", "field:=effort") as process:
         remote = Remote(spinning)
-        remote.listen()
         assert remote.state() == "unconfigured"
         names = remote.ask(ListParameters, "list_parameters").result.names
         described = remote.ask(DescribeParameters, "describe_parameters", names=names).descriptors
@@ -94,7 +82,7 @@ def test_a_manager_takes_the_node_through_its_states_and_parameters_are_checked(
         assert "auto or manual" in remote.set("contact", "often") and not remote.set("contact", "auto")
         assert not remote.set("memory", str(own / "none"))
         assert not remote.go("configure") and remote.state() == "unconfigured"
-        assert not remote.set("memory", str(own)) and not remote.set("field", ["position"])
+        assert not remote.set("memory", str(own)) and not remote.set("field", "position")
         assert remote.go("configure") and remote.state() == "inactive"
         assert "deactivate and cleanup first" in remote.set("field", "velocity")
         assert remote.set("risk", 1.5) and remote.set("risk", 1.0) and not remote.set("risk", 0.02)
@@ -123,7 +111,6 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
 ):
     """The publisher begins as soon as somebody listens; the node is killed within a touch, and started again."""
     remote = Remote(spinning)
-    remote.listen()
     with publishing(500, 250) as publisher, node_command(own) as process:
         spinning.silent_after(publisher)
         reply = remote.call("learn", "felt")
@@ -152,30 +139,6 @@ def test_readings_that_come_while_the_memory_opens_are_all_taken_and_what_was_ac
         assert kept.digest() != digest and kept.materials == {"a": 6, "b": 6, "c": 6}
 
 
-def test_every_reading_since_the_topic_was_heard_is_counted(spinning, own):
-    with publishing(500, 250) as publisher, node_command(own) as process:
-        spinning.silent_after(publisher)
-        output = ended_by_ctrl_c(process)
-    assert "messages: 500" in output and "dropped" not in output
-
-
-def test_a_client_without_lifecycle_makes_a_plain_node(spinning, own):
-    words = ("ros2", "--memory", own, "--topic", TOPIC, "--field", "position", "--ros-args", "-r", "__node:=plain")
-    with command("-c", PLAIN, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        remote = Remote(spinning, "/plain")
-        assert json.loads(remote.call("materials").message) == {"a": 6, "b": 6, "c": 6}
-        assert "read when the node starts: end it" in remote.set("topic", "/other")
-        assert f"{remote.name}/get_state" not in dict(remote.node.get_service_names_and_types())
-        process.send_signal(signal.SIGINT)
-        _, logged = process.communicate(timeout=60)
-    assert process.returncode == 0 and "no lifecycle here" in logged
-
-
-def served_by(node, memory, **values):
-    named = {"memory": str(memory), "topic": TOPIC, "field": "position", "type": "sensor_msgs/msg/JointState"}
-    return _Served(node, None, named | values, managed=True)
-
-
 @pytest.fixture
 def opening(own, monkeypatch):
     """Has memories open only when the event is set; what was opened."""
@@ -192,9 +155,25 @@ def opening(own, monkeypatch):
     TactileLearner.open(own).close()  # it was let go
 
 
-def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(spinning, own, opening):
-    node, (go, paths) = spinning.node("scroll_tactile"), opening
-    served = served_by(node, own)
+@pytest.fixture
+def prepared(spinning, own):
+    """Makes a lifecycle node here, with these values of parameters; it is cleaned up at the end."""
+    made = []
+
+    def node(**values):
+        node = spinning.node("scroll_tactile", _node)
+        given = {"memory": str(own), "topic": TOPIC, "field": "position", "type": "sensor_msgs/msg/JointState"}
+        node.prepare(None, given | values)
+        made.append(node)
+        return node
+
+    yield node
+    for each in made:
+        each.clean_up()
+
+
+def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, prepared, opening):
+    node, (go, paths) = prepared(), opening
 
     def running():
         """What else the node is asked meanwhile."""
@@ -202,49 +181,47 @@ def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(spinning,
             [refused] = node.set_parameters([rclpy.Parameter("memory", value="other")])
             assert not refused.successful and "deactivate and cleanup first" in refused.reason
             go.set()
-            assert served.tried(served.configure), served.error
+            assert node.trigger_configure() and node.error is None
         return True
 
-    _start(served, running)
-    assert paths == [own] and len(served.fingers) == 1 and not served.fingers[0].active
-    served.clean_up()
+    _start(node, running)
+    assert paths == [own] and not node.finger.active
+    node.clean_up()
 
 
-def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(spinning, own, opening):
-    served = served_by(spinning.node("scroll_tactile"), own)
-    _start(served, lambda: False)
+def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(prepared, opening):
+    node = prepared()
+    _start(node, lambda: False)
     opening[0].set()
-    served.clean_up()
-    assert served.met["materials"] == 3 and not served.fingers
+    node.clean_up()
+    assert node.met["materials"] == 3 and node.finger is None
 
 
-def test_whatever_hinders_a_transition_ends_the_start(spinning, own, monkeypatch):
+@pytest.mark.parametrize("step", ["__init__", "activate"])
+def test_whatever_hinders_a_transition_ends_the_start(step, prepared, monkeypatch):
     """rclpy makes a result of an exception, without a word."""
-    from rclpy.lifecycle import TransitionCallbackReturn
+    node, logged = prepared(), []
 
-    context, logged = spinning.node("operator").context, []
-
-    def fail(self):
+    def fail(self, *_, **__):
         raise ZeroDivisionError("of all things")
 
-    for step in ("configure", "activate"):
-        node, _ = _node(rclpy, context)
-        node.served = served_by(node, own)
-        monkeypatch.setattr(node.get_logger(), "error", logged.append)
-        with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-            patched.setattr(_Served, step, fail)
-            _start(node.served, lambda: True)
-        assert "of all things" in logged[-1] and "Traceback" in logged[-1]
-        node.served.clean_up()
-    node, _ = _node(rclpy, context)
-    node.served = served_by(node, own)
+    monkeypatch.setattr(node.get_logger(), "error", logged.append)
+    with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
+        patched.setattr(TactileNode, step, fail)
+        _start(node, lambda: True)
+    assert "of all things" in logged[0] and "Traceback" in logged[0]
+
+
+def test_a_transition_that_ros_refuses_ends_the_start(prepared, monkeypatch):
+    from rclpy.lifecycle import TransitionCallbackReturn
+
+    node = prepared()
     monkeypatch.setattr(node, "trigger_activate", lambda: TransitionCallbackReturn.ERROR)
     with pytest.raises(errors.ScrollTactileError, match="did not activate the node"):
-        _start(node.served, lambda: True)
-    node.served.clean_up()
+        _start(node, lambda: True)
 
 
-def test_a_damaged_row_is_no_reason_not_to_start(spinning, own, monkeypatch):
+def test_a_damaged_row_is_no_reason_not_to_start(prepared, monkeypatch):
     asked = []
 
     def health(self, *, after=0):
@@ -252,10 +229,73 @@ def test_a_damaged_row_is_no_reason_not_to_start(spinning, own, monkeypatch):
         raise DamageError("row 7 is damaged", path=self.path)
 
     monkeypatch.setattr(TactileLearner, "health", health)
-    served = served_by(spinning.node("scroll_tactile"), own, health_after=5)
-    served.configure()
-    assert len(served.fingers) == 1 and set(asked) == {5}
-    served.clean_up()
+    node = prepared(health_after=5)
+    node.configure()
+    assert node.finger is not None and set(asked) == {5}
+
+
+@pytest.mark.parametrize("name", ["finger", "hand"])
+def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeypatch):
+    """Of the hand's five nodes one runs; there is no wheel of the message that its file names."""
+    given = {"memory": str(own), "field": "position"} if name == "finger" else {"memories": str(tmp_path)}
+    file = EXAMPLES / "ros2" / "launch" / f"{name}.launch.py"
+    nodes = launched(monkeypatch, file, tmp_path, topic=TOPIC, namespace="/left", **given)
+    words, place = nodes[-1], "/left/scroll_tactile"
+    if name == "hand":
+        files = [(tmp_path / f"launch_{i}_1.yaml").read_text() for i in range(5)]
+        for i, finger in enumerate(("thumb", "index", "middle", "ring", "little")):
+            assert f"__ns:=/left/{finger}" in nodes[i] and f"tactiles[{i}].electrodes" in files[i]
+            assert json.dumps(str(tmp_path / finger)) in files[i]
+        own.rename(tmp_path / "little")
+        (tmp_path / "launch_4_1.yaml").write_text(files[4].replace("tactiles[4].electrodes", "position"))
+        place = "/left/little/scroll_tactile"
+    assert words[0] == "scroll-tactile"
+    with command("-m", "scroll_tactile.clients.cli", *words[1:], stdout=subprocess.PIPE) as process:
+        remote = Remote(spinning, place)
+        spinning.until(lambda: remote.state() == "active", 300)  # it brings itself up
+        with publishing(500, 250):
+            spinning.until(lambda: len(remote.ended()) == 2, 300)
+        assert remote.ended() == ["a", "b"] and remote.call("learn", "felt").success
+        ended_by_ctrl_c(process)
+
+
+def test_the_command_from_start_to_ctrl_c(spinning, own):
+    """Every reading since the topic was heard counts, a second node is refused, and what was learned is there."""
+    remote, named = Remote(spinning, "/left/scroll_tactile"), ("--ros-args", "-r", "__ns:=/left")
+    with publishing(500, 250) as publisher, node_command(own, *named) as process:
+        spinning.silent_after(publisher)
+        assert f"is being written by process {process.pid}" in refused(
+            "ros2", "--memory", own, "--topic", TOPIC, "--field", "position"
+        )
+        assert len(remote.ended()) == 2 and remote.call("learn", "felt").success
+        output = ended_by_ctrl_c(process)
+    assert "4 materials" in output and "messages: 500" in output and "dropped" not in output
+    with TactileLearner.open(own, mode="read") as kept:
+        assert kept.materials["felt"] == 1
+
+
+def test_readmes_line_runs_as_it_stands(spinning, tmp_path):
+    TactileLearner.open(tmp_path / "memory", sensor=PRESETS["biotac"].sensor).close()
+    words = next(words for words in command_lines() if words[1] == "ros2")
+    with command("-m", "scroll_tactile.clients.cli", *words[1:], cwd=tmp_path, stdout=subprocess.PIPE) as process:
+        assert Remote(spinning).call("materials").success
+        assert "memory: 0 materials" in ended_by_ctrl_c(process)
+
+
+def test_the_example_acts_on_what_it_feels(own):
+    with command(EXAMPLES / "ros2_node.py", own, TOPIC, "position", stderr=subprocess.PIPE) as process:
+        with publishing(360, 250):
+            said = [next(text for text in process.stderr if f"{name} after" in text) for name in "ab"]
+        ended_by_ctrl_c(process)
+    assert len(said) == 2
+
+
+def test_where_readings_are_and_whose_they_are(memory, tmp_path):
+    assert _place("/t", "a", "biotac") == ("/t", "a")
+    assert _place("", "", "biotac") == ("/rh/tactile", "tactiles[0].electrodes")
+    assert _new_sensor(str(memory), "", "biotac") is None  # a preset may give topic and field alone
+    assert _new_sensor(str(tmp_path / "none"), "", "biotac") == PRESETS["biotac"].sensor
+    assert names_in([" a", "", "  ", "b, c"]) == ["a", "b", "c"] and names_in(" ") == []
 
 
 def test_a_parameter_that_there_is_not_is_named_with_the_nearest(own):
@@ -263,60 +303,44 @@ def test_a_parameter_that_there_is_not_is_named_with_the_nearest(own):
         serve(own, TOPIC, "position", rsk=0.01)
 
 
-@pytest.mark.parametrize("name", ["finger", "hand"])
-def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeypatch):
-    launching.doubles(monkeypatch)
-    given = {"topic": TOPIC, "field": "position"} if name == "finger" else {}
-    if name == "hand":  # there is no wheel of the message that its file names
-        text = (EXAMPLES / "params" / "hand.yaml").read_text()
-        text = text.replace("sr_robot_msgs/msg/BiotacAll", "sensor_msgs/msg/JointState")
-        for i, field in enumerate(("position", "velocity", "effort")):
-            text = text.replace(f"tactiles[{i}].electrodes", field)
-        (tmp_path / "hand.yaml").write_text(text.replace("/rh/tactile", TOPIC))
-        given = {"params": str(tmp_path / "hand.yaml")}
-    file = EXAMPLES / "launch" / f"{name}.launch.py"
-    words, transitions = launching.launched(file, tmp_path, memory=str(own), namespace="/left", **given)
-    assert words.pop(0) == "scroll-tactile"
-    with command("-m", "scroll_tactile.clients.cli", *words, stdout=subprocess.PIPE) as process:
-        remote = Remote(spinning, "/left/scroll_tactile")
-        if transitions:
-            assert remote.state() == "unconfigured"
-        for transition in transitions:
-            assert remote.ask(ChangeState, "change_state", transition=Transition(id=transition)).success
-        spinning.until(lambda: remote.state() == "active", 300)  # it brings itself up
-        place = "" if name == "finger" else "thumb/"
-        remote.listen(f"{place}answer")
-        with publishing(500, 250):
-            spinning.until(lambda: len(remote.ended()) == 2, 300)
-        assert [answer["material"] for answer in remote.ended()] == ["a", "b"]
-        assert remote.call(f"{place}learn", "felt").success
-        if name == "hand":
-            assert remote.call("index/materials").success and "felt" in remote.call("index/materials").message
-        ended_by_ctrl_c(process)
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--topic /t", "expected --field"),
+        ("--field data", "expected --topic"),
+        ("--preset anyskin", "leaves the topic to the robot"),
+        ("--preset biotak", "nearest is 'biotac'"),
+        ("--topic /t --field data[", "expected"),
+        ("--topic /t --field data", "to make one, say which sensor"),
+        ("--topic /t --field data --contact often", "contact as auto or manual"),
+        ("--topic /t --field data --topics /u", "no option '--topics'"),
+        ("--topic /t --field data --sensor nose", "expected a sensor"),
+        ("--topic /t --field data --risk 1.0", "between 0 and 1"),
+        ("--topic /t --field data --ros-args -p risk:=x", "parameter risk"),
+    ],
+    ids=str,
+)
+def test_wrong_options(words, said, tmp_path):
+    assert said in refused("ros2", "--memory", tmp_path / "none", *words.split())
+    assert not (tmp_path / "none").exists()
 
 
-def test_a_memory_that_is_there_has_its_sensor_and_parameters_are_what_they_can_be(memory, tmp_path):
-    assert new_sensor(memory, "", "biotac") is None  # a preset may give topic and field alone
-    assert new_sensor(tmp_path / "none", "", "biotac") == PRESETS["biotac"].sensor
-    with pytest.raises(errors.InputError, match="say which sensor"):
-        new_sensor(tmp_path / "none", "", "")
-    assert texts([" a", "", "  ", "b "]) == ["a", "b"] and texts(" ") == []
-    risk = next(each for each in DYNAMIC if each.name == "risk")
-    assert [bool(refused(risk, value)) for value in (0.0, 0.05, 1.0, True, "x")] == [True, False, True, True, True]
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("sr_robot_msgs/msg/BiotacAll", errors.MissingLibraryError, "apt install ros-jazzy-sr-robot-msgs"),
+        ("std_msgs/msg/Strin", errors.FieldError, "nearest is 'String'"),
+        *((name, errors.InputError, "package/msg/Name") for name in ("BiotacAll", "a/b/C", "a/msg/", "os;x/msg/C", "")),
+    ],
+)
+def test_a_type_that_cannot_be_had(name, error, said, monkeypatch):
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    with pytest.raises(error, match=said):
+        interface(name)
 
 
-def test_fingers_by_topics_fields_and_names():
-    assert fingers_of(["/t"], ["a"], [], "") == [Finger("", "/t", "a")]
-    assert fingers_of([], [], [], "biotac") == [Finger("", "/rh/tactile", "tactiles[0].electrodes")]
-    assert fingers_of(["/t"], ["a", "b"], [], "") == [Finger("finger0", "/t", "a"), Finger("finger1", "/t", "b")]
-    assert fingers_of(["/t", "/u"], ["a"], ["l", "r"], "") == [Finger("l", "/t", "a"), Finger("r", "/u", "a")]
-    for wrong, said in (
-        ((["/t"], [], []), "expected field="),
-        ((["/t", "/u"], ["a", "b", "c"], []), "for each of 3 fingers"),
-        ((["/t"], ["a", "b"], ["l"]), "for each of 2 fingers"),
-        ((["/t"], ["a", "b"], ["l", "l"]), "each once"),
-        ((["/t"], ["a"], ["left/hand"]), "letters, digits"),
-        ((["/t"], ["a["], []), "expected"),
-    ):
-        with pytest.raises(errors.InputError, match=said):
-            fingers_of(*wrong, "")
+def test_without_rclpy(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(errors.MissingLibraryError, match=r"setup\.bash"):
+        require_rclpy()
+    assert "rclpy" in refused("ros2", "--memory", tmp_path / "none", "--topic", "/t", "--field", "data")

@@ -1,29 +1,27 @@
 """The node over a real ROS 2: Fast DDS on this machine, publishers in other processes."""
 
 import json
-import subprocess
+import re
 
-import numpy as np
 import pytest
-from commands import refused
 from live_touches import shift
-from readme import command_lines
-from robot import ROBOT, TOPIC, command, ended_by_ctrl_c, publishing
+from robot import TOPIC, publishing
 from touches import PAD
 
 from scroll_tactile import Health, TactileLearner, errors
-from scroll_tactile.recordings import PRESETS, read
+from scroll_tactile.clients.ros2 import Listener, Quality, TactileNode, inputs
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
-from diagnostic_msgs.srv import AddDiagnostics  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float32MultiArray, String  # noqa: E402
 
-from scroll_tactile.clients.ros2 import TactileNode  # noqa: E402
-
 # Of the parser that rosidl imports with the first message.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+
+
+KIND = "sensor_msgs/msg/JointState"
 
 
 def feed(node, rows, start=0.0):
@@ -53,8 +51,7 @@ def test_every_reading_of_a_burst_arrives_and_is_answered(spinning, learner):
 
 def test_a_touch_between_the_services_begin_and_end(spinning, learner):
     node = spinning.node("scroll_tactile")
-    kind = "sensor_msgs/msg/JointState"
-    served = TactileNode(node, learner, TOPIC, "position", kind=kind, contact="manual")
+    served = TactileNode(node, learner, TOPIC, "position", kind=KIND, contact="manual")
     rows, [place] = shift("b")
     assert spinning.call(node, "/scroll_tactile/begin").success
     feed(served, rows[slice(*place)])
@@ -63,24 +60,31 @@ def test_a_touch_between_the_services_begin_and_end(spinning, learner):
     assert spinning.call(node, "/scroll_tactile/again").success
 
 
-def test_who_comes_late_is_told_the_last_answer_field_by_field_and_what_was_learned_is_taken_back(spinning, learner):
+def test_who_comes_late_is_told_the_last_answer_in_each_form_and_what_was_learned_is_taken_back(spinning, learner):
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from std_msgs.msg import Bool, Float64
 
     node = spinning.node("scroll_tactile")
     answers = []
-    kind = "sensor_msgs/msg/JointState"
-    served = TactileNode(node, learner, TOPIC, "position", kind=kind, answered=answers.append)
+    served = TactileNode(node, learner, TOPIC, "position", kind=KIND, answered=answers.append)
     feed(served, shift("b", seed=8)[0])
     late, told = spinning.node("late"), {}
     profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for name, of in {"answer": String, "material": String, "probability": Float64, "known": Bool}.items():
+    kinds = {"answer": String, "material": String, "probability": Float64, "known": Bool, "status": DiagnosticArray}
+    for name, of in kinds.items():
         place = f"/scroll_tactile/{name}"
-        late.create_subscription(of, place, lambda got, name=name: told.update({name: got.data}), profile)
-    spinning.until(lambda: len(told) == 4)
+        late.create_subscription(of, place, lambda got, name=name: told.update({name: got}), profile)
+    spinning.until(lambda: len(told) == 5 and '"ended"' in told["answer"].data)
     last = answers[-1]
-    assert told["material"] == last["material"] and told["probability"] == last["probability"]
-    assert told["known"] is bool(last["known"]) and json.loads(told["answer"]) == json.loads(json.dumps(last))
+    assert told["material"].data == last["material"] and told["probability"].data == last["probability"]
+    assert told["known"].data is bool(last["known"])
+    assert json.loads(told["answer"].data) == json.loads(json.dumps(last))
+    spinning.until(lambda: told["status"].status[0].values[0].value == "ended")
+    stamp, [state] = told["status"].header.stamp, told["status"].status
+    assert stamp.sec + stamp.nanosec / 1e9 == pytest.approx(last["stamp"], abs=1e-6)
+    assert (state.name, state.message, state.hardware_id) == ("scroll_tactile", "b", "pad")
+    assert {pair.key: pair.value for pair in state.values}["probability"] == str(last["probability"])
+    assert json.loads(spinning.call(node, "/scroll_tactile/predict").message)["material"] == "b"
     before = learner.digest()
     assert spinning.call(node, "/scroll_tactile/learn", "b").success
     assert learner.digest() != before
@@ -88,14 +92,13 @@ def test_who_comes_late_is_told_the_last_answer_field_by_field_and_what_was_lear
     assert reply.success and "was taken back" in reply.message
     assert learner.digest() == before
     assert not spinning.call(node, "/scroll_tactile/undo").success
+    assert "came none" in spinning.call(node, "/scroll_tactile/learn", " ").message
     assert json.loads(spinning.call(node, "/scroll_tactile/materials").message) == learner.materials
 
 
 def test_diagnostics_say_what_was_met(spinning, learner):
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-
     node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    served = TactileNode(node, learner, TOPIC, "position", kind=KIND)
     heard = []
     spinning.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
     feed(served, shift("a")[0])
@@ -108,8 +111,6 @@ def test_diagnostics_say_what_was_met(spinning, learner):
 
 
 def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spinning, learner, monkeypatch):
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-
     asked = []
 
     def health(self, *, after):
@@ -120,7 +121,7 @@ def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spin
 
     monkeypatch.setattr(TactileLearner, "health", health)
     node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    served = TactileNode(node, learner, TOPIC, "position", kind=KIND)
     heard = []
     spinning.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
     feed(served, shift("a")[0])
@@ -149,125 +150,93 @@ def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning,
 
 
 def test_messages_that_were_lost_on_their_way_are_counted(spinning, learner):
-    served = TactileNode(spinning.node("scroll_tactile"), learner, TOPIC, "position", kind="sensor_msgs/msg/JointState")
+    served = TactileNode(spinning.node("scroll_tactile"), learner, TOPIC, "position", kind=KIND)
     for publisher, number in ((b"a", 7), (b"a", 8), (b"b", 1), (b"a", 11), (b"b", 2), (b"a", 12)):
         about = {"publication_sequence_number": number, "publisher_gid": {"data": publisher}}
         served.receive(JointState(position=[0.1, 0.1]), about)
     assert served.bridge.report.dropped == 2
 
 
-def test_a_topic_that_never_comes_is_said_with_those_nearest(spinning, learner):
+def test_a_topic_that_never_comes_is_said_with_those_nearest_of_others(spinning, learner):
     node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, "/finger/tactil", "position", kind="sensor_msgs/msg/JointState")
+    served = TactileNode(node, learner, "/finger/tactil", "position", kind=KIND)
     assert "nobody publishes /finger/tactil" in served.listener.absent()
     assert "nearest" not in served.listener.absent()  # what is heard here is a topic, too
-    other = spinning.node("finger")
-    other.create_publisher(JointState, TOPIC, 10)
+    spinning.until(lambda: "/scroll_tactile/known" in dict(node.get_topic_names_and_types()))
+    assert "/scroll_tactile/" not in served.listener.absent()
+    spinning.node("finger").create_publisher(JointState, TOPIC, 10)
     spinning.until(lambda: f"nearest is {TOPIC!r}" in served.listener.absent())
 
 
-def test_fingers_of_a_node_have_one_risk_and_scene_until_the_last_is_closed(spinning, learner):
+def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_cannot_be_read_is_said_once(
+    spinning, monkeypatch
+):
+    monkeypatch.setattr(inputs, "LOOKED", 0.02)
+    node, kinds, warned, looks = spinning.node("hand"), [], [], []
+    monkeypatch.setattr(node, "get_topic_names_and_types", lambda: looks.append(1) or [(TOPIC, kinds)])
+    monkeypatch.setattr(node.get_logger(), "warning", warned.append)
+    listener = Listener(node, TOPIC)
+    listener.received -= 100  # it waited that long
+    for kinds[:] in (["std_msgs/msg/String", KIND], ["sr_robot_msgs/msg/BiotacAll"]):
+        looks.clear()
+        spinning.until(lambda: len(looks) > 3)
+        assert listener.subscription is None
+    warned = [text for text in warned if "it is not heard until then" in text]  # others name the silence
+    assert len(warned) == 2 and "say which" in warned[0] and "sr-robot-msgs" in warned[1]
+    kinds[:] = [KIND]
+    spinning.until(lambda: listener.subscription is not None)
+    assert listener.kind == KIND and listener.subscription.msg_type is JointState
+    spinning.node("finger").create_publisher(JointState, TOPIC, 10)
+    spinning.until(lambda: re.match(f"no reading for . s from the publisher of {TOPIC}", listener.absent()))
+
+
+def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkeypatch):
+    monkeypatch.setattr(inputs, "WAITING", 3)
+    listener, taken = Listener(spinning.node("hand"), TOPIC, KIND), []
+
+    def take(*message):
+        taken.append(message)
+
+    def receive(*numbers):
+        for i in numbers:
+            listener.receive(i, {"source_timestamp": i * 10**9, "publication_sequence_number": i})
+
+    receive(1, 2, 3, 5, 6)  # 4 was lost on its way, 1 and 2 had to make room
+    listener.start(take)
+    receive(7)
+    assert taken == [(3, 3.0, 2), (5, 5.0, 1), (6, 6.0, 0), (7, 7.0, 0)]
+    listener.stop()
+    receive(8)  # nobody hears it
+    listener.start()
+    receive(9)  # it is heard anew, and what comes waits again
+    listener.start(take)
+    assert taken[4:] == [(9, 9.0, 0)]
+
+
+@pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning")  # rclpy's own
+def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
+    from rclpy.qos import qos_profile_sensor_data
+
     node = spinning.node("hand")
-    kind = "sensor_msgs/msg/JointState"
+    with pytest.raises(errors.InputError, match="reliability as best_effort or reliable"):
+        Listener(node, TOPIC, quality=Quality(reliability="perfect"))
+    listener = Listener(node, TOPIC, KIND, Quality(reliability="reliable", depth=7))
+    spinning.node("driver").create_publisher(JointState, TOPIC, qos_profile_sensor_data)
+    spinning.until(lambda: "qos asks for reliability reliable, and less is promised" in listener.absent())
 
-    def finger(name, **how):
-        return TactileNode(node, learner, TOPIC, "position", kind=kind, finger=name, active=False, **how)
 
+def test_a_finger_that_is_taken_off_leaves_its_node_as_it_was(spinning, learner):
+    node = spinning.node("arm")
+
+    def stands():
+        services = {name for name, _ in node.get_service_names_and_types_by_node("arm", "/")}
+        return services, {each.topic_name for each in node.publishers}, set(node._parameters)
+
+    before = stands()
     with pytest.raises(errors.InputError, match="never observed"):
-        finger("thumb", scene=["zinc"])
-    assert not node.has_parameter("scene")
-    fingers = [finger("thumb", risk=0.02, scene=["a", "b"]), finger("index"), finger("ring", risk=0.02, scene=["b, a"])]
-    with pytest.raises(errors.InputError, match=r"risk as 0.02 already.*came risk=0.05: leave it out"):
-        finger("little", risk=0.05)
-    with pytest.raises(errors.InputError, match=r"came scene=\['c'\]"):
-        finger("little", scene=["c"])
-    for each in fingers:
-        assert each.bridge._how["risk"] == 0.02 and sorted(each.bridge._how["scene"]) == ["a", "b"]
-        assert node.get_parameter("risk").value == 0.02
-        each.close()
-    assert not any(map(node.has_parameter, ("risk", "scene", "health_after")))
-    again = finger("thumb", risk=0.1)
-    assert again.bridge._how["risk"] == 0.1
-    again.close()
-
-
-def test_no_topic_of_its_own_is_named_as_the_nearest(spinning, learner):
-    node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, "/rh/tactile", "position", kind="sensor_msgs/msg/JointState")
-    spinning.until(lambda: "/scroll_tactile/known" in dict(node.get_topic_names_and_types()))
-    assert "/scroll_tactile/" not in served.listener.absent()
-
-
-def test_a_topic_that_comes_late_is_silent_from_then_on(spinning, learner):
-    served = TactileNode(spinning.node("scroll_tactile"), learner, "/finger/late", "position")
-    served.listener.received -= 100  # it waited that long
-    spinning.node("finger").create_publisher(JointState, "/finger/late", 10)
-    spinning.until(lambda: served.listener.subscription is not None)
-    assert "no reading for 0 s from the publisher of /finger/late" in served.listener.absent()
-
-
-def test_the_command_from_start_to_ctrl_c(spinning, memory, tmp_path):
-    """A name is learned, ctrl-C ends it in order, a second node is refused, and the memory has it."""
-    with TactileLearner.open(memory, mode="read") as source:
-        source.backup(tmp_path / "own")
-    words = ["ros2", "--memory", tmp_path / "own", "--topic", TOPIC, "--field", "position"]
-    ended = []
-    arm = spinning.node("arm")
-    arm.create_subscription(String, "/left/scroll_tactile/answer", lambda text: ended.append(json.loads(text.data)), 50)
-    named = ("--ros-args", "-r", "__ns:=/left")
-    with command("-m", "scroll_tactile.clients.cli", *words, *named, stdout=subprocess.PIPE) as process:
-        client = arm.create_client(AddDiagnostics, "/left/scroll_tactile/learn")
-        spinning.until(client.service_is_ready, 60)
-        assert f"is being written by process {process.pid}" in refused(*words)
-        with publishing(500, 250) as publisher:
-            spinning.silent_after(publisher)
-        assert sum(answer["event"] == "ended" for answer in ended) == 2
-        assert spinning.call(arm, "/left/scroll_tactile/learn", "felt").success
-        output = ended_by_ctrl_c(process)
-    assert "4 materials" in output and "readings: 500" in output
-    with TactileLearner.open(tmp_path / "own", mode="read") as kept:
-        assert kept.materials["felt"] == 1
-
-
-def test_readmes_line_runs_as_it_stands(spinning, tmp_path):
-    TactileLearner.open(tmp_path / "memory", sensor=PRESETS["biotac"].sensor).close()
-    words = next(words for words in command_lines() if words[1] == "ros2")
-    with command("-m", "scroll_tactile.clients.cli", *words[1:], cwd=tmp_path, stdout=subprocess.PIPE) as process:
-        client = spinning.node("arm").create_client(AddDiagnostics, "/scroll_tactile/learn")
-        spinning.until(client.service_is_ready, 60)
-        assert "memory: 0 materials" in ended_by_ctrl_c(process)
-
-
-def test_the_example_acts_on_what_it_feels(memory, tmp_path):
-    with TactileLearner.open(memory, mode="read") as source:
-        source.backup(tmp_path / "own")
-    script = ROBOT.parents[2] / "examples" / "ros2_node.py"
-    with command(script, tmp_path / "own", TOPIC, "position", stderr=subprocess.PIPE) as process:
-        with publishing(360, 250):
-            said = [next(text for text in process.stderr if f"{name} after" in text) for name in "ab"]
-        ended_by_ctrl_c(process)
-    assert len(said) == 2
-
-
-def test_messages_that_a_node_serialized_are_read_from_a_bag(tmp_path):
-    """Lists of any lengths, empty ones among them; the truth is what was put into the messages."""
-    from rclpy.serialization import serialize_message
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    random = np.random.default_rng(4)
-    store, kind = get_typestore(Stores.ROS2_HUMBLE), "sensor_msgs/msg/JointState"
-    truth = []
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/joints", kind, typestore=store)
-        for i in range(60):
-            names = ["x" * length for length in random.integers(0, 9, random.integers(0, 4)).tolist()]
-            lists = [random.standard_normal(count).tolist() for count in (2, *random.integers(0, 3, 2).tolist())]
-            message = JointState(name=names, position=lists[0], velocity=lists[1], effort=lists[2])
-            message.header.stamp.sec, message.header.frame_id = 100 + i, "f" * (i % 9)
-            writer.write(connection, 10**9 * i, serialize_message(message))
-            truth.append(lists[0])
-    recording = read(tmp_path / "bag", topic="/joints", field="position")
-    assert recording.readings.tolist() == truth
-    assert recording.times.tolist() == [100.0 + i for i in range(60)]
-    assert not recording.report.notes
+        TactileNode(node, learner, TOPIC, "position", kind=KIND, scene=["zinc"], active=False)
+    assert stands() == before
+    served = TactileNode(node, learner, TOPIC, "position", kind=KIND, risk=0.02, scene=["a", "b"], active=False)
+    assert node.get_parameter("risk").value == 0.02 and stands() != before
+    served.close()
+    spinning.until(lambda: stands() == before)

@@ -1,52 +1,45 @@
-"""A hand of several fingers, managed from outside: ros2 launch hand.launch.py memory:=/home/robot/memory
+"""Five fingers, a node for each: ros2 launch hand.launch.py memories:=/home/robot/memories namespace:=/left
 
-params/hand.yaml names the fingers and leaves the node unconfigured; here the launch system configures it as soon as it
-runs, and activates it once it is configured. A lifecycle manager of one's own, or `ros2 lifecycle set /scroll_tactile
-configure`, does so as well.
+Each finger has a namespace and a memory of its own: /left/thumb/scroll_tactile/answer is what the thumb feels, and
+/home/robot/memories/thumb is what it has learned. All read one topic, whose messages have an entry for each finger.
 """
 
 from pathlib import Path
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
-from launch.events import matches_action
+from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import LifecycleNode
-from launch_ros.event_handlers import OnStateTransition
-from launch_ros.events.lifecycle import ChangeState
-from lifecycle_msgs.msg import Transition
+from launch_ros.actions import Node
 
-PARAMETERS = Path(__file__).resolve().parents[1] / "params" / "hand.yaml"
+PARAMETERS = Path(__file__).resolve().parents[1] / "params" / "finger.yaml"
+FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 def generate_launch_description() -> LaunchDescription:
     """What ros2 launch asks for."""
-    node = LifecycleNode(
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("memories", description="The folder with a memory for each finger."),
+            DeclareLaunchArgument("topic", default_value="/rh/tactile", description="Where the readings are sent."),
+            DeclareLaunchArgument("namespace", default_value="", description="Of the hand."),
+            DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="A file of parameters."),
+            *(_node(finger, f"tactiles[{i}].electrodes") for i, finger in enumerate(FINGERS)),
+        ]
+    )
+
+
+def _node(finger: str, field: str) -> Node:
+    given = {
+        "memory": [LaunchConfiguration("memories"), f"/{finger}"],
+        "topic": LaunchConfiguration("topic"),
+        "field": field,
+        "preset": "biotac",  # the sensor of a memory that is not there yet
+    }
+    return Node(
         executable="scroll-tactile",
         arguments=["ros2"],
         name="scroll_tactile",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params"), {"memory": LaunchConfiguration("memory")}],
+        namespace=[LaunchConfiguration("namespace"), f"/{finger}"],
+        parameters=[LaunchConfiguration("params"), given],
         output="screen",
-    )
-
-    def change(transition: int) -> EmitEvent:
-        return EmitEvent(event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=transition))
-
-    return LaunchDescription(
-        [
-            DeclareLaunchArgument("memory", description="The folder of the memory."),
-            DeclareLaunchArgument("namespace", default_value="", description="Of the node."),
-            DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="A file of parameters."),
-            RegisterEventHandler(
-                OnStateTransition(
-                    target_lifecycle_node=node,
-                    start_state="configuring",
-                    goal_state="inactive",
-                    entities=[change(Transition.TRANSITION_ACTIVATE)],
-                )
-            ),
-            node,
-            change(Transition.TRANSITION_CONFIGURE),
-        ]
     )

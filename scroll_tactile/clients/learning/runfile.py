@@ -76,8 +76,8 @@ class RunFile:
         ]
         if differing:
             raise InputError(
-                f"{path.parent} belongs to another run ({'; '.join(differing)}). Ask for the same, take another folder, or "
-                "move this one away to begin anew"
+                f"{path.parent} belongs to another run ({'; '.join(differing)}). Ask for the same, take another "
+                "folder, or move this one away to begin anew"
             )
         if not isinstance(notes, dict):
             raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}. {BEGIN}")

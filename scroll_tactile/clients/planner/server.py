@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import AsyncIterator, Callable
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
+from pydantic_core import from_json
 from scroll_tactile_store import StoreError
 
 from scroll_tactile import __version__
-from scroll_tactile.clients.planner.served import Columns, File, Place, Readings, Served, Topic
 from scroll_tactile.clients.report.facts import MemoryFacts
-from scroll_tactile.errors import ObservationError, ScrollTactileError
+from scroll_tactile.errors import InputError, ObservationError, ScrollTactileError
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.libraries import optional
+from scroll_tactile.recordings import read
+from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.stream import Stream
 
 __all__ = ["serve"]
 
@@ -27,8 +36,19 @@ INSTRUCTIONS = (
     "What a robot's finger has touched: what it feels now, what it knows, and what is worth touching again. Where "
     "known is false it never felt this, and material is only the nearest; where known is null it cannot tell yet."
 )
+MOST_VALUES = 2**20  # numbers in the readings of one call: a minute of 100 channels at 170 Hz
+LARGEST = 2**28  # bytes of a recording
+CALL = re.compile(r"^read\((.*)\)$", re.MULTILINE)  # the line to copy of a recording's contents, as Python has it
 
-Material = Annotated[str, Field(max_length=1000)]
+Readings = Annotated[
+    list[list[float]] | None, Field(description="Rows of one touch in time, each with the sensor's channels.")
+]
+Text = Annotated[str, Field(max_length=1000)]
+Material = Text
+File = Annotated[Text | None, Field(description="In place of readings: a recording in the served folder, by its path.")]
+Topic = Annotated[Text | None, Field(description="Of a file with several topics: the one to read.")]
+Place = Annotated[Text | None, Field(description="Of a file with several fields: the one to read.")]
+Columns = Annotated[Text | None, Field(description="Of a file with more channels: those to take, such as 0:2.")]
 
 
 def serve(learner: TactileLearner, *, learn: bool = False, files: Path | None = None) -> None:
@@ -38,14 +58,52 @@ def serve(learner: TactileLearner, *, learn: bool = False, files: Path | None = 
     none. Raises MissingLibraryError without the library, and InputError where files is no folder.
     """
     with optional("mcp", "mcp", "serving a memory to planners"):
+        import anyio
         from mcp.server import MCPServer
         from mcp.server.mcpserver.exceptions import ToolError
+        from mcp.server.mcpserver.tools import Tool
     tools = _Tools(learner, Served(files))
-    server = MCPServer("scroll-tactile", instructions=INSTRUCTIONS, version=__version__, log_level="WARNING")
     offered: list[Callable[..., Any]] = [tools.what_is_felt, tools.what_is_known, tools.what_to_touch_again]
-    for tool in [*offered, tools.observe, tools.retract] if learn else offered:
-        server.add_tool(_explained(tools, tool, ToolError))
-    server.run("stdio")
+    offered += [tools.observe, tools.retract] if learn else []
+    made = [Tool.from_function(_explained(tools, tool, ToolError)) for tool in offered]
+    for tool in made:  # true or "1" is no number, and an argument that there is not is refused by its name
+        model, how = tool.fn_metadata.arg_model, ConfigDict(extra="forbid", strict=True)
+        strict = type(model.__name__, (model,), {"model_config": how, "__module__": __name__})
+        tool.fn_metadata.arg_model, tool.parameters = strict, strict.model_json_schema(by_alias=True)
+    about = {"instructions": INSTRUCTIONS, "version": __version__}
+    anyio.run(_answer_lines, MCPServer("scroll-tactile", **about, log_level="WARNING", tools=made))
+
+
+async def _answer_lines(server: Any) -> None:
+    """Serve over standard input and output; a line that is no JSON is answered by an error, where MCP is silent."""
+    import anyio
+    from mcp.server.stdio import stdio_server
+    from mcp.shared.message import SessionMessage
+    from mcp_types import ErrorData, JSONRPCError
+
+    async def lines() -> AsyncIterator[str]:
+        async for line in anyio.wrap_file(TextIOWrapper(sys.stdin.buffer, encoding="utf-8", errors="replace")):
+            try:
+                from_json(line)
+            except ValueError as error:
+                said = ErrorData(code=-32700, message=f"expected a message in JSON: {error}")
+                await outgoing.send(SessionMessage(JSONRPCError(jsonrpc="2.0", id=_number_of(line), error=said)))
+            else:
+                yield line
+
+    given: Any = lines()
+    async with stdio_server(stdin=given) as (incoming, outgoing):
+        inner = server._lowlevel_server  # as MCPServer.run does, which takes no other input
+        await inner.run(incoming, outgoing, inner.create_initialization_options())
+
+
+def _number_of(line: str) -> int | None:
+    """The number of a request that is JSON but for a lone half of a surrogate pair; None where it has none."""
+    try:
+        number = json.loads(line)["id"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return number if type(number) is int else None
 
 
 def _explained(tools: _Tools, tool: Any, as_error: type[Exception]) -> Callable[..., Any]:
@@ -56,7 +114,7 @@ def _explained(tools: _Tools, tool: Any, as_error: type[Exception]) -> Callable[
         try:
             tools.learner.refresh()  # a client keeps its server for days, and others may learn meanwhile
             return tool(*values, **named)
-        except (ScrollTactileError, StoreError, OSError, MemoryError, UnicodeError) as error:
+        except (ScrollTactileError, StoreError, OSError, MemoryError) as error:
             raise as_error(tools.without_paths(str(error)) or type(error).__name__) from error
 
     return explained
@@ -142,3 +200,56 @@ class _Tools:
             )
         self.learner.retract(observation)
         return {"retracted": observation}
+
+
+class Served:
+    """A folder of recordings, or None where none is served. Raises InputError for what is no folder."""
+
+    def __init__(self, folder: Path | None) -> None:
+        if folder is not None and not folder.is_dir():
+            raise InputError(f"expected a folder of recordings as files={str(folder)!r}; there is none")
+        self._folder = None if folder is None else folder.resolve()
+
+    def touch(
+        self, sensor: Sensor, readings: Readings, file: File, topic: Topic, field: Place, columns: Columns
+    ) -> Stream | list[list[float]]:
+        """One touch, by its readings or by a recording in the folder. Raises InputError for both, for neither and for
+        too many readings, and what `read` and `Recording.stream` raise."""
+        if (readings is None) == (file is None) or (file is None and any((topic, field, columns))):
+            raise InputError("expected readings or a file, one of them; topic, field and columns are of a file")
+        if readings is None:
+            return read(self._place(str(file)), topic=topic, field=field, columns=columns).stream(sensor)
+        if sum(map(len, readings)) > MOST_VALUES:
+            raise InputError(f"expected at most {MOST_VALUES} numbers in a touch; cut it, or name a file")
+        return readings
+
+    def without_paths(self, text: str) -> str:
+        """An error's text as a planner is to read it: the folder is not named, and lines to copy are its own."""
+        text = text if self._folder is None else text.replace(f"{self._folder}{os.sep}", "")
+        return CALL.sub(r"such as file=\1", text)
+
+    def _place(self, file: str) -> Path:
+        """A recording in the folder, wherever its links lead. Raises InputError for any other."""
+        if self._folder is None:
+            raise InputError("no folder of recordings is served: start with --files FOLDER, or give readings")
+        place = self._folder if "\0" in file else (self._folder / file).resolve()
+        if self._folder not in place.parents or _bytes(place) > LARGEST:
+            raise InputError(
+                f"expected a recording in the served folder, a file or the folder of one without links in it, of at "
+                f"most {LARGEST >> 20} MB; came {file!r:.80}"
+            )
+        return place
+
+
+def _bytes(place: Path) -> float:
+    """Of a file, or of what a folder has; infinite for anything else, and where a link in it could lead elsewhere."""
+    if place.is_file():
+        return place.stat().st_size
+    total = 0.0 if place.is_dir() else math.inf
+    for folder, folders, files in os.walk(place):
+        for name in (*folders, *files):
+            inside = Path(folder, name)
+            total += math.inf if inside.is_symlink() else inside.stat().st_size
+        if total > LARGEST:
+            break
+    return total

@@ -10,10 +10,8 @@ import importlib
 import typing
 
 if typing.TYPE_CHECKING:
-    from scroll_tactile.clients.ros2.answer_fields import Answer
-    from scroll_tactile.clients.ros2.bridge import Bridge, BridgeReport
-    from scroll_tactile.clients.ros2.interfaces import Quality
-    from scroll_tactile.clients.ros2.listening import Listener
+    from scroll_tactile.clients.ros2.bridge import Answer, Bridge, BridgeReport
+    from scroll_tactile.clients.ros2.inputs import Listener, Quality
     from scroll_tactile.clients.ros2.node import TactileNode
     from scroll_tactile.clients.ros2.serving import serve
 
@@ -21,11 +19,8 @@ __all__ = ["Answer", "Bridge", "BridgeReport", "Listener", "Quality", "TactileNo
 
 # Imported on first use: a topic should be heard before the libraries behind a learner are there.
 _MODULES = {
-    "Answer": "answer_fields",
-    "Bridge": "bridge",
-    "BridgeReport": "bridge",
-    "Listener": "listening",
-    "Quality": "interfaces",
+    **dict.fromkeys(("Answer", "Bridge", "BridgeReport"), "bridge"),
+    **dict.fromkeys(("Listener", "Quality"), "inputs"),
     "TactileNode": "node",
     "serve": "serving",
 }

@@ -1,32 +1,35 @@
-"""Between messages and a live session: a reading and its time out of each, and what there is to say after it."""
+"""Turns messages into readings of a live session, and what changed into answers. It needs no ROS."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.clients.ros2.answer_fields import Answer, answer_of, ended, under_way
 from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.live.answers import LiveState
+from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.live.session import HealthNotes
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.ros.rosbag import picture
-from scroll_tactile.results import Receipt
+from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.ranges import all_clipped
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]
 
+Answer = Mapping[str, Any]
+"""An answer by name, as JSON has it; `Bridge` lists what is in it."""
+
 RESTLESS = "the sensor is not at rest, or something touches it: nothing is found until it is left alone for two seconds"
+RANKED = 5  # materials of an answer's ranking
 _FILE = re.compile(r"\w[\w.-]{0,99}", re.ASCII)  # a name that leads to no other folder
 _NUMBER = re.compile(r"[0-9]{1,19}")  # of a row: no journal has more, and int() refuses thousands of digits
 
@@ -88,10 +91,10 @@ class Bridge:
         self.report = BridgeReport()
         self.state = LiveState()
         self.stamp = 0.0
-        self._touch: Stream | None = None  # the last of the session before this one
         self.paused = False
-        self._learned: list[Receipt] = []  # by this bridge; the last may be taken back, see `learned`
         self.receipt: Receipt | None = None  # of the last `learn`, also of a touch that was learned before
+        self._learned: list[Receipt] = []  # by this bridge; the last may be taken back, see `learned`
+        self._touch: Stream | None = None  # the last of the session before this one
         self._met: dict[str, int] = {}  # by the sessions before this one
         self._answer, self._warn = answer, warn
         self._notes = HealthNotes(learner, None, warn, materials=of is None) if watch else None
@@ -116,7 +119,10 @@ class Bridge:
         except InputError as error:
             if isinstance(error, FieldError) and self.report.messages == 1:
                 raise
-            self._refuse(error)
+            self.report.refused += 1
+            if type(error) not in self._warned:
+                self._warned.add(type(error))
+                self._warn(f"{error}. Further messages like it are left out and counted, without a word")
             return self.state
         self.stamp = stamp
         self._publish(state)
@@ -124,6 +130,55 @@ class Bridge:
             self._restless = self.session.report.restless
             self._warn(RESTLESS if self._restless else "the sensor was at rest: touches are found from now on")
         return state
+
+    def _reading(self, message: object) -> npt.NDArray[Any]:
+        found = picture(message) if self._pictures else None
+        if found is not None:
+            return found
+        reading = self.field.reading(message)
+        return reading if self.learner.sensor.camera else reading.astype(np.float64, copy=False)
+
+    def _time(self, message: object, published: float) -> float:
+        if self._header is None:
+            return published
+        try:
+            seconds, nanoseconds = self._header.values(message)
+        except FieldError:
+            self._header = None
+            return published
+        if seconds == 0 == nanoseconds:
+            self.report.unstamped += 1
+            return published + self._ahead
+        stamp = float(seconds + nanoseconds / 1e9)
+        self._ahead = stamp - published
+        return stamp
+
+    def _publish(self, now: LiveState) -> None:
+        """Answer what is new."""
+        before, self.state = self.state, now
+        for touch in now.touches:
+            self._say_ended(touch)
+            if self._notes is not None:
+                self._notes.take(touch)
+        if now.contact:
+            fresh = not before.contact or bool(now.touches)
+            if now.decided and (fresh or not before.decided):
+                self._say("decided", now)
+            elif fresh or now.prediction is not before.prediction:
+                self._say("began" if fresh else "prediction", now)
+        elif before.contact and not now.touches:
+            self._say("brief", now)
+
+    def _say(self, event: str, now: LiveState) -> None:
+        """Give the answer to a touch under way."""
+        said = {"event": event, "stamp": self.stamp, **self._by}
+        said |= {"contact": now.contact, "seconds": now.seconds, "decided": now.decided}
+        self._answer(said if now.prediction is None else said | _told(now.prediction, now.estimates))
+
+    def _say_ended(self, touch: LiveTouch) -> None:
+        said = {"event": "ended", "stamp": self.stamp, **self._by}
+        said |= {"contact": False, "seconds": touch.stream.seconds, "decided": touch.decided, "end": touch.end}
+        self._answer(said | {"touches": 1 + len(touch.earlier)} | _told(touch.prediction, touch.estimates))
 
     def check(self, scene: Sequence[str] | None) -> None:
         """Raise what `adjust` raises for a scene; nothing changes."""
@@ -151,16 +206,39 @@ class Bridge:
         self._met = self._counts()
         self.session, self.paused, self._restless = session, False, False
 
+    def close(self) -> None:
+        """End the touch under way, if any; the learner stays open."""
+        self.session.close()
+        if self._notes is not None:
+            self._notes.take(None)
+
+    def status(self) -> dict[str, int | bool]:
+        """What the bridge and its sessions met, by name; of states that of the last session."""
+        return {**asdict(self.report), **self._counts()}
+
+    def _counts(self) -> dict[str, int | bool]:
+        """What this session met, and those before it."""
+        met = asdict(self.session.report).items()
+        return {name: value if isinstance(value, bool) else value + self._met.get(name, 0) for name, value in met}
+
     @property
     def touch(self) -> Stream | None:
         """The last touch that ended; None before."""
         return self._touch if self.session.touch is None else self.session.touch
 
-    def learn(self, material: str) -> str:
-        """Learn the last touch that ended under this name; durable when this returns. Says what was done.
+    @property
+    def learned(self) -> Receipt | None:
+        """What this bridge learned last, and nobody took back."""
+        while self._learned and self.learner.memory.is_gone(self._learned[-1].sequence):
+            self._learned.pop()
+        return self._learned[-1] if self._learned else None
 
-        Raises InputError where no touch has ended, or the memory has it under another name, and what `learner.observe`
-        raises.
+    # What services ask for. Each says what was done, is durable when it returns, and raises what the learner raises.
+
+    def learn(self, material: str) -> str:
+        """Learn the last touch that ended under this name.
+
+        Raises InputError where no touch has ended, or the memory has it under another name.
         """
         touch = self._ended_touch("to learn")
         if (why := refusal(self.learner.names_of(touch), material, all_clipped(touch))) is not None:
@@ -176,10 +254,7 @@ class Bridge:
         )
 
     def undo(self) -> str:
-        """Take back what was learned last; durable when this returns. Says what was done.
-
-        Raises InputError where nothing is left to be taken back, and what `learner.retract` raises.
-        """
+        """Take back what was learned last. Raises InputError where nothing is left to be taken back."""
         receipt = self.learned
         if receipt is None:
             raise InputError(
@@ -190,10 +265,7 @@ class Bridge:
         return f"{receipt.material}: observation {receipt.sequence} was taken back; {left} are left"
 
     def retract(self, observation: str) -> str:
-        """Take back an observation, by its number; durable when this returns. Says what was done.
-
-        Raises InputError for what is no number, and for that of an adaptation, and what `learner.retract` raises.
-        """
+        """Take back an observation, by its number. Raises InputError for what is none, and for an adaptation's."""
         if not _NUMBER.fullmatch(observation):
             raise InputError(f"expected the number of an observation, as learn gave it; came {observation!r:.60}")
         number = int(observation)
@@ -205,18 +277,15 @@ class Bridge:
         self.learner.retract(number)
         return f"observation {number} was taken back"
 
-    @property
-    def learned(self) -> Receipt | None:
-        """What this bridge learned last, and nobody took back."""
-        while self._learned and self.learner.memory.is_gone(self._learned[-1].sequence):
-            self._learned.pop()
-        return self._learned[-1] if self._learned else None
+    def forget(self, material: str) -> str:
+        """Forget a material."""
+        count = self.learner.forget(material)
+        return f"{material}: {count} observation{'s' * (count != 1)} forgotten"
 
     def save(self, name: str) -> str:
         """Pack the memory as a file of this name beside its folder, for `learner.merge`. Says where it lies.
 
-        Raises InputError for a name with a folder in it, and where there is such a file, and what `learner.pack`
-        raises.
+        Raises InputError for a name with a folder in it, and where there is such a file.
         """
         if not _FILE.fullmatch(name):
             raise InputError(f"expected a file's name of letters, digits, '_', '-' and '.'; came {name!r:.60}")
@@ -228,25 +297,16 @@ class Bridge:
         self.learner.pack(path)
         return str(path)
 
-    def predict(self) -> str:
-        """The answer to the last touch that ended, by the memory as it is now, as JSON; see the class.
-
-        Raises InputError where no touch has ended.
-        """
-        touch = self._ended_touch("to predict")
-        scene, axis = self._how["scene"], self._how["of"]
-        prediction = self.learner.predict(touch, scene=scene, of=axis)
-        said = {"event": "predicted", "stamp": self.stamp, "contact": self.state.contact, "seconds": touch.seconds}
-        return json.dumps(said | self._by | answer_of(prediction, {}))
-
     def materials(self) -> str:
         """The materials with their observations, as JSON."""
         return json.dumps(dict(self.learner.materials))
 
-    def forget(self, material: str) -> str:
-        """Forget a material; durable when this returns. Says what was done; raises what `learner.forget` raises."""
-        count = self.learner.forget(material)
-        return f"{material}: {count} observation{'s' * (count != 1)} forgotten"
+    def predict(self) -> str:
+        """The last touch that ended, by the memory as it is now, as JSON. Raises InputError where none has ended."""
+        touch = self._ended_touch("to predict")
+        prediction = self.learner.predict(touch, scene=self._how["scene"], of=self._how["of"])
+        said = {"event": "predicted", "stamp": self.stamp, "contact": self.state.contact, "seconds": touch.seconds}
+        return json.dumps(said | self._by | _told(prediction, {}))
 
     def begin(self) -> str:
         """A touch begins. Raises InputError in a session that finds contacts itself, and while paused."""
@@ -280,70 +340,11 @@ class Bridge:
             raise InputError(f"expected a touch {what}; none has ended yet")
         return self.touch
 
-    def status(self) -> dict[str, int | bool]:
-        """What the bridge and its sessions met, by name; of states that of the last session."""
-        return {**asdict(self.report), **self._counts()}
 
-    def _counts(self) -> dict[str, int | bool]:
-        """What this session met, and those before it."""
-        report = asdict(self.session.report)
-        return {
-            name: value if isinstance(value, bool) else value + self._met.get(name, 0) for name, value in report.items()
-        }
-
-    def close(self) -> None:
-        """End the touch under way, if any; the learner stays open."""
-        self.session.close()
-        if self._notes is not None:
-            self._notes.take(None)
-
-    def _reading(self, message: object) -> npt.NDArray[Any]:
-        found = picture(message) if self._pictures else None
-        if found is not None:
-            return found
-        reading = self.field.reading(message)
-        return reading if self.learner.sensor.camera else reading.astype(np.float64, copy=False)
-
-    def _time(self, message: object, published: float) -> float:
-        if self._header is None:
-            return published
-        try:
-            seconds, nanoseconds = self._header.values(message)
-        except FieldError:
-            self._header = None
-            return published
-        if seconds == 0 == nanoseconds:
-            self.report.unstamped += 1
-            return published + self._ahead
-        stamp = float(seconds + nanoseconds / 1e9)
-        self._ahead = stamp - published
-        return stamp
-
-    def _refuse(self, error: InputError) -> None:
-        self.report.refused += 1
-        self._warn_once(error, f"{error}. Further messages like it are left out and counted, without a word")
-
-    def _warn_once(self, error: Exception, text: str) -> None:
-        """Warn of the first error of each kind."""
-        if type(error) not in self._warned:
-            self._warned.add(type(error))
-            self._warn(text)
-
-    def _publish(self, now: LiveState) -> None:
-        """Answer what is new."""
-        before, self.state = self.state, now
-        for touch in now.touches:
-            self._answer(ended(touch, self.stamp, self._by))
-            if self._notes is not None:
-                self._notes.take(touch)
-        if now.contact:
-            fresh = not before.contact or bool(now.touches)
-            if now.decided and (fresh or not before.decided):
-                self._say("decided", now)
-            elif fresh or now.prediction is not before.prediction:
-                self._say("began" if fresh else "prediction", now)
-        elif before.contact and not now.touches:
-            self._say("brief", now)
-
-    def _say(self, event: str, now: LiveState) -> None:
-        self._answer(under_way(event, now, self.stamp, self._by))
+def _told(prediction: Prediction, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """What a prediction says, and estimates by quantity."""
+    told: dict[str, Any] = {**prediction.as_json()}
+    if estimates:
+        told["estimates"] = {name: own.as_json() for name, own in estimates.items()}
+    ranking = prediction.ranking_as_json(RANKED)
+    return told | {"unusual": prediction.unusual, "candidates": prediction.candidates(), "ranking": ranking}

@@ -1,0 +1,329 @@
+"""What the node is given: types of ROS by name, parameters, and messages of a topic, which may come late."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from scroll_tactile.errors import FieldError, InputError, MissingLibraryError
+from scroll_tactile.libraries import install_line
+from scroll_tactile.recordings.paths import nearest
+
+__all__ = [
+    "DYNAMIC",
+    "PARAMETERS",
+    "Listener",
+    "Quality",
+    "declare",
+    "interface",
+    "names_in",
+    "require_rclpy",
+    "verdict",
+]
+
+LOOKED = 0.2  # seconds between looks for a topic that is not there yet
+MISSED = 5.0  # seconds until the first warning about a missing or silent topic; each next wait is twice as long
+LONGEST = 600.0
+PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+DEEP, FEW = 2000, 120  # readings and pictures in the subscription's queue: two seconds at 1 kHz and at 60 Hz
+WAITING = 10_000  # messages that wait for their taker: ten seconds at 1 kHz, some tens of MB; of pictures FEW
+QUALITIES = {"reliability": ("best_effort", "reliable"), "durability": ("volatile", "transient_local")}
+_NAME = re.compile(r"([A-Za-z]\w*)/(msg|srv)/([A-Za-z]\w*)")
+
+Taker = Callable[[Any, float, int], object]
+"""Takes a message, when it was published, in seconds, and how many were lost since the one before."""
+
+
+def require_rclpy() -> Any:
+    """Python's client of ROS 2. Raises MissingLibraryError, with how to get it, where it cannot be imported."""
+    try:
+        return importlib.import_module("rclpy")
+    except ImportError as error:
+        raise MissingLibraryError(
+            f"a ROS 2 node needs rclpy, which cannot be imported here ({error}): source the robot's own ROS 2 "
+            "(source /opt/ros/DISTRIBUTION/setup.bash) in the shell that starts this, with a Python of the same "
+            f"version; where there is no ROS: {install_line('ros-rclpy', 'ros2')}"
+        ) from error
+
+
+def interface(name: str) -> Any:
+    """The class of a message or service, such as std_msgs/msg/String.
+
+    Raises InputError for a name that is none, MissingLibraryError where its package is not installed, with the line
+    that installs it, and FieldError, with those nearest, where the package has none of this name.
+    """
+    match = _NAME.fullmatch(name)
+    if match is None:
+        raise InputError(f"expected a type as package/msg/Name, such as sensor_msgs/msg/JointState; came {name!r}")
+    package, group, short = match.groups()
+    try:
+        module = importlib.import_module(f"{package}.{group}")
+    except ImportError as error:
+        distribution = os.environ.get("ROS_DISTRO", "DISTRIBUTION")
+        raise MissingLibraryError(
+            f"type {name} needs the Python package {package!r}, which cannot be imported ({error}): "
+            f"sudo apt install ros-{distribution}-{package.replace('_', '-')}, or source the workspace it is built in"
+        ) from error
+    if not hasattr(module, short):
+        names = [other for other in dir(module) if other[0].isupper() and "_" not in other]
+        raise FieldError(f"package {package!r} has no {group} {short!r}{nearest(short, names)}")
+    return getattr(module, short)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the node: name, default and what it is for, as ROS shows them.
+
+    choices: the texts that it can be. bounds: of a number, both included.
+    """
+
+    name: str
+    default: Any
+    about: str
+    choices: tuple[str, ...] = ()
+    bounds: tuple[float, float] | None = None
+
+    def descriptor(self) -> Any:
+        """What ROS shows."""
+        made = interface("rcl_interfaces/msg/ParameterDescriptor")(name=self.name, description=self.about)
+        made.read_only, made.dynamic_typing = self.name == "autostart", self.name == "scene"
+        made.additional_constraints = f"one of {', '.join(self.choices)}" if self.choices else ""
+        if self.bounds is not None:
+            short = "floating_point_range" if isinstance(self.default, float) else "integer_range"
+            kind = interface(f"rcl_interfaces/msg/{short.title().replace('_', '')}")
+            low, high = (type(self.default)(bound) for bound in self.bounds)
+            setattr(made, short, [kind(from_value=low, to_value=high)])
+        return made
+
+    def refused(self, value: object) -> str:
+        """Why it cannot have a value; "" where it can."""
+        if self.choices and value not in self.choices:
+            return f"expected parameter {self.name} as {' or '.join(self.choices)}; came {value!r}"
+        if self.name == "risk" and not (isinstance(value, float) and 0 < value < 1):
+            return f"expected parameter risk as a share of wrong answers between 0 and 1; came {value!r}"
+        try:
+            names_in(value if self.name == "scene" else "")
+        except InputError as error:
+            return f"parameter scene: {error}"
+        return ""
+
+
+DYNAMIC = (
+    Parameter("risk", 0.05, "The share of wrong answers among those that are decided.", bounds=(0.0, 1.0)),
+    Parameter("scene", "", "The materials that can be here, a list of texts or one with commas; empty: all."),
+    Parameter("health_after", 0, "Count for the sensor's health only later observations.", bounds=(0, 2**62)),
+)
+"""Free to change at any time; risk and scene count from the next touch on."""
+
+PARAMETERS = (
+    Parameter("memory", "", "The folder of the memory."),
+    Parameter("topic", "", "Where the readings are sent."),
+    Parameter("field", "", "The path to a message's numbers."),
+    Parameter("type", "", "The messages' type, as package/msg/Name; empty: what the topic says."),
+    Parameter("preset", "", "A known sensor, which gives sensor, topic and field: biotac, anyskin, digit …"),
+    Parameter("sensor", "", "Whose readings they are; needed only to make a new memory."),
+    Parameter("mode", "write", "Whether touches can be learned.", choices=("write", "read")),
+    Parameter("contact", "auto", "Who finds touches: auto, or the services begin and end.", choices=("auto", "manual")),
+    Parameter("of", "", "An axis of labels to answer by, in place of materials."),
+    Parameter("watch", False, "Note rest and known touches for the sensor's health, some hundred bytes each."),
+    *(
+        Parameter(f"qos.{name}", of[0], "What is asked of the publishers.", choices=of)
+        for name, of in QUALITIES.items()
+    ),
+    Parameter("qos.depth", 0, "Messages that may wait; 0: 2000, of pictures 120.", bounds=(0, 1_000_000)),
+    Parameter("autostart", True, "Configure and activate when the node starts."),
+    *DYNAMIC,
+)
+"""All of the node. Those that are not dynamic are read when it is configured; autostart once."""
+
+
+def declare(node: Any, parameters: Iterable[Parameter], values: Mapping[str, Any]) -> list[str]:
+    """Declare those that the node does not have yet, and return their names. values: defaults of this node, by name.
+
+    Raises InputError where ROS was started with a value of another type, or out of bounds.
+    """
+    new = [each for each in parameters if not node.has_parameter(each.name)]
+    for each in new:
+        try:
+            node.declare_parameter(each.name, values.get(each.name, each.default), each.descriptor())
+        except Exception as error:  # rclpy's own, whose place has changed from release to release
+            raise InputError(f"parameter {each.name}: {error}") from error
+        if why := each.refused(node.get_parameter(each.name).value):
+            raise InputError(why)
+    return [each.name for each in new]
+
+
+def verdict(parameters: Iterable[Parameter], values: Mapping[str, Any], why: str = "") -> Any:
+    """What ROS is told of values that are to be set, by name: why one of them cannot be, else `why`, or yes."""
+    reasons = [each.refused(values[each.name]) for each in parameters if each.name in values]
+    why = "; ".join(filter(None, reasons)) or why
+    return interface("rcl_interfaces/msg/SetParametersResult")(successful=not why, reason=why)
+
+
+def names_in(value: object) -> list[str]:
+    """The names in a list of texts, or in a text with commas. Raises InputError for anything else."""
+    found = [value] if isinstance(value, str) else value
+    if not isinstance(found, list | tuple) or not all(isinstance(text, str) for text in found):
+        raise InputError(f"expected a text or a list of texts; came {value!r:.60}")
+    return [name.strip() for text in found for name in text.split(",") if name.strip()]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The quality of service of a subscription.
+
+    As it is, best effort and volatile, which any publisher can serve; but its queue holds two seconds of readings at
+    1 kHz, not five messages: while a touch is learned and its row reaches the disk no reading is taken, and a sensor at
+    1 kHz would overrun a queue of five in 5 ms. depth: messages that may wait; 0: 2000, or 120 pictures.
+    """
+
+    reliability: str = "best_effort"
+    durability: str = "volatile"
+    depth: int = 0
+
+    def profile(self, kind: str) -> Any:
+        """The same in rclpy's terms, for messages of a kind. Raises InputError for a word that is none of them."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+        for name, words in QUALITIES.items():
+            if getattr(self, name) not in words:
+                raise InputError(f"expected {name} as {' or '.join(words)}; came {getattr(self, name)!r}")
+        return QoSProfile(
+            depth=self.depth or (FEW if kind in PICTURES else DEEP),  # of the last that came
+            reliability=ReliabilityPolicy[self.reliability.upper()],
+            durability=DurabilityPolicy[self.durability.upper()],
+        )
+
+
+class Listener:
+    """Hears a topic, and gives its messages to one taker.
+
+    topic, kind: where the messages are. Without a kind, such as sensor_msgs/msg/JointState, the type is what the topic
+    is sent as, and it may appear later. The subscription begins with the listener: what comes before there is a taker
+    waits, the last 10 000 messages, or 120 pictures, so that a memory can be opened meanwhile.
+
+    A topic that is not there, or silent, is named in a warning after 5, 10, 20 … seconds; one that appears later with
+    two types, or with one of a package that is missing, once.
+
+    Raises MissingLibraryError where a package of ROS is missing, InputError for a kind that is none, for a topic of two
+    types and for a quality that is none.
+    """
+
+    def __init__(self, node: Any, topic: str, kind: str | None = None, quality: Quality | None = None) -> None:
+        self.node, self.kind, self._quality = node, kind, quality or Quality()
+        self._quality.profile("")  # or raises
+        self.topic = node.resolve_topic_name(topic)
+        self.received = self._reported = 0.0
+        self.subscription: Any = None
+        self._taker: Taker | None = None
+        self._waiting: deque[tuple[Any, float, int]] = deque()
+        self._left_out = 0  # of what waited
+        self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
+        self._patience = MISSED
+        self._said: set[str] = set()  # why there is no subscription yet
+        self._looking: Any = None
+        self._timer: Any = None
+        self.start()
+
+    def start(self, taker: Taker | None = None) -> None:
+        """Hear the topic, anew after `stop`. A taker gets what waited, and from now on each message."""
+        if self._timer is None:
+            if not self._look():
+                self._looking = self.node.create_timer(LOOKED, self._look_again)
+            self.received, self._reported, self._numbers = time.monotonic(), time.monotonic(), {}
+            self._timer = self.node.create_timer(1.0, self._each_second)
+        self._taker = taker or self._taker
+        while self._waiting and self._taker is not None:  # a taker may stop it
+            message, published, lost = self._waiting.popleft()
+            lost, self._left_out = lost + self._left_out, 0
+            self._taker(message, published, lost)
+
+    def stop(self) -> None:
+        """Hear no more, and give no more; what waited is gone."""
+        for timer in filter(None, (self._looking, self._timer)):
+            self.node.destroy_timer(timer)
+        if self.subscription is not None:
+            self.node.destroy_subscription(self.subscription)
+        self._looking = self._timer = self.subscription = self._taker = None
+        self._waiting.clear()
+        self._left_out = 0
+
+    def receive(self, message: Any, about: Mapping[str, Any]) -> None:
+        """Take a message; about: what ROS says of it."""
+        self.received, self._patience = time.monotonic(), MISSED
+        published = about.get("source_timestamp") or about.get("received_timestamp") or time.time_ns()
+        came = message, published / 1e9, self._lost(about)
+        if self._taker is not None:
+            self._taker(*came)
+        elif self._timer is not None:
+            self._waiting.append(came)
+            if len(self._waiting) > (FEW if self.kind in PICTURES else WAITING):
+                self._left_out += 1 + self._waiting.popleft()[2]
+
+    def _lost(self, about: Mapping[str, Any]) -> int:
+        """How many messages were lost since the last of the same publisher, where the transport counts them."""
+        number = about.get("publication_sequence_number")
+        if number is None:
+            return 0
+        publisher = bytes((about.get("publisher_gid") or {}).get("data") or b"")
+        lost = max(0, int(number) - self._numbers.get(publisher, int(number) - 1) - 1)
+        self._numbers[publisher] = number
+        return lost
+
+    def _look(self) -> bool:
+        """Subscribe, without a kind as soon as the topic is there; whether it is. Raises what the class does."""
+        kinds = [self.kind] if self.kind else dict(self.node.get_topic_names_and_types()).get(self.topic, [])
+        if len(kinds) > 1:
+            raise InputError(f"topic {self.topic!r} is sent as {' and as '.join(kinds)}: say which, with --type")
+        for kind in kinds:
+            message, self.kind = interface(kind), kind
+            profile = self._quality.profile(kind)
+            self.subscription = self.node.create_subscription(message, self.topic, self.receive, profile)
+            self.node.get_logger().info(f"reading {self.topic}, {kind}")
+            self.received = time.monotonic()  # it is silent from now on
+        return bool(kinds)
+
+    def _look_again(self) -> None:
+        """Look from a timer, out of which an error would end the executor: warn of each once, and go on looking."""
+        try:
+            if self._look():
+                self.node.destroy_timer(self._looking)
+                self._looking = None
+        except InputError as error:
+            if str(error) not in self._said:
+                self._said.add(str(error))
+                self.node.get_logger().warning(f"{error}; it is not heard until then")
+
+    def _each_second(self) -> None:
+        now = time.monotonic()
+        if now - self.received > MISSED and now - self._reported > self._patience:
+            self._reported, self._patience = now, min(2 * self._patience, LONGEST)
+            self.node.get_logger().warning(self.absent())
+
+    def absent(self) -> str:
+        """Why nothing comes, as far as can be seen."""
+        silent = f"no reading for {time.monotonic() - self.received:.0f} s"
+        about = self.node.get_publishers_info_by_topic(self.topic)
+        if not about:
+            own = f"{self.node.get_fully_qualified_name()}/"
+            heard = [name for name, _ in self.node.get_topic_names_and_types()]
+            topics = [name for name in heard if name != self.topic and not name.startswith(own)]  # those of others
+            return f"{silent}: nobody publishes {self.topic}{nearest(self.topic, topics)}"
+        kinds = sorted({each.topic_type for each in about})
+        who, send = ("the publisher", "sends") if len(about) == 1 else (f"the {len(about)} publishers", "send")
+        other = f", which {send} {' and '.join(kinds)} and not {self.kind}" * (self.kind not in kinds)
+        asked = self._quality.profile("")
+        less = [  # then nothing is ever delivered
+            f"{name} {strict}"
+            for name, (_, strict) in QUALITIES.items()
+            if getattr(self._quality, name) == strict
+            and all(getattr(each.qos_profile, name) != getattr(asked, name) for each in about)
+        ]
+        unfit = f": qos asks for {' and '.join(less)}, and less is promised" if less else ""
+        return f"{silent} from {who} of {self.topic}{other}{unfit}"

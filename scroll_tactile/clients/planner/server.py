@@ -68,10 +68,12 @@ def serve(learner: TactileLearner, *, learn: bool = False, files: Path | None = 
     made = [Tool.from_function(_explained(tools, tool, ToolError)) for tool in offered]
     for tool in made:  # true or "1" is no number, and an argument that there is not is refused by its name
         model, how = tool.fn_metadata.arg_model, ConfigDict(extra="forbid", strict=True)
-        strict = type(model.__name__, (model,), {"model_config": how, "__module__": __name__})
+        strict: Any = type(model.__name__, (model,), {"model_config": how, "__module__": __name__})
         tool.fn_metadata.arg_model, tool.parameters = strict, strict.model_json_schema(by_alias=True)
-    about = {"instructions": INSTRUCTIONS, "version": __version__}
-    anyio.run(_answer_lines, MCPServer("scroll-tactile", **about, log_level="WARNING", tools=made))
+    server = MCPServer(
+        "scroll-tactile", instructions=INSTRUCTIONS, version=__version__, log_level="WARNING", tools=made
+    )
+    anyio.run(_answer_lines, server)
 
 
 async def _answer_lines(server: Any) -> None:

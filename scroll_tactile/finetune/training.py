@@ -96,7 +96,7 @@ def start_without(
         start = Start(known, {}, np.zeros(len(known)))
     else:
         reference = names if model.kind == "lda" else list(statistics.materials)
-        readouts = {scale: Task.of(statistics, scale, reference).solve(statistics) for scale in scales}
+        readouts = {scale: Task.of(statistics, scale, reference).solve() for scale in scales}
         start = start_of(model, known, readouts)
     for sample in samples:
         statistics.add(sample.material, sample.codes, sample.image.shape[1])

@@ -1,6 +1,6 @@
 """Checkpoints as zarr writes them, byte for byte, a hundred times as fast: most tests write some by the way.
 
-Tests of the writing have zarr write them, as the store does (see conftest.py); tests/storage/test_quick_checkpoints.py
+Tests of the writing have zarr write them, as the store does (see conftest.py); tests/storage/test_store_commit.py
 compares the files of both.
 """
 

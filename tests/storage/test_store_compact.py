@@ -1,8 +1,6 @@
 """Compaction: a checkpoint stands for rows that have given up their arrays, in a log that takes the other's place."""
 
 import errno
-import itertools
-import os
 import shutil
 from pathlib import Path
 
@@ -11,8 +9,8 @@ import pytest
 import scroll_tactile_store.checkpoints
 import scroll_tactile_store.files
 from forging import log_of
-from scroll_tactile_store import CompactedError, DamageError, Store, StoreError, check_store
-from store_builds import as_after_a_crash, damage, flip, flip_row, folders
+from scroll_tactile_store import CompactedError, DamageError, Store
+from store_builds import damage, flip, flip_row, folders
 
 LAST = 12
 
@@ -129,61 +127,6 @@ def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, nam
     assert agrees(opened, 0)
     compact(opened, 5)
     assert agrees(opened, 5)
-
-
-def failing(monkeypatch, at, error, *, after):
-    """Let the rename of this number raise, before or after it is done; the list of renames."""
-    real, calls = os.replace, []
-
-    def call(*args, **options):
-        calls.append(args)
-        if len(calls) == at:
-            if after:
-                real(*args, **options)
-            raise error
-        return real(*args, **options)
-
-    monkeypatch.setattr(os, "replace", call)
-    return calls
-
-
-class KilledError(BaseException):
-    pass
-
-
-KILLED = KilledError()
-HOW = {
-    "fails": (OSError(errno.EIO, "the disk says no"), False),
-    "fails, and has done it": (OSError(errno.EIO, "the disk says no"), True),
-    "killed": (KILLED, True),
-}
-
-
-@pytest.mark.parametrize(("error", "after"), HOW.values(), ids=HOW)
-def test_whatever_rename_fails_all_that_was_acknowledged_is_there(made, tmp_path, monkeypatch, error, after):
-    """For this process, which goes on, and for another; `tests/faults/each_call.py` has every call fail."""
-    for at in itertools.count(1):
-        with Store.open(shutil.copytree(made, tmp_path / f"s{at}")) as opened:
-            raised = None
-            with monkeypatch.context() as broken:
-                calls = failing(broken, at, error, after=after)
-                try:
-                    compact(opened, 5)
-                except (StoreError, KilledError) as caught:
-                    raised = caught
-            if len(calls) < at:
-                break
-            left = as_after_a_crash(opened, tmp_path / f"left{at}")
-            add(opened, LAST + 1)
-            assert (raised is None, opened.compacted) in {(True, 5), (False, 0), (False, 5)}
-            assert agrees(opened, opened.compacted, LAST + 1)
-            with Store.open(opened.path, mode="read") as reader:
-                assert agrees(reader, opened.compacted, LAST + 1)
-        assert damage(opened.path) == []
-        with Store.open(left) as again:
-            assert agrees(again, again.compacted)
-            assert add(again, LAST + 1) == LAST + 1
-        assert check_store(left) == []
 
 
 def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):

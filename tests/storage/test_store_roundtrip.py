@@ -194,7 +194,7 @@ def test_importing_is_light_and_a_checkpoint_is_read_without_zarr(tmp_path):
     with Store.open(tmp_path, identity={}) as opened:
         opened.commit({"x": np.arange(30), "y": np.array(["é"])}, last_sequence=0)
     code = (
-        "import sys, store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))\n"
+        "import sys, scroll_tactile_store as store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))\n"
         "with store.Store.open(sys.argv[1], mode='read') as opened: print(len(opened.latest().arrays))\n"
         "print({'zarr'} & set(sys.modules))"
     )

@@ -10,11 +10,7 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-import h5py
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from made import SKIN, lerobot, ros
+from made import SKIN, ros
 
 from faults.bag_attacks import FLOATS, mcap, mcap_chunk, message
 from faults.mutants import NUMBERS, TEXTS, VALUES, mutated_bytes
@@ -60,7 +56,7 @@ def mutated_lines(rng: random.Random, text: str) -> tuple[str, str]:
 
 def made(rng: random.Random, folder: Path) -> tuple[Path, dict[str, Any], str]:
     """A recording that its own library would write, or that is right byte by byte, of what nobody would put in it."""
-    maker = rng.choice((_made_mcap, _made_mcap, _made_definition, _made_db3, _made_hdf5, _made_parquet))
+    maker = rng.choice((_made_mcap, _made_definition, _made_db3))
     path, options, about = maker(rng, folder)
     return path, options, f"{maker.__name__[6:]}: {about}"[:300]
 
@@ -146,51 +142,3 @@ SQL = (
     "CREATE TABLE {0}(id, name, type, serialization_format) WITHOUT ROWID",
     "garbage",
 )
-
-
-def _made_hdf5(rng: random.Random, folder: Path) -> tuple[Path, dict[str, Any], str]:
-    shape = rng.choice(((30, 19), (30,), (0, 19), (30, 0), (10**6, 2), (10**12, 3), (2, 10**9), (), (3, 4, 5, 3)))
-    kind = rng.choice(("f4", "u1", "f8", ">i2", "S5", "?", "c8", h5py.string_dtype(), "V9", "f2"))
-    chunks = rng.choice((None, True, tuple(min(max(n, 1), 64) for n in shape) or None))
-    more: dict[str, Any] = {"chunks": chunks} if shape else {}
-    if more.get("chunks") is not None and rng.random() < 0.6:
-        more |= {"compression": rng.choice(("gzip", "lzf")), "shuffle": rng.random() < 0.5}
-        more |= {"fletcher32": rng.random() < 0.3} | ({"scaleoffset": 2} if rng.random() < 0.1 else {})
-    with h5py.File(folder / "x.h5", "w") as file:
-        data = file.create_dataset(rng.choice(("tactile", "data/demo_0/tactile")), shape, kind, **more)
-        if data.size is not None and data.size < 10**6 and data.dtype.kind in "iuf" and data.size:
-            data[...] = 1
-        file["times"] = np.arange(rng.choice((0, 30, 31)))
-    if rng.random() < 0.3:
-        _, raw = mutated_bytes(rng, (folder / "x.h5").read_bytes(), ())
-        (folder / "x.h5").write_bytes(raw)
-    return folder / "x.h5", {"field": "tactile"}, f"{shape} {kind} {more}"
-
-
-def _made_parquet(rng: random.Random, folder: Path) -> tuple[Path, dict[str, Any], str]:
-    path = lerobot(folder / "set")
-    file = rng.choice(sorted(path.rglob("*.parquet")))
-    table = pq.read_table(file)
-    name = rng.choice(table.schema.names)
-    count = table.num_rows
-    column = rng.choice(
-        (
-            pa.nulls(count),
-            pa.array(["x"] * count),
-            pa.array([[1.0] * i for i in range(count)]),
-            pa.array(rng.choices((-1, 0, 2**62, 10**6), k=count)),
-            pa.array(np.full(count, np.nan)),
-            pa.array([b"\x80"] * count),
-            pa.array([[[1.0], None]] * count),
-            pa.array([{"a": 1}] * count),
-            pa.array(["x"] * count).dictionary_encode(),
-        )
-    )
-    table = table.set_column(table.schema.get_field_index(name), name, column)
-    table = pa.concat_tables([table] * rng.choice((1, 1, 1, 1000)))
-    pq.write_table(table, file, compression=rng.choice(("zstd", "snappy", "gzip", "lz4", "none")))
-    how = "whole"
-    if rng.random() < 0.5:
-        how, raw = mutated_bytes(rng, file.read_bytes(), ())
-        file.write_bytes(raw)
-    return path, {"field": "tip"}, f"{name} is {column.type} in {file.name}, {how}"

@@ -13,6 +13,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from numcodecs import Blosc
 from faults.bag_attacks import BAGS, Attack
 from faults.parquet_attacks import PARQUETS
 
+Made = tuple[Path, dict[str, Any]]
 FIELD = {"field": "data/tactile"}
 SECRET = 0xA5  # what files are full of that nobody may read
 RAN = "RAN"  # what code that is run leaves behind, beside the watched file
@@ -42,6 +44,10 @@ class Evil:
         return os.system, (self.command,)
 
 
+ARRAY: dict[str, Any] = {"zarr_format": 2, "shape": [4096, 19], "chunks": [4096, 19], "dtype": "|u1", "filters": None}
+ARRAY |= {"compressor": None, "fill_value": 0, "order": "C"}
+
+
 def describe(folder: Path, key: str, **about: Any) -> Path:
     """A Zarr array's description, version 2; its folder."""
     place = folder / key
@@ -50,88 +56,44 @@ def describe(folder: Path, key: str, **about: Any) -> Path:
     return place
 
 
-ARRAY = {
-    "zarr_format": 2,
-    "shape": [4096, 19],
-    "chunks": [4096, 19],
-    "dtype": "|u1",
-    "filters": None,
-    "compressor": None,
-    "fill_value": 0,
-    "order": "C",
-}
-
-
-def group(folder: Path, **about: Any) -> Path:
-    """A Zarr group with one array; its folder."""
+def zarr_of(folder: Path, watched: Path, *, chunk: Callable[[Path], bytes] | None = None, **about: Any) -> Made:
+    """A Zarr group with one array that is described so; chunk: of the watched file, what its first chunk is."""
     path = folder / "x.zarr"
     (path / "data").mkdir(parents=True)
     for place in (path, path / "data"):
         (place / ".zgroup").write_text('{"zarr_format": 2}')
     describe(path, "data/tactile", **about)
-    return path
+    if chunk is not None:
+        (path / "data/tactile" / ".".join("0" * len(about.get("shape", "xy")))).write_bytes(chunk(watched))
+    return path, FIELD
 
 
-def pickled(*, ends: bool) -> Attack:
+def pickled(folder: Path, watched: Path, *, ends: bool) -> Made:
     """R1: a text array whose filters are vlen-utf8 over pickle; of the readings, or of where the episodes end."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = buffer(folder, 2)
-        if not ends:
-            shutil.rmtree(path / "meta")
-        key = "meta/episode_ends" if ends else "data/tactile"
-        shutil.rmtree(path / key)
-        filters = [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 4}]
-        place = describe(path, key, shape=[1], chunks=[1], dtype="|O", filters=filters)
-        (place / "0").write_bytes(pickle.dumps(Evil(watched)))
-        return path, FIELD
-
-    return make
-
-
-def pickled_by_lies(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-    """R1 with numbers for a type, a pickle for a filter or for what compresses, and the truth in .zmetadata alone."""
-    path = group(folder, shape=[1], chunks=[1], dtype="<f8", compressor={"id": "pickle", "protocol": 4})
-    (path / "data/tactile/0").write_bytes(pickle.dumps(Evil(watched)))
-    about = json.loads((path / "data/tactile/.zarray").read_text())
-    lies = {"zarr_consolidated_format": 1, "metadata": {".zgroup": {"zarr_format": 2}, "data/tactile/.zarray": about}}
-    (path / ".zmetadata").write_text(json.dumps(lies))
+    path = buffer(folder, 2)
+    if not ends:
+        shutil.rmtree(path / "meta")
+    key = "meta/episode_ends" if ends else "data/tactile"
+    shutil.rmtree(path / key)
+    filters = [{"id": "vlen-utf8"}, {"id": "pickle", "protocol": 4}]
+    place = describe(path, key, shape=[1], chunks=[1], dtype="|O", filters=filters)
+    (place / "0").write_bytes(pickle.dumps(Evil(watched)))
     return path, FIELD
 
 
-def blosc(flags: int, block: int, stored: int, size: int = 4096 * 19) -> Attack:
-    """R2: a frame of Blosc that leads c-blosc out of its buffers; format 2."""
-    frame = struct.pack("<BBBBIII", 2, 1, flags, 1, size, block, stored) + struct.pack("<i", 2**30)
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = group(folder, compressor=Blosc().get_config())
-        (path / "data/tactile/0.0").write_bytes(frame)
-        return path, FIELD
-
-    return make
+def pickled_by_lies(folder: Path, watched: Path) -> Made:
+    """R1 with numbers for a type, a pickle for what compresses, and the truth in .zmetadata alone."""
+    about: dict[str, Any] = {"shape": [1], "chunks": [1], "dtype": "<f8", "compressor": {"id": "pickle", "protocol": 4}}
+    path, options = zarr_of(folder, watched, chunk=lambda file: pickle.dumps(Evil(file)), **about)
+    lies = {".zgroup": {"zarr_format": 2}, "data/tactile/.zarray": ARRAY | about}
+    (path / ".zmetadata").write_text(json.dumps({"zarr_consolidated_format": 1, "metadata": lies}))
+    return path, options
 
 
-def blosc_3(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-    """R2 in format 3, by another codec as well."""
-    from zarr.codecs import BloscCodec
-
-    path = buffer(folder, 3, compressors=[BloscCodec()])
-    size = 7 * 10 * 4
-    (path / "data/tactile/c/0/0").write_bytes(struct.pack("<BBBBIII", 2, 1, 2, 1, size, size, size + 16))
-    return path, FIELD
-
-
-def entry(name: str, kind: str, to: str = "/dev/zero") -> Attack:
-    """A FIFO, socket or link where a file is expected, in a Zarr group."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = group(folder, shape=[64, 64], chunks=[64, 64])
-        place = path / "data/tactile" / name
-        place.unlink(missing_ok=True)
-        special(place, kind, watched, to)
-        return path, FIELD
-
-    return make
+def blosc(flags: int, block: int, stored: int) -> Attack:
+    """R2: a frame of Blosc that leads c-blosc out of its buffers."""
+    frame = struct.pack("<BBBBIII", 2, 1, flags, 1, 4096 * 19, block, stored) + struct.pack("<i", 2**30)
+    return partial(zarr_of, compressor=Blosc().get_config(), chunk=lambda _: frame)
 
 
 def special(place: Path, kind: str, watched: Path, to: str = "/dev/zero") -> None:
@@ -142,47 +104,36 @@ def special(place: Path, kind: str, watched: Path, to: str = "/dev/zero") -> Non
         place.symlink_to(watched if kind == "link" else to)
 
 
-def alone(name: str, kind: str) -> Attack:
+def entry(folder: Path, watched: Path, name: str, kind: str) -> Made:
+    """A FIFO, socket or link where a file is expected, in a Zarr group."""
+    path, options = zarr_of(folder, watched, shape=[64, 64], chunks=[64, 64])
+    place = path / "data/tactile" / name
+    place.unlink(missing_ok=True)
+    special(place, kind, watched)
+    return path, options
+
+
+def alone(folder: Path, watched: Path, name: str, kind: str) -> Made:
     """No file where a whole recording is expected."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        special(folder / name, kind, watched)
-        return folder / name, {}
-
-    return make
+    special(folder / name, kind, watched)
+    return folder / name, {}
 
 
-def through_a_folder(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
+def through_a_folder(folder: Path, watched: Path) -> Made:
     """A chunk in a folder that is a link."""
-    path = group(folder, shape=[4096, 1], chunks=[4096, 1], dimension_separator="/")
+    path, options = zarr_of(folder, watched, shape=[4096, 1], chunks=[4096, 1], dimension_separator="/")
     shutil.copy(watched, watched.with_name("0"))
     (path / "data/tactile/0").symlink_to(watched.parent)
-    return path, FIELD
+    return path, options
 
 
-def zeros() -> bytes:
+def zeros(*_: Path) -> bytes:
     """A quarter of a gigabyte of zeros, deflated."""
     made = zlib.compressobj(1)
     return b"".join(made.compress(bytes(1 << 24)) for _ in range(16)) + made.flush()
 
 
-def deflated(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-    """A chunk of a few bytes by its shape, and of a quarter of a gigabyte by what it holds."""
-    path = group(folder, compressor={"id": "zlib", "level": 9})
-    (path / "data/tactile/0.0").write_bytes(zeros())
-    return path, FIELD
-
-
-def zarr_of(**about: Any) -> Attack:
-    """A group whose array is described so."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        return group(folder, **about), FIELD
-
-    return make
-
-
-def zip_bomb(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
+def zip_bomb(folder: Path, watched: Path) -> Made:
     """A zip whose chunk unfolds to more than its shape says."""
     with zipfile.ZipFile(folder / "x.zarr.zip", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(".zgroup", '{"zarr_format": 2}')
@@ -193,55 +144,31 @@ def zip_bomb(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
     return folder / "x.zarr.zip", FIELD
 
 
-def hdf5(fill: Callable[[Any, Path], None], field: str = "tactile") -> Attack:
-    """An HDF5 file."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        with h5py.File(folder / "x.h5", "w") as file:
-            fill(file, watched)
-        return folder / "x.h5", {"field": field}
-
-    return make
+def hdf5(folder: Path, watched: Path, fill: Callable[[Any, Path], Any]) -> Made:
+    """An HDF5 file; fill: what is in it, of the watched file."""
+    with h5py.File(folder / "x.h5", "w") as file:
+        fill(file, watched)
+    return folder / "x.h5", {"field": "tactile"}
 
 
-def external(file: Any, watched: Path) -> None:
-    """R3: external storage."""
+def external(file: Any, watched: Path, *, fifo: bool = False) -> None:
+    """R3: external storage; in a FIFO it is waited for."""
+    if fifo:
+        os.mkfifo(watched := Path(file.filename).with_name("fifo"))
     file.create_dataset("tactile", shape=(50, 19), dtype="u1", external=[(str(watched), 0, 950)])
 
 
-def external_fifo(file: Any, watched: Path) -> None:
-    """R3: external storage in a FIFO, which is waited for."""
-    fifo = Path(file.filename).with_name("fifo")
-    os.mkfifo(fifo)
-    file.create_dataset("tactile", shape=(50, 19), dtype="u1", external=[(str(fifo), 0, 950)])
-
-
-def virtual(file: Any, watched: Path) -> None:
-    """R3: a virtual data set of another file."""
-    other = _other(watched)
-    layout = h5py.VirtualLayout((50, 19), "u1")
-    layout[:] = h5py.VirtualSource(str(other), "secret", (50, 19))
-    file.create_virtual_dataset("tactile", layout)
-
-
-def _other(watched: Path) -> Path:
-    """An HDF5 file beside the watched one."""
+def elsewhere(file: Any, watched: Path, *, is_link: bool) -> None:
+    """R3: a link to a data set in another file, or a virtual data set of it."""
     other = watched.with_name("other.h5")
-    if not other.exists():
-        with h5py.File(other, "w") as there:
-            there["secret"] = np.full((50, 19), SECRET, "u1")
-    return other
-
-
-def linked(file: Any, watched: Path) -> None:
-    """R3: a link to a data set in another file."""
-    _other(watched)
-    file["tactile"] = h5py.ExternalLink(str(watched.with_name("other.h5")), "secret")
-
-
-def never_written(file: Any, watched: Path) -> None:
-    """10^12 rows of fill."""
-    file.create_dataset("tactile", shape=(10**12, 19), chunks=(1024, 19), dtype="f4")
+    with h5py.File(other, "w") as there:
+        there["secret"] = np.full((50, 19), SECRET, "u1")
+    if is_link:
+        file["tactile"] = h5py.ExternalLink(str(other), "secret")
+    else:
+        layout = h5py.VirtualLayout((50, 19), "u1")
+        layout[:] = h5py.VirtualSource(str(other), "secret", (50, 19))
+        file.create_virtual_dataset("tactile", layout)
 
 
 def deep(file: Any, watched: Path) -> None:
@@ -258,63 +185,33 @@ def bomb(file: Any, watched: Path) -> None:
     data.id.write_direct_chunk((0, 0), zeros())
 
 
-def npy(shape: tuple[int, ...], kind: str = "<f4", data: bytes = bytes(100)) -> Attack:
-    """A .npy by its header."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        with (folder / "x.npy").open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, {"descr": kind, "fortran_order": False, "shape": shape})
-            file.write(data)
-        return folder / "x.npy", {}
-
-    return make
+def npy(folder: Path, watched: Path, shape: tuple[int, ...], size: int = 0) -> Made:
+    """A .npy by its header; size: of the file, where most of it is a hole."""
+    with (folder / "x.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+        file.write(bytes(100))
+        file.truncate(size or file.tell())
+    return folder / "x.npy", {}
 
 
-def sparse(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-    """A .npy of 400 GB, of which the disk has a page."""
-    path, _ = npy((10**11,))(folder, watched)
-    with path.open("r+b") as file:
-        file.truncate(4 * 10**11 + 128)
-    return path, {}
-
-
-def pickle_npy(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
+def pickle_npy(folder: Path, watched: Path) -> Made:
     """Objects in a .npy."""
     np.save(folder / "x.npy", np.array([Evil(watched)], object), allow_pickle=True)
     return folder / "x.npy", {}
 
 
-def robot_set(change: Callable[[Path, Any, Path], None]) -> Attack:
+def robot_set(folder: Path, watched: Path, change: Callable[[Path, Any, Path], Any]) -> Made:
     """A LeRobotDataset in which something else is done."""
-
-    def make(folder: Path, watched: Path) -> tuple[Path, dict[str, Any]]:
-        path = lerobot(folder / "set")
-        about = json.loads((path / "meta/info.json").read_text())
-        change(path, about, watched)
-        (path / "meta/info.json").write_text(json.dumps(about))
-        return path, {"field": "tip"}
-
-    return make
+    path = lerobot(folder / "set")
+    about = json.loads((path / "meta/info.json").read_text())
+    change(path, about, watched)
+    (path / "meta/info.json").write_text(json.dumps(about))
+    return path, {"field": "tip"}
 
 
 def named(pattern: str) -> Attack:
     """Data files by this pattern."""
-
-    def change(path: Path, about: Any, watched: Path) -> None:
-        about["data_path"] = pattern
-
-    return robot_set(change)
-
-
-def equal_rows(path: Path, about: Any, *, dictionary: bool) -> None:
-    """A parquet file of 3.6·10^7 equal rows in some KB, as runs of one number, or in pages that become long."""
-    name = "observation.tactile.tip"
-    about["features"][name]["shape"] = [1]
-    batch = pa.record_batch({name: np.zeros(1_000_000, "f4"), "timestamp": np.zeros(1_000_000, "f8")})
-    file = path / "data/chunk-000/file-000.parquet"
-    with pq.ParquetWriter(file, batch.schema, compression="zstd", use_dictionary=dictionary) as writer:
-        for _ in range(36):  # in one group of rows; whole, it does not fit into what an attacked process may take
-            writer.write_batch(batch, row_group_size=64_000_000)
+    return partial(robot_set, change=lambda path, about, watched: about.update(data_path=pattern))
 
 
 def parquet_file(name: str, write: Callable[[Path], Any]) -> Attack:
@@ -324,60 +221,68 @@ def parquet_file(name: str, write: Callable[[Path], Any]) -> Attack:
         about["features"]["observation.tactile.tip"]["shape"] = [1]
         write(path / name)
 
-    return robot_set(change)
+    return partial(robot_set, change=change)
+
+
+def equal_rows(file: Path, *, dictionary: bool) -> None:
+    """A parquet file of 3.6·10^7 equal rows in some KB, as runs of one number, or in pages that become long."""
+    batch = pa.record_batch({"observation.tactile.tip": np.zeros(10**6, "f4"), "timestamp": np.zeros(10**6, "f8")})
+    with pq.ParquetWriter(file, batch.schema, compression="zstd", use_dictionary=dictionary) as writer:
+        for _ in range(36):  # in one group of rows; whole, it does not fit into what an attacked process may take
+            writer.write_batch(batch, row_group_size=64_000_000)
 
 
 def parquet_link(path: Path, about: Any, watched: Path) -> None:
     """A parquet file that is elsewhere."""
-    file = path / "data/chunk-000/file-000.parquet"
+    file = path / DATA
     shutil.move(file, watched.parent / "other.parquet")
     file.symlink_to(watched.parent / "other.parquet")
 
 
+DATA = "data/chunk-000/file-000.parquet"
 ATTACKS: dict[str, Attack] = (
     BAGS
     | {
-        "R1 pickled ends": pickled(ends=True),
-        "R1 pickled readings": pickled(ends=False),
+        "R1 pickled ends": partial(pickled, ends=True),
+        "R1 pickled readings": partial(pickled, ends=False),
         "R1 pickle that compresses": pickled_by_lies,
         "R2 a block far away": blosc(0x20, 4096 * 19, 2**31 - 1),
         "R2 copied from behind the frame": blosc(2, 4096 * 19, 4096 * 19 + 16),
-        "R2 of items of none": blosc(0x21, 0, 20),
-        "R2 format 3": blosc_3,
-        "R2 a chunk that is a link": entry("0.0", "link"),
-        "R3 external storage": hdf5(external),
-        "R3 external storage in a FIFO": hdf5(external_fifo),
-        "R3 virtual": hdf5(virtual),
-        "R3 external link": hdf5(linked),
-        "R7 zarr: a chunk that is a FIFO": entry("0.0", "fifo"),
-        "R7 zarr: a chunk that is a device": entry("0.0", "device"),
-        "R7 zarr: a chunk that is a socket": entry("0.0", "socket"),
-        "R7 zarr: .zarray that is a FIFO": entry(".zarray", "fifo"),
-        "R7 zarr: .zarray that is a link": entry(".zarray", "link"),
+        "R2 a chunk that is a link": partial(entry, name="0.0", kind="link"),
+        "R3 external storage": partial(hdf5, fill=external),
+        "R3 external storage in a FIFO": partial(hdf5, fill=partial(external, fifo=True)),
+        "R3 virtual": partial(hdf5, fill=partial(elsewhere, is_link=False)),
+        "R3 external link": partial(hdf5, fill=partial(elsewhere, is_link=True)),
+        "R7 zarr: a chunk that is a FIFO": partial(entry, name="0.0", kind="fifo"),
+        "R7 zarr: a chunk that is a device": partial(entry, name="0.0", kind="device"),
+        "R7 zarr: .zarray that is a FIFO": partial(entry, name=".zarray", kind="fifo"),
+        "R7 zarr: .zarray that is a link": partial(entry, name=".zarray", kind="link"),
         "R7 zarr: a chunk's folder that is a link": through_a_folder,
-        "R7 zarr: rows never written": zarr_of(shape=[10**12, 19]),
-        "R7 zarr: chunks of one number, never written": zarr_of(shape=[10**7, 100], chunks=[1, 1]),
-        "R7 zarr: chunks beyond memory": zarr_of(shape=[10, 19], chunks=[10**12, 19]),
-        "R7 zarr: deflated": deflated,
+        "R7 zarr: rows never written": partial(zarr_of, shape=[10**12, 19]),
+        "R7 zarr: chunks of one number, never written": partial(zarr_of, shape=[10**7, 100], chunks=[1, 1]),
+        "R7 zarr: chunks beyond memory": partial(zarr_of, shape=[10, 19], chunks=[10**12, 19]),
+        "R7 zarr: deflated": partial(zarr_of, compressor={"id": "zlib", "level": 9}, chunk=zeros),
         "R7 zarr: zip": zip_bomb,
-        "R7 zarr: fill of another type": zarr_of(fill_value="x" * 1000),
-        "R7 zarr: deep": zarr_of(shape=json.loads("[" * 400 + "]" * 400)),
-        "R7 hdf5: rows never written": hdf5(never_written),
-        "R7 hdf5: deep": hdf5(deep),
-        "R7 hdf5: deflated": hdf5(bomb),
-        "R7 npy: rows of nothing": npy((10**10, 0)),
-        "R7 npy: sparse": sparse,
+        "R7 zarr: fill of another type": partial(zarr_of, fill_value="x" * 1000),
+        "R7 zarr: deep": partial(zarr_of, shape=json.loads("[" * 400 + "]" * 400)),
+        "R7 hdf5: rows never written": partial(
+            hdf5, fill=lambda file, _: file.create_dataset("tactile", (10**12, 19), "f4", chunks=(1024, 19))
+        ),
+        "R7 hdf5: deep": partial(hdf5, fill=deep),
+        "R7 hdf5: deflated": partial(hdf5, fill=bomb),
+        "R7 npy: rows of nothing": partial(npy, shape=(10**10, 0)),
+        "R7 npy: sparse": partial(npy, shape=(10**11,), size=4 * 10**11 + 128),
         "R7 npy: pickle": pickle_npy,
         "R7 lerobot: names by width": named("data/{chunk_index:0999999999d}.parquet"),
         "R7 lerobot: names by attribute": named("data/{chunk_index.__class__}.parquet"),
         "R7 lerobot: names that climb": named("../watched/{chunk_index}.parquet"),
-        "R7 lerobot: equal rows": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=True)),
-        "R7 lerobot: long pages": robot_set(lambda path, about, _: equal_rows(path, about, dictionary=False)),
-        "R7 lerobot: a link": robot_set(parquet_link),
+        "R7 lerobot: equal rows": parquet_file(DATA, partial(equal_rows, dictionary=True)),
+        "R7 lerobot: long pages": parquet_file(DATA, partial(equal_rows, dictionary=False)),
+        "R7 lerobot: a link": partial(robot_set, change=parquet_link),
     }
     | {f"R7 lerobot: {name}": parquet_file(*file) for name, file in PARQUETS.items()}
     | {
-        f"R7 {kind}: {name}": alone(name, kind)
+        f"R7 {kind}: {name}": partial(alone, name=name, kind=kind)
         for name in ("x.npy", "x.csv", "x.h5", "x.mcap", "x.bag", "x.db3", "x.zarr.zip")
         for kind in ("fifo", "socket", "device")
     }

@@ -127,7 +127,7 @@ def moved(place):
     [
         *((linked, place) for place in PLACES),
         *((moved, place) for place in PLACES[::2]),
-        *zip((piped, of_holes), PLACES),
+        *zip((piped, of_holes), PLACES, strict=False),
     ],
 )
 def test_only_regular_files_of_a_size_that_is_written_in_real_folders_are_read(path, do, place):

@@ -10,7 +10,7 @@ import pytest
 import scroll_tactile_store.log
 import scroll_tactile_store.log_writer
 from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest
-from scroll_tactile_store import DamageError, RecordError, StoreClosedError, StoreError, StoreFullError
+from scroll_tactile_store import DamageError, RecordError, StoreClosedError, StoreError
 from scroll_tactile_store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
 from scroll_tactile_store.log import LogPlace, LogReader
 from scroll_tactile_store.log_file import PART
@@ -358,56 +358,19 @@ def test_a_place_behind_the_last_number_that_there_can_be_is_refused(whole, tmp_
 # Full disks, short writes, errors of the disk.
 
 
-class Failing:
-    """A writer's file of which one call in a while fails."""
-
-    def __init__(self, monkeypatch, log):
-        self.left = {}
-        self.code = errno.EIO
-        write, sync, cut = log._file.write, os.fdatasync, os.ftruncate
-        monkeypatch.setattr(log._file, "write", self.failing("write", write, part=True))
-        monkeypatch.setattr(os, "fdatasync", self.failing("fdatasync", sync))
-        monkeypatch.setattr(os, "ftruncate", self.failing("ftruncate", cut))
-
-    def failing(self, name, call, *, part=False):
-        def called(*given):
-            if self.left.get(name, 0):
-                self.left[name] -= 1
-                if part:
-                    call(given[0], given[1][: len(given[1]) // 2])
-                raise OSError(self.code, os.strerror(self.code))
-            return call(*given)
-
-        return called
-
-
-@pytest.mark.parametrize("name", ["write", "fdatasync"])
-@pytest.mark.parametrize(("code", "error"), [(errno.EIO, StoreError), (errno.ENOSPC, StoreFullError)])
-def test_a_failed_append_leaves_the_log_as_it_was(tmp_path, monkeypatch, name, code, error):
-    path = build(tmp_path / "log")
-    with LogWriter(path) as log, LogReader(path) as beside:
-        failing = Failing(monkeypatch, log)
-        failing.code = code
-        beside.refresh()
-        for round_ in range(3):
-            failing.left = {name: 2 if name == "write" else 1}  # without room it tries once more, without zeros
-            with pytest.raises(error):
-                log.append(KIND, b"never" * 200)
-            failing.left = {}
-            kept = [*BATCHES, *([b"%d" % i] for i in range(round_))]
-            assert read(path) == kept
-            log.append(KIND, b"%d" % round_)
-            assert path.stat().st_size == AHEAD  # the room ahead is made again
-            assert read(path) == [*kept, [b"%d" % round_]]
-
-
 def test_a_reader_learns_that_what_it_read_was_taken_back(tmp_path, monkeypatch):
+    """`faults/each_call.py` has every call fail; here the file could not be cut off either."""
+
+    def fails(*_):
+        raise OSError(errno.EIO, "the disk")
+
     path = build(tmp_path / "log")
     with LogWriter(path) as log, LogReader(path) as beside:
-        failing = Failing(monkeypatch, log)
-        failing.left = {"fdatasync": 1, "ftruncate": 1}
-        with pytest.raises(StoreError):
-            log.append(KIND, b"not durable")
+        with monkeypatch.context() as broken:
+            broken.setattr(os, "fdatasync", fails)
+            broken.setattr(os, "ftruncate", fails)
+            with pytest.raises(StoreError):
+                log.append(KIND, b"not durable")
         assert rest(beside) == [*BATCHES, [b"not durable"]]
         log.append(KIND, b"in its place")
         with pytest.raises(StoreError, match="took a batch back"):

@@ -34,7 +34,7 @@ from scroll_tactile_store.encoding import decode_payload, encode_payload
 from scroll_tactile_store.framing import FRAME_BYTES, read_frame
 
 from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
-from faults.places import Attack, Scene, leftover, strange_file
+from faults.places import Attack, Scene, strange_file
 from scroll_tactile.memory.touch_rows import pack_codes, unpack_readings
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
@@ -254,6 +254,6 @@ CLASSES: dict[str, tuple[Attack, ...]] = {
     "checkpoints": (forged_checkpoint,),
     "currents": (forged_current,),
     "bytes": (spoiled_bytes,) * 2 + (spoiled_frames,),
-    "files": (strange_file,) * 4 + (leftover,),
+    "files": (strange_file,),
 }
 FORGED = ("rows", "identities", "checkpoints", "currents")

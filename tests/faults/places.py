@@ -73,18 +73,3 @@ def strange_file(rng: random.Random, path: Path, scene: Scene) -> str:
     elif moved.exists() and "moved" not in kind:
         shutil.rmtree(moved)
     return f"{name}: {kind}"
-
-
-def leftover(rng: random.Random, path: Path, scene: Scene) -> str:
-    """What a writer, a repair or somebody else left beside what counts: logs and checkpoints of other memories."""
-    other = rng.choice(scene.others)
-    log = min(other.glob("log-*"))
-    name = rng.choice(("log-00000009", "log-00000009.new", "log-00000001.damaged", "CURRENT.new", "CURRENT.damaged"))
-    data = rng.choice((log.read_bytes(), (other / "CURRENT").read_bytes(), rng.randbytes(100), b""))
-    (path / name).write_bytes(data)
-    groups = sorted((other / "checkpoints").glob("[0-9]*"))
-    if groups and rng.random() < 0.7:
-        to = rng.choice(("00000099", "00000099.partial", "00000001.damaged", "00000001.damaged-2"))
-        shutil.copytree(groups[0], path / "checkpoints" / to, dirs_exist_ok=True)
-        name += f", {to}"
-    return name

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from numcodecs import blosc, zstd
 from scroll_tactile_store import DamageError, RecordError, Store, VersionError, check_store, encoding
 from scroll_tactile_store.compression import compress, decompress, decompress_zstd
-from scroll_tactile_store.encoding import decode_payload, encode_payload
 from store_builds import taking_at_most
 
 from scroll_tactile.recordings.arrays.blosc import decompress_blosc
@@ -83,31 +82,6 @@ def test_arrays_in_a_newer_format_are_told_from_damage(plain):
     put_row(plain, payload=payload([], version=2))
     with Store.open(plain, mode="read") as opened, pytest.raises(VersionError, match=r"format 2; .* upgrade"):
         list(opened.records())
-
-
-ARRAYS = {
-    "levels": np.arange(4000, dtype=np.uint8).reshape(10, 400),
-    "text": np.array(["wool", "silk ü"]),
-    "flags": np.arange(300) % 2 == 0,
-    "none": np.zeros((0, 3)),
-    "one": np.array(1.5),
-}
-
-
-@settings(deadline=None, max_examples=100)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_a_harmed_payload_is_refused_or_read_and_nothing_else(seed):
-    rng, content = np.random.default_rng(seed), bytearray(encode_payload(ARRAYS))
-    for _ in range(rng.integers(1, 4)):
-        content[int(rng.integers(len(content) if rng.random() < 0.5 else 120))] = int(rng.integers(256))
-    if rng.random() < 0.2:
-        del content[int(rng.integers(len(content))) :]
-    try:
-        decode_payload(bytes(content))
-    except ValueError:
-        pass
-    except VersionError as error:
-        assert "upgrade" in str(error)
 
 
 @pytest.mark.parametrize(

@@ -98,24 +98,6 @@ def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, curren
     assert agrees(plain, latest=15)
 
 
-@pytest.mark.parametrize("which_one", ["newest", "compaction"])
-@pytest.mark.parametrize("change", [{"number": 9}, {"sha256": "0" * 64}, {"last_sequence": 14}])
-def test_a_checkpoint_that_is_another_than_the_one_named_is_not_believed(compacted, which_one, change):
-    known = get_current(compacted)[which_one]
-    change = change | ({"last_sequence": 5} if "last_sequence" in change and which_one == "compaction" else {})
-    set_current(compacted, **{which_one: known | change})
-    with Store.open(compacted, mode="read") as opened:
-        if which_one == "newest":
-            assert opened.latest().last_sequence == 6
-        else:
-            with pytest.raises(DamageError, match="checkpoint"):
-                opened.compaction()
-            assert opened.latest().last_sequence == 15
-    assert damage(compacted)
-    repair_store(compacted)
-    assert damage(compacted) == []
-
-
 def test_a_log_and_a_checkpoint_of_another_store_are_not_believed(plain, tmp_path):
     with Store.open(tmp_path / "other", identity=IDENTITY | {"other": True}) as other:
         for number in range(1, 4):

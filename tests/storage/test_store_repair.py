@@ -1,10 +1,12 @@
 """Repairing a store: the longest part that verifies is kept, what is lost is named, and nothing is thrown away."""
 
+import itertools
 import os
 import random
 import re
 import shutil
 import subprocess
+from functools import partial
 
 import pytest
 import scroll_tactile_store.repair
@@ -275,26 +277,21 @@ class KilledError(BaseException):
     pass
 
 
-def steps_of(monkeypatch, last):
-    """Kill the repair before or after its step `last`: a step is a rename, a sync, or a removal."""
+def killed_at(monkeypatch, step):
+    """Kill the repair before or after its step of this number: a rename, a sync or a removal. Steps so far."""
     count = [0]
 
-    def killing(owner, name):
-        real = getattr(owner, name)
-
-        def step(*args, **options):
-            count[0] += 1
-            if count[0] == last and last % 2:
-                raise KilledError
-            done = real(*args, **options)
-            if count[0] == last:
-                raise KilledError
-            return done
-
-        monkeypatch.setattr(owner, name, step)
+    def killing(real, *args, **options):
+        count[0] += 1
+        if count[0] == step and step % 2:
+            raise KilledError
+        done = real(*args, **options)
+        if count[0] == step:
+            raise KilledError
+        return done
 
     for name in ("rename", "replace", "fsync", "unlink", "rmdir"):
-        killing(os, name)
+        monkeypatch.setattr(os, name, partial(killing, getattr(os, name)))
     return count
 
 
@@ -311,12 +308,11 @@ def test_killed_at_any_step_it_can_be_begun_again(stores, tmp_path, monkeypatch,
         (source / "CURRENT").unlink()
     whole = shutil.copytree(source, tmp_path / "whole")
     expected = repair_store(whole)
-    i = interrupted = 0
-    while True:
-        i += 1
+    interrupted = 0
+    for i in itertools.count(1):
         path = shutil.copytree(source, tmp_path / str(i))
         with monkeypatch.context() as broken:
-            count = steps_of(broken, i)
+            count = killed_at(broken, i)
             try:
                 repair_store(path)
             except KilledError:

@@ -35,7 +35,7 @@ from forging import (
 )
 from numcodecs import zstd
 
-from faults.places import Attack, Scene
+from faults.attacks import Attack, Scene
 from scroll_tactile.memory.touch_rows import pack_codes
 
 Folder = Callable[[Path], object]

@@ -119,12 +119,6 @@ def taking_at_most(size):
         tracemalloc.stop()
 
 
-def torn(path, cut):
-    """Cut the log off at a byte, as a power cut may."""
-    file = log_of(path)
-    file.write_bytes(file.read_bytes()[:cut])
-
-
 def damage(path):
     return [problem for problem in check_store(path) if problem.kind != "leftover"]
 

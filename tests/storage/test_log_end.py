@@ -1,5 +1,7 @@
 """The end of a log: what `CURRENT`, a checkpoint or a batch proves of it, and what a power cut may have torn."""
 
+import os
+
 import numpy as np
 import pytest
 from forging import log_of
@@ -21,11 +23,6 @@ def ends(log):
     """Where the header and each batch end."""
     begin, _, commits = ends_of(log)
     return [begin, *commits]
-
-
-def cut(log, end):
-    with log.open("r+b") as file:
-        file.truncate(end)
 
 
 def require_named(path, rows, kept):
@@ -54,7 +51,7 @@ def test_a_closed_log_that_is_cut_off_or_flipped_at_its_end_is_damaged(tmp_path,
     if flipped:
         flip(log, -100)
     else:
-        cut(log, ends(log)[kept])
+        os.truncate(log, ends(log)[kept])
     require_named(tmp_path / "s", 4, kept)
 
 
@@ -62,7 +59,7 @@ def test_a_log_that_had_a_row_and_has_none_is_damaged_though_nobody_closed_it(tm
     with Store.open(tmp_path / "s", identity={}) as store:
         store.append("add", "", b"")
         path = as_after_a_crash(store, tmp_path / "crashed")
-    cut(log_path(path, 1), ends(log_path(path, 1))[0])
+    os.truncate(log_path(path, 1), ends(log_path(path, 1))[0])
     require_named(path, 1, 0)
 
 
@@ -74,7 +71,7 @@ def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, b
         store.commit({}, last_sequence=2)
         store.append("add", "behind it", b"")
         path = as_after_a_crash(store, tmp_path / "crashed")
-    cut(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
+    os.truncate(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
     with pytest.raises(DamageError, match="repair the store"):
         Store.open(path)
     with Store.open(path, mode="read") as store:
@@ -106,7 +103,7 @@ def test_a_store_that_says_nothing_of_it_is_read_as_before(tmp_path):
     log = made(tmp_path / "s")
     current = read_current(tmp_path / "s" / CURRENT_FILE)
     write_current(tmp_path / "s", type(current)(current.log, current.log_identity))
-    cut(log, ends(log)[2])
+    os.truncate(log, ends(log)[2])
     with Store.open(tmp_path / "s") as store:
         assert store.last == 2
 

@@ -16,12 +16,12 @@ from store_builds import (
     agrees,
     commit,
     contents,
+    cut_rows,
     damage,
     flip,
     folders,
     in_turns,
     newest,
-    torn,
 )
 
 HARMS = {
@@ -87,7 +87,7 @@ def test_of_several_logs_the_one_with_the_last_row_is_gone_on_from(plain, curren
     other = log_path(plain, 3)
     shutil.copy(log_of(plain), other)
     with Store.open(plain, mode="read"):
-        torn(plain, frames_of(plain)[19].offset)
+        cut_rows(plain, 19)
     if current == "of now":
         log_of(plain).rename(log_path(plain, 2))
         set_current(plain, log=[7, get_current(plain)["log"][1]])

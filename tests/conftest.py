@@ -61,7 +61,7 @@ def shared_tables() -> Iterator[None]:
         yield
 
 
-BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_hostile_checkpoints", "test_quick_checkpoints")
+BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_hostile_checkpoints")
 """What is about the writing itself."""
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quick_checkpoints import array_about
 from scroll_tactile_store import Store
 from scroll_tactile_store.chunks import ArrayContent
 from scroll_tactile_store.encoding import array_digest, check_arrays, encode_payload
@@ -291,24 +292,12 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
 
 def put_array(folder: Path, array: np.ndarray) -> list[str]:
     """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
-    plain = ArrayContent(array.dtype, array.shape, "").to_plain(array)
-    codec = {"name": "bytes"} | ({"configuration": {"endian": "little"}} if plain.dtype.itemsize > 1 else {})
-    meta = {
-        "shape": list(plain.shape),
-        "data_type": "bool" if plain.dtype.kind == "b" else plain.dtype.name,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [max(n, 1) for n in plain.shape]}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "fill_value": False if plain.dtype.kind == "b" else 0,
-        "codecs": [codec],
-        "attributes": {"dtype": array.dtype.str},
-        "zarr_format": 3,
-        "node_type": "array",
-        "storage_transformers": [],
-    }
+    content = ArrayContent(array.dtype, array.shape, "")
+    plain = content.to_plain(array)
     chunk = folder.joinpath("c", *["0"] * plain.ndim)
     shutil.rmtree(folder / "c", ignore_errors=True)  # of other axes
     chunk.parent.mkdir(parents=True, exist_ok=True)
-    (folder / "zarr.json").write_text(json.dumps(meta), encoding="utf-8")
+    (folder / "zarr.json").write_text(json.dumps(array_about(array, content, None)), encoding="utf-8")
     data = np.ascontiguousarray(plain).tobytes()
     if not plain.size:
         return []

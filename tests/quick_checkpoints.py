@@ -1,6 +1,6 @@
 """Checkpoints as zarr writes them, byte for byte, a hundred times as fast: most tests write some by the way.
 
-Tests of the writing have zarr write them, as the store does (see conftest.py); tests/storage/test_quick_checkpoints.py
+Tests of the writing have zarr write them, as the store does (see conftest.py); tests/storage/test_store_commit.py
 compares the files of both.
 """
 
@@ -30,8 +30,8 @@ class Group:
         (self._path / "zarr.json").write_text(json.dumps(about, indent=self._indent))
 
 
-def _about(array: np.ndarray, content: ArrayContent, level: int | None) -> dict[str, Any]:
-    """The description of an array."""
+def array_about(array: np.ndarray, content: ArrayContent, level: int | None) -> dict[str, Any]:
+    """What zarr says of an array."""
     plain: dict[str, Any] = {"name": "bytes"}
     if content.plain.itemsize > 1:
         plain["configuration"] = {"endian": "little"}
@@ -65,7 +65,7 @@ def write_zarr(
     for name, array in draft.arrays.items():
         content = described[name]
         (path / name).mkdir()
-        (path / name / "zarr.json").write_text(json.dumps(_about(array, content, level), indent=indent))
+        (path / name / "zarr.json").write_text(json.dumps(array_about(array, content, level), indent=indent))
         for place in content.places(content.chunk):
             file = (path / name).joinpath("c", *map(str, place))
             file.parent.mkdir(parents=True, exist_ok=True)

@@ -6,8 +6,12 @@ Each returns what it did. `watched` is a folder that is none of the memory's: no
 from __future__ import annotations
 
 import json
+import os
 import random
+import shutil
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,19 +38,81 @@ from scroll_tactile_store.encoding import decode_payload, encode_payload
 from scroll_tactile_store.framing import FRAME_BYTES, read_frame
 
 from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
-from faults.places import Attack, Scene, leftover, strange_file
 from scroll_tactile.memory.touch_rows import pack_codes, unpack_readings
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
 
+
+@dataclass(frozen=True)
+class Scene:
+    """Where an attack takes place. others: further memories; codes: the rows of codes of a touch, by scale."""
+
+    watched: Path
+    others: tuple[Path, ...] = ()
+    codes: Any = None
+
+
+Attack = Callable[[random.Random, Path, Scene], str]
+
+
+STRANGE_FILES = ("LOG", "LOG", "CURRENT", "CURRENT", "CURRENT.new", "log-00000009", "log-00000009.new", "lock")
+STRANGE_FILES += ("LOG.damaged", "log-x", "holder.json", "holder.json.new", "checkpoints", "GROUP", "GROUP/zarr.json")
+STRANGE_FILES += ("ARRAY", "ARRAY/zarr.json", "ARRAY/c", "ARRAY/c/0", "checkpoints/99999999", "GROUP.damaged")
+STRANGE_FILES += ("checkpoints/00000099.partial", "derived", "derived/x")
+ODD = ("link", "link", "link", "loop", "nowhere", "pipe", "device", "folder", "sparse", "hard", "socket")
+INSIDE = ("12345", "file", "memory", "memory/CURRENT", "12345/data", ".", "memory/checkpoints")
+DEVICES = tuple(map(Path, ("/dev/zero", "/dev/full", "/proc/self/mem")))
+
+
+def strange_file(rng: random.Random, path: Path, scene: Scene) -> str:
+    """A link, a pipe, a device, a folder or a file of a terabyte in the place of a file or folder, or beside them."""
+    name = rng.choice(STRANGE_FILES)
+    target = path / name.replace("LOG", min(log.name for log in path.glob("log-*")))
+    if name.startswith(("GROUP", "ARRAY")):
+        groups = sorted((path / "checkpoints").glob("[0-9]*"))
+        if not groups:
+            return "no checkpoint"
+        first = groups[0]
+        array = rng.choice(sorted(folder.parent for folder in first.glob("*/zarr.json")))
+        target = path / name.replace("GROUP", str(first)).replace("ARRAY", str(array))
+    kind = rng.choice(ODD)
+    moved = path.parent / "moved"
+    if os.path.lexists(target):
+        target.rename(moved)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "link":
+        to = rng.choice((*(scene.watched / name for name in INSIDE), moved, *DEVICES))
+        target.symlink_to(to)
+        kind = f"link to {to.name}"
+    elif kind in ("loop", "nowhere"):
+        target.symlink_to(target if kind == "loop" else scene.watched / "new")
+    elif kind in ("pipe", "device", "socket"):
+        kinds = {"pipe": 0o010600, "device": 0o020600, "socket": 0o140600}
+        os.mknod(target, kinds[kind], os.makedev(1, 5))
+    elif kind == "folder":
+        target.mkdir()
+        (target / "12345").mkdir()
+        (target / "file").write_text("x")
+    elif kind == "sparse":
+        with target.open("wb") as file:
+            if moved.is_file():
+                file.write(moved.read_bytes())
+            file.truncate(rng.choice((2**31, 2**40)))
+    else:
+        os.link(scene.watched / "file", target)
+    if moved.is_symlink() or moved.is_file():
+        moved.unlink()
+    elif moved.exists() and "moved" not in kind:
+        shutil.rmtree(moved)
+    return f"{name}: {kind}"
+
+
 KINDS = ("observe",) * 12 + ("retract", "retract", "describe", "describe", "merge", "member", "x", "", "OBSERVE")
 
-SPANS: tuple[Any, ...] = ([[1, 1]], [[1, 10**12]], [[2, 1]], [[0, 0]], [[-5, 1]], [[1, 1], [1, 1]], [[99, 99]], None)
-SPANS += ([[1, 2], [2, 3]], "x", [], [[]], [1], [[1, 1, 1]], [[True, 1]], [[1.0, 1]])
-SHARES: tuple[Any, ...] = ({"x": 1.0}, {"x": 2.0}, {"x": float("nan")}, "x", [], {"wool": "x"}, {"": True}, {"x": 1})
-SHARES += ({"a\nb": None}, {}, None, 5, {"x": {"y": 1}}, {"x": True, "y": 0.7})
-TIMES = (1e14, -1e14, float("inf"), 0, -1, 1e308, 253402300800.0)
-SEQUENCES = (1, 2, 3, -1, 0, 50, 2**40, 2**63 - 1, -(2**63))
+SPANS: tuple[Any, ...] = ([[1, 1]], [[1, 10**12]], [[2, 1]], [[-5, 1]], [[99, 99]], [], [1], [[True, 1]], None)
+SHARES: tuple[Any, ...] = ({"x": 1.0}, {"x": float("nan")}, "x", {"wool": "x"}, {"a\nb": None}, {}, None, {"x": True})
+TIMES = (1e14, float("inf"), -1, 253402300800.0)
+SEQUENCES = (1, 3, -1, 0, 2**40, 2**63 - 1, -(2**63))
 
 
 def forged_row(rng: random.Random, path: Path, scene: Scene) -> str:
@@ -142,12 +208,8 @@ def forged_checkpoint(rng: random.Random, path: Path, scene: Scene) -> str:
     """A checkpoint whose description, arrays and place in `CURRENT` agree, and are not what a memory has."""
     number = rng.choice(named_in(path))["number"]
     known = described(path, number)
-    way = rng.choice(("attributes", "attributes", "known", "arrays", "arrays", "arrays", "metadata"))
-    if way == "attributes":
-        told, text = mutated_json(rng, known["attributes"])
-        with suppress(ValueError, RecursionError):
-            seal(path, number, known | {"attributes": json.loads(text)})
-    elif way == "known":
+    way = rng.choice(("known", "known", "arrays", "arrays", "metadata"))
+    if way == "known":
         told, text = mutated_json(rng, known)
         with suppress(ValueError, RecursionError, TypeError):
             seal(path, number, json.loads(text))
@@ -169,40 +231,20 @@ def forged_checkpoint(rng: random.Random, path: Path, scene: Scene) -> str:
 def forged_current(rng: random.Random, path: Path, scene: Scene) -> str:
     """A `CURRENT` that verifies, and names something else."""
     current = get_current(path)
-    named = [name for name in ("newest", "compaction") if current[name]]
-    way = rng.choice(("place", "place", "number", "swap", "log", "json")) if named else rng.choice(("log", "json"))
-    name = rng.choice(named) if named else ""
-    told = name
-    if way == "place":
-        at = rng.randrange(3)
-        there = _places(path)
-        value = rng.choice((*NUMBERS, "00" * 16, "x")) if rng.random() < 0.3 else None
-        if value is None:
-            current[name]["place"] = rng.choice(there)
-        else:
-            current[name]["place"][at] = value
-        told += f" {current[name]['place']}"
-    elif way == "number":
-        key = rng.choice(("number", "last_sequence", "sha256"))
-        current[name][key] = rng.choice((*NUMBERS, "0" * 64, None, 1, 2, 3, 4, 5))
-        told += f" {key} {current[name][key]}"
-    elif way == "swap":
-        newest, compaction = current["newest"], current["compaction"]
-        ways = ((None, newest), (newest, newest), (compaction, newest), (None, None))
-        current["newest"], current["compaction"] = rng.choice(ways)
-    elif way == "log":
-        current["log"] = rng.choice(
-            ([1, rng.randbytes(8).hex()], [2, current["log"][1]], [2**63, current["log"][1]], [], [1], "x", None)
-        )
-        told = str(current["log"])
+    known: Any = {key: value for key, value in current.items() if key != "sha256"}
+    if (named := [name for name in ("newest", "compaction") if current[name]]) and rng.random() < 0.5:
+        name, frames = rng.choice(named), _frames(path)
+        i = rng.randrange(len(frames))
+        known[name]["place"] = [sum(map(len, frames[: i + 1])), i + 1, frames[i][72:88].hex()]
+        told = f"place of {name}: {known[name]['place']}"
     else:
-        told, text = mutated_json(rng, {key: value for key, value in current.items() if key != "sha256"})
-        with suppress(ValueError, RecursionError, TypeError, AttributeError):
-            current = json.loads(text)
+        told, text = mutated_json(rng, known)
+        with suppress(ValueError, RecursionError):
+            known = json.loads(text)
     with suppress(TypeError, AttributeError, UnicodeEncodeError):
-        current = sealed(current)
-    (path / "CURRENT").write_text(json.dumps(current), encoding="utf-8")
-    return f"{way}: {told}"
+        known = sealed(known)
+    (path / "CURRENT").write_text(json.dumps(known), encoding="utf-8")
+    return told
 
 
 def _frames(path: Path) -> list[bytes]:
@@ -215,56 +257,39 @@ def _frames(path: Path) -> list[bytes]:
     return found
 
 
-def _places(path: Path) -> list[Any]:
-    at, places = 0, []
-    for number, frame in enumerate(_frames(path), 1):
-        at += len(frame)
-        places.append([at, number, frame[72:88].hex()])
-    return places
+def _reordered(rng: random.Random, parts: list[bytes], others: list[bytes]) -> str:
+    """Have rows, or frames, in another order: swapped, doubled, taken out, of another memory, or with other bytes."""
+    i, j = rng.randrange(len(parts)), rng.randrange(len(parts))
+    way = rng.choice(("swapped", "doubled", "taken out", "other", "bytes"))
+    if way == "swapped":
+        parts[i], parts[j] = parts[j], parts[i]
+    elif way == "doubled":
+        parts.insert(j, parts[i])
+    elif way == "taken out":
+        del parts[min(i, j) : max(i, j) + 1]
+    elif way == "other":
+        parts[i : i + rng.randrange(2)] = [rng.choice(others)]
+    else:
+        way, parts[i] = mutated_bytes(rng, parts[i], parts)
+    return f"{way}: {i}, {j}"
 
 
 def spoiled_frames(rng: random.Random, path: Path, scene: Scene) -> str:
-    """The frames of a log, as they are, in another order: swapped, doubled, taken out, of another log, cut off."""
+    """The frames of a log in another order, each as it is."""
     frames, data = _frames(path), log_of(path).read_bytes()
     rest = data[sum(map(len, frames)) :]
-    i, j = rng.randrange(len(frames)), rng.randrange(len(frames))
-    way = rng.choice(("swapped", "doubled", "taken out", "other", "cut", "zeros", "behind"))
-    if way == "swapped":
-        frames[i], frames[j] = frames[j], frames[i]
-    elif way == "doubled":
-        frames.insert(j, frames[i])
-    elif way == "taken out":
-        del frames[min(i, j) : max(i, j) + 1]
-    elif way == "other":
-        frames[i : i + 1] = [*rng.choice((frames[i : i + 1], [])), rng.choice(_frames(rng.choice(scene.others)))]
-    elif way == "cut":
-        del frames[i:]
-        rest = b""
-    elif way == "zeros":
-        frames[i] = bytes(len(frames[i]))
-    else:
-        rest = rng.choice((b"".join(_frames(rng.choice(scene.others))), rng.randbytes(5000), bytes(2**20)))
-    log_of(path).write_bytes(b"".join(frames) + rest)
-    return f"{way}: {i}, {j} of {len(frames)}"
+    others = _frames(rng.choice(scene.others))
+    told = _reordered(rng, frames, others)
+    log_of(path).write_bytes(b"".join(frames) + rng.choice((rest, rest, b"".join(others), bytes(2**20))))
+    return told
 
 
 def forged_log(rng: random.Random, path: Path, scene: Scene) -> str:
-    """The rows of a log in another order, with right checksums: swapped, doubled, taken out, of another memory."""
+    """The rows of a log in another order, with right checksums."""
     rows = read_log(path)[1]
-    i, j = rng.randrange(len(rows)), rng.randrange(len(rows))
-    way = rng.choice(("swapped", "doubled", "taken out", "other", "bytes"))
-    if way == "swapped":
-        rows[i], rows[j] = rows[j], rows[i]
-    elif way == "doubled":
-        rows.insert(j, rows[i])
-    elif way == "taken out":
-        del rows[min(i, j) : max(i, j) + 1]
-    elif way == "other":
-        rows[i : i + 1] = [*rng.choice((rows[i : i + 1], [])), rng.choice(read_log(rng.choice(scene.others))[1])]
-    else:
-        way, rows[i] = mutated_bytes(rng, rows[i], rows)
+    told = _reordered(rng, rows, read_log(rng.choice(scene.others))[1])
     write_log(path, rows)
-    return f"{way}: {i}, {j} of {len(rows)}"
+    return told
 
 
 def _is_name(name: str) -> bool:
@@ -297,6 +322,6 @@ CLASSES: dict[str, tuple[Attack, ...]] = {
     "checkpoints": (forged_checkpoint,),
     "currents": (forged_current,),
     "bytes": (spoiled_bytes,) * 2 + (spoiled_frames,),
-    "files": (strange_file,) * 4 + (leftover,),
+    "files": (strange_file,),
 }
 FORGED = ("rows", "identities", "checkpoints", "currents")

@@ -14,13 +14,12 @@ from scroll_tactile_store.encoding import decode_payload, encode_payload
 from scroll_tactile_store.records import from_json
 from touches import stream
 
-from faults.attacks import CLASSES, FORGED, made_row
+from faults.attacks import CLASSES, FORGED, Attack, Scene, made_row
 from faults.cases import Cases, Finding, Told, Wrong, remove, size
 from faults.common import fingerprint, warnings_told
 from faults.learners import opened
 from faults.mutants import mutated_payload
 from faults.named import NAMED, REFUSED
-from faults.places import Attack, Scene
 from faults.received import OURS, READING, WRITING, Case, Memory, Reader, Target, check, corpus, merge, read
 from scroll_tactile import TactileLearner
 from scroll_tactile.memory.touch_rows import pack_codes

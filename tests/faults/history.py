@@ -1,10 +1,14 @@
 """Ten thousand steps of random histories against the model: `python tests/faults/history.py --steps 10000 --seed 0`."""
 
+from __future__ import annotations
+
 import argparse
 import itertools
 import shutil
 import sys
 import tempfile
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -26,16 +30,44 @@ from hypothesis.stateful import (
 from touches import SMALL, SmallSample, contents, stream
 
 from faults.common import parser, progress, run
-from faults.learned_files import learn_files
 from faults.learners import KIT, expected, fed, opened, perform, seen, unsound_copies
-from faults.model import State, after
+from faults.model import Pairs, State, after
 from faults.plans import KINDS, draw, prepare, touch
+from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.learning.sources import SourceOptions
 from scroll_tactile.errors import StreamError
 from scroll_tactile.statistics.statistics import Statistics
 
 LENGTH = 50
 readouts = st.sampled_from(["lda", "ridge"])
 randoms = st.randoms(use_true_random=False)
+
+
+class Here(Executor):
+    """Runs each job at once, in this process."""
+
+    def submit(self, what: Callable[..., Any], /, *words: Any, **named: Any) -> Future[Any]:
+        """See `Executor.submit`."""
+        future: Future[Any] = Future()
+        future.set_result(what(*words, **named))
+        return future
+
+
+def learn_files(path: Path, state: State, touches: Pairs) -> int:
+    """Have a fleet learn these touches into a memory, which nobody has open; how many came in."""
+    with tempfile.TemporaryDirectory() as home:
+        files = []
+        for number, (material, touch) in enumerate(touches):
+            files.append(Path(home, f"{number:03d}", material, "touch.npy"))
+            files[-1].parent.mkdir(parents=True)
+            np.save(files[-1], stream(touch).astype(np.float32))
+        destination = Path(home, "m")
+        path.rename(destination)  # with what the run keeps beside it
+        made = {"embedding": KIT.embeddings[state.embedding], "client": Here(), "add": True}
+        done = learn(destination, files, SourceOptions(by="folder"), **made)
+        assert not done.refused, done.refused
+        destination.rename(path)
+        return done.observations
 
 
 class History(RuleBasedStateMachine):

@@ -24,7 +24,7 @@ from faults.cases import Wrong
 from faults.common import fingerprint, warnings_told
 from faults.learners import opened, perform, samples
 from faults.model import Operation
-from scroll_tactile import Kernels, TactileLearner
+from scroll_tactile import TactileLearner
 from scroll_tactile.clients.cli import application
 from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import ScrollTactileError
@@ -310,16 +310,6 @@ def refresh(case: Case) -> str:
         return case.judge(learner, warned)
 
 
-def reembed(case: Case) -> str:
-    """Carry it over to another embedding."""
-    with heard(), TactileLearner.open(case.path) as learner:
-        before = learner.materials
-        learner.reembed(Kernels(seed=1, dimension=64))
-        if learner.materials != before:
-            raise Wrong("embedded again, it has other materials")
-    return "carried over"
-
-
 Reader = Callable[[Case], str]
 READING: tuple[Reader, ...] = (read, merge, check, backup, export, inspect)
-WRITING: tuple[Reader, ...] = (write, repair, refresh, reembed)
+WRITING: tuple[Reader, ...] = (write, repair, refresh)

@@ -5,8 +5,9 @@ import tracemalloc
 from contextlib import contextmanager
 
 import numpy as np
+import pytest
 from forging import frames_of, get_current, group_of, log_of, read_log, spoil_row, write_log
-from scroll_tactile_store import Store, check_store
+from scroll_tactile_store import CompactedError, Store, check_store
 from scroll_tactile_store.row_encoding import row_sequence
 
 LAST = 20
@@ -118,12 +119,6 @@ def taking_at_most(size):
         tracemalloc.stop()
 
 
-def torn(path, cut):
-    """Cut the log off at a byte, as a power cut may."""
-    file = log_of(path)
-    file.write_bytes(file.read_bytes()[:cut])
-
-
 def damage(path):
     return [problem for problem in check_store(path) if problem.kind != "leftover"]
 
@@ -132,3 +127,32 @@ def same_arrays(found, given):
     return {name: (array.dtype, array.shape, array.tobytes()) for name, array in found.items()} == {
         name: (array.dtype, array.shape, array.tobytes()) for name, array in given.items()
     }
+
+
+def holds(opened, *, kept=LAST, compacted=0, latest=None, lost=()):
+    """An open store of rows 1 to `kept`, of which those up to `compacted` have no arrays and `lost` are not there."""
+    assert (opened.identity, opened.last, opened.compacted) == (IDENTITY, kept, compacted)
+    rows = [(row.sequence, row.label, row.key, row.attributes) for row in opened.heads()]
+    expected = [n for n in range(1, kept + 1) if n not in lost]
+    assert rows == [(n, f"row {n}", bytes([n]), {"n": n}) for n in expected]
+    rows = [(row.sequence, row.arrays["x"].tobytes()) for row in opened.records(compacted)]
+    assert rows == [(n, values(n).tobytes()) for n in range(compacted + 1, kept + 1)]
+    for number in range(1, compacted + 1):
+        for read in (lambda number: opened.records(number - 1), opened.record):
+            with pytest.raises(CompactedError, match=f"records 1 to {compacted}"):
+                read(number)
+    for found, last_sequence in ((opened.latest(), latest), (opened.compaction(), compacted or None)):
+        assert (found and found.last_sequence) == last_sequence
+        if found:
+            assert found.attributes == {"n": last_sequence}
+            assert same_arrays(found.arrays, state(last_sequence))
+    return True
+
+
+def agrees(path, **expected):
+    """An undamaged store that `holds` this, whoever opens it."""
+    assert damage(path) == []
+    for mode in ("read", "write"):
+        with Store.open(path, mode=mode) as opened:
+            assert holds(opened, **expected)
+    return True

@@ -1,5 +1,6 @@
 """The log: what was committed comes back to the byte, a torn tail is passed over, and damage is named."""
 
+import errno
 import os
 import shutil
 import struct
@@ -9,7 +10,7 @@ import pytest
 import scroll_tactile_store.log
 import scroll_tactile_store.log_writer
 from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest
-from scroll_tactile_store import DamageError, RecordError, StoreClosedError
+from scroll_tactile_store import DamageError, RecordError, StoreClosedError, StoreError
 from scroll_tactile_store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
 from scroll_tactile_store.log import LogPlace, LogReader
 from scroll_tactile_store.log_file import PART
@@ -346,28 +347,50 @@ def test_a_forged_size_is_no_frame(whole, tmp_path, size):
 END = (15, 14, COMMIT, 0, b"")
 
 
-@pytest.mark.parametrize(
-    ("frames", "is_damage"),
-    [
-        ([(2**64 - 1, 14, KIND, 1, b"x")], True),
-        ([(14, 2**64 - 1, KIND, 1, b"x")], True),
-        ([(14, 13, KIND, 1, b"x")], True),
-        ([(3, 3, COMMIT, 0, b"")], True),
-        ([(14, 14, 0, 1, b"x"), END], False),  # a second header holds nothing
-        ([(14, 14, COMMIT, 1, b"x"), END], False),  # nor does a commit with a payload
-    ],
-)
-def test_a_forged_frame_is_damage_or_holds_nothing(whole, tmp_path, frames, is_damage):
-    path = tmp_path / "log"
-    path.write_bytes(forged(whole, *frames))
-    found, damage = batches_and_damage(path)
-    assert [each for batch in found for each in batch] == [each for batch in BATCHES for each in batch]
-    assert (damage is not None) == is_damage
-
-
 def test_a_place_behind_the_last_number_that_there_can_be_is_refused(whole, tmp_path):
     path = tmp_path / "log"
     path.write_bytes(forged(whole, (2**64 - 1, 2**64 - 1, COMMIT, 0, b"")))
     place = LogPlace(path.stat().st_size, 2**64, 2**64, path.read_bytes()[-16:])
     with pytest.raises(DamageError, match="holds no batch"):
         LogWriter(path, place=place)
+
+
+# Full disks, short writes, errors of the disk.
+
+
+def test_a_reader_learns_that_what_it_read_was_taken_back(tmp_path, monkeypatch):
+    """`faults/each_call.py` has every call fail; here the file could not be cut off either."""
+
+    def fails(*_):
+        raise OSError(errno.EIO, "the disk")
+
+    path = build(tmp_path / "log")
+    with LogWriter(path) as log, LogReader(path) as beside:
+        with monkeypatch.context() as broken:
+            broken.setattr(os, "fdatasync", fails)
+            broken.setattr(os, "ftruncate", fails)
+            with pytest.raises(StoreError):
+                log.append(KIND, b"not durable")
+        assert rest(beside) == [*BATCHES, [b"not durable"]]
+        log.append(KIND, b"in its place")
+        with pytest.raises(StoreError, match="took a batch back"):
+            rest(beside)
+        with LogReader(path) as anew:
+            assert rest(anew) == [*BATCHES, [b"in its place"]]
+
+
+def test_short_writes_are_gone_on_with(tmp_path, monkeypatch):
+    path, write = build(tmp_path / "log"), os.write
+    with LogWriter(path) as log:
+        monkeypatch.setattr(os, "write", lambda file, data: write(file, bytes(data)[:300]))
+        append(log, [b"a" * 2000, b"b"])
+        monkeypatch.undo()
+    assert read(path) == [*BATCHES, [b"a" * 2000, b"b"]]
+
+
+def test_what_is_left_of_a_nearly_full_disk_is_for_others(small_disk):
+    path = build(small_disk / "log", [])
+    with LogWriter(path) as log:
+        log.append(KIND, b"x" * 100)
+        assert path.stat().st_size < 1000
+        (small_disk / "other").write_bytes(bytes(500_000))

@@ -1,5 +1,7 @@
 """The end of a log: what `CURRENT`, a checkpoint or a batch proves of it, and what a power cut may have torn."""
 
+import os
+
 import numpy as np
 import pytest
 from forging import log_of
@@ -21,11 +23,6 @@ def ends(log):
     """Where the header and each batch end."""
     begin, _, commits = ends_of(log)
     return [begin, *commits]
-
-
-def cut(log, end):
-    with log.open("r+b") as file:
-        file.truncate(end)
 
 
 def require_named(path, rows, kept):
@@ -54,25 +51,15 @@ def test_a_closed_log_that_is_cut_off_or_flipped_at_its_end_is_damaged(tmp_path,
     if flipped:
         flip(log, -100)
     else:
-        cut(log, ends(log)[kept])
+        os.truncate(log, ends(log)[kept])
     require_named(tmp_path / "s", 4, kept)
 
 
-def crashed(path, rows):
-    """A copy of a store as a kill leaves it."""
-    with Store.open(path, identity={}) as store:
-        for index in range(rows):
-            store.append("add", "", bytes([index]))
-        copy = path.with_name("crashed")
-        copy.mkdir()
-        for name in (CURRENT_FILE, "log-00000001"):
-            (copy / name).write_bytes((path / name).read_bytes())
-    return copy
-
-
 def test_a_log_that_had_a_row_and_has_none_is_damaged_though_nobody_closed_it(tmp_path):
-    path = crashed(tmp_path / "s", 3)
-    cut(log_path(path, 1), ends(log_path(path, 1))[0])
+    with Store.open(tmp_path / "s", identity={}) as store:
+        store.append("add", "", b"")
+        path = as_after_a_crash(store, tmp_path / "crashed")
+    os.truncate(log_path(path, 1), ends(log_path(path, 1))[0])
     require_named(path, 1, 0)
 
 
@@ -84,7 +71,7 @@ def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, b
         store.commit({}, last_sequence=2)
         store.append("add", "behind it", b"")
         path = as_after_a_crash(store, tmp_path / "crashed")
-    cut(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
+    os.truncate(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
     with pytest.raises(DamageError, match="repair the store"):
         Store.open(path)
     with Store.open(path, mode="read") as store:
@@ -95,15 +82,6 @@ def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, b
     assert [problem.kind for problem in damage(path)] == ["spare" if by <= FRAME_BYTES else "lost", "spare"]
     assert repair_store(path).kept == 2
     assert damage(path) == []
-
-
-def test_the_end_of_a_log_that_nobody_closed_may_be_torn_and_the_rows_before_it_are_there(tmp_path):
-    path = crashed(tmp_path / "s", 3)
-    cut(log_path(path, 1), ends(log_path(path, 1))[2] + 50)
-    with Store.open(path) as store:
-        assert store.last == 2
-        assert store.append("add", "", b"").sequence == 3
-    assert read_current(path / CURRENT_FILE).last == 3
 
 
 def test_a_store_that_cannot_say_so_is_closed_with_a_warning_and_one_that_is_another_is_left_alone(tmp_path, caplog):
@@ -125,7 +103,7 @@ def test_a_store_that_says_nothing_of_it_is_read_as_before(tmp_path):
     log = made(tmp_path / "s")
     current = read_current(tmp_path / "s" / CURRENT_FILE)
     write_current(tmp_path / "s", type(current)(current.log, current.log_identity))
-    cut(log, ends(log)[2])
+    os.truncate(log, ends(log)[2])
     with Store.open(tmp_path / "s") as store:
         assert store.last == 2
 

@@ -3,7 +3,6 @@
 import shutil
 
 import pytest
-import scroll_tactile_store.backup
 from forging import log_of
 from scroll_tactile_store import DamageError, NotAStoreError, Store, StoreError, repair_store
 from scroll_tactile_store.layout import read_current
@@ -75,32 +74,6 @@ def test_a_batch_that_is_not_over_is_not_in_it(opened, tmp_path):
     with Store.open(tmp_path / "copy", mode="read") as copy:
         assert copy.last == 3
     assert read_current(tmp_path / "copy" / "CURRENT").last == 3  # a copy says where its log ends
-
-
-def test_a_checkpoint_that_is_replaced_meanwhile_is_looked_for_again(plain, tmp_path, monkeypatch):
-    real, instants = scroll_tactile_store.backup._copy_tree, ["before", "after", "within"]
-    with Store.open(plain) as writer:
-        commit(writer.commit, 20)
-
-        def replaced(source, target):
-            # The first call of each attempt copies the folder, those within it its arrays.
-            outer = source.parent.name == "checkpoints"
-            instant = instants[-1] if instants else ""
-            if instants and (instant == "within") != outer:
-                instants.pop()
-                if instant == "after":
-                    real(source, target)
-                commit(writer.commit, 20)
-                if instant == "after":
-                    return
-            real(source, target)
-
-        monkeypatch.setattr(scroll_tactile_store.backup, "_copy_tree", replaced)
-        with Store.open(plain, mode="read") as reader:
-            reader.backup(tmp_path / "copy")
-        assert instants == []
-    assert same_store(tmp_path / "copy", plain)
-    assert folders(tmp_path / "copy") == ["00000005"]
 
 
 def test_what_is_there_is_not_written_over(plain, tmp_path):

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 import scroll_tactile_store.checkpoint_files
 import scroll_tactile_store.checkpoints
+from quick_checkpoints import WRITTEN_BY_ZARR, write_zarr
 from scroll_tactile_store import DamageError, Store, StoreError, check_store
-from scroll_tactile_store.chunks import ArrayFiles
-from store_builds import folders
+from scroll_tactile_store.checkpoint_files import CheckpointDraft, write_checkpoint
+from scroll_tactile_store.chunks import ArrayContent, ArrayFiles
+from scroll_tactile_store.encoding import array_digest
+from store_builds import contents, folders
 
 ONE = {"x": np.arange(10)}
 
@@ -68,8 +71,8 @@ def test_closing_finishes_what_was_handed_over(tmp_path):
 def test_a_program_that_forgets_to_close_ends_and_loses_no_row(tmp_path):
     """zarr writes nothing any more while the interpreter shuts down; the journal holds the row all the same."""
     code = """
-import atexit, sys, numpy, scroll_tactile_store
-opened = scroll_tactile_store.Store.open(sys.argv[1], identity={})
+import atexit, sys, numpy, scroll_tactile_store as store
+opened = store.Store.open(sys.argv[1], identity={})
 atexit.register(lambda: opened.commit_later({"x": numpy.arange(3)}, last_sequence=1))
 opened.append("a", "b", b"")
 opened.commit_later({"x": numpy.arange(2)}, last_sequence=1)
@@ -151,3 +154,36 @@ def test_a_reader_whose_checkpoint_is_replaced_while_it_reads_gets_the_new_one(o
         found = reader.latest()
     assert (found.number, found.arrays["x"].tolist()) == (4, [0, 1, 2, 3])
     assert caplog.records == []
+
+
+# Most tests have checkpoints written in zarr's place (see tests/conftest.py): to the same bytes.
+
+RNG = np.random.default_rng(0)
+ARRAYS = {
+    "floats": RNG.standard_normal((30, 4)),
+    "short-floats": RNG.standard_normal((3, 2, 5)).astype(np.float32),
+    "integers": RNG.integers(-(2**60), 2**60, (7, 3)),
+    "small-integers": RNG.integers(0, 99, (40,)).astype(np.int16),
+    "bytes": RNG.integers(0, 255, (2, 9)).astype(np.uint8),
+    "flags": RNG.integers(0, 2, 8).astype(bool),
+    "text": np.array(["felt", "ü"]),
+    "none": np.zeros((0, 3)),
+    "one": np.array(2.5),
+}
+
+
+@pytest.mark.parametrize("level", [None, 3, 6])
+def test_every_file_has_the_bytes_that_zarr_gives_it(tmp_path, level):
+    arrays = ARRAYS | ({"chunks": RNG.integers(0, 9, 10**6)} if level == 3 else {})  # which zarr writes
+    draft = CheckpointDraft(arrays, 3, "{}", level or 3)
+    described = {name: ArrayContent(one.dtype, one.shape, array_digest(one)) for name, one in arrays.items()}
+    for name, write in (("zarr", WRITTEN_BY_ZARR), ("quick", write_zarr)):
+        group = write(tmp_path / name, draft, described, level)
+        group.update_attributes({"number": 1, "arrays": {"ü": [1, 2.5, None, True]}, "identity": {}})
+    assert contents(tmp_path / "quick") == contents(tmp_path / "zarr")
+
+
+def test_the_store_writes_through_zarr_here(tmp_path, monkeypatch):
+    monkeypatch.setattr("zarr.create_group", None)
+    with pytest.raises(TypeError):
+        write_checkpoint(tmp_path, 1, CheckpointDraft({"a": np.ones(3)}, 1, "{}", 3), {})

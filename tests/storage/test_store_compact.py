@@ -1,51 +1,31 @@
-"""Compaction: a checkpoint stands for rows that have given up their arrays, in a log that takes the other's place."""
+"""Compaction: a checkpoint stands for rows that have given up their arrays, in a log that takes the other's place.
+
+`tests/faults/each_call.py` has every call of it fail.
+"""
 
 import errno
-import itertools
-import os
-import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
+import scroll_tactile_store.archive
+import scroll_tactile_store.backup
 import scroll_tactile_store.checkpoints
-import scroll_tactile_store.files
+import scroll_tactile_store.log_writer
 from forging import log_of
-from scroll_tactile_store import CompactedError, DamageError, Store, StoreError, check_store
-from store_builds import as_after_a_crash, damage, flip, flip_row, folders
-
-LAST = 12
-
-
-def noise(number):
-    return np.random.default_rng(number).integers(0, 2**60, 400)
+from scroll_tactile_store import CompactedError, DamageError, Store, check_store
+from scroll_tactile_store.layout import read_current
+from store_builds import LAST, add, commit, damage, flip, flip_row, folders, holds, spoil, state
 
 
-def add(opened, number):
-    return opened.append("a", f"row {number}", bytes([number]), arrays={"x": noise(number)}).sequence
-
-
-def sums(last_sequence):
-    return {"sum": np.array(last_sequence * (last_sequence + 1) // 2), "bulk": np.full(500, last_sequence, np.float64)}
-
-
-def compact(opened, last_sequence, **options):
-    opened.compact(sums(last_sequence), last_sequence=last_sequence, newest=(sums(opened.last), {}), **options)
-
-
-@pytest.fixture(scope="session")
-def made(tmp_path_factory):
-    """Twelve rows, and a checkpoint up to the last; not to be changed."""
-    with Store.open(tmp_path_factory.mktemp("made") / "s", identity={"for": "compaction"}) as fresh:
-        for number in range(1, LAST + 1):
-            add(fresh, number)
-        fresh.commit(sums(LAST), last_sequence=LAST)
-    return fresh.path
+def compact(opened, last_sequence):
+    commit(opened.compact, last_sequence, newest=(state(opened.last), {"n": opened.last}))
 
 
 @pytest.fixture
-def opened(made, tmp_path):
-    with Store.open(shutil.copytree(made, tmp_path / "s")) as copy:
+def opened(plain):
+    """Twenty rows, and a checkpoint up to the last."""
+    with Store.open(plain) as copy:
+        commit(copy.commit, LAST)
         yield copy
 
 
@@ -53,41 +33,20 @@ def open_files():
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def spoil(folder):
-    chunk = folder / "bulk" / "c" / "0"
-    chunk.write_bytes(chunk.read_bytes()[:-1])
-
-
-def agrees(opened, compacted, last=LAST):
-    assert (opened.last, opened.compacted) == (last, compacted)
-    assert [head.label for head in opened.heads()] == [f"row {number}" for number in range(1, last + 1)]
-    found = [(row.sequence, row.arrays["x"].tobytes()) for row in opened.records(compacted)]
-    assert found == [(number, noise(number).tobytes()) for number in range(compacted + 1, last + 1)]
-    for after in range(compacted):
-        with pytest.raises(CompactedError, match=f"records 1 to {compacted}"):
-            opened.records(after)
-    found = opened.compaction()
-    if compacted:
-        assert (found.last_sequence, found.arrays["sum"]) == (compacted, sums(compacted)["sum"])
-    else:
-        assert found is None
-    return True
-
-
 def test_the_space_is_given_back_to_the_disk(opened):
     before = log_of(opened.path).stat().st_size
-    opened.compact(sums(LAST), last_sequence=LAST)
+    commit(opened.compact, LAST)
     opened.close()
     # A row without its arrays takes some 200 bytes; there is one log and one checkpoint.
     assert log_of(opened.path).stat().st_size < LAST * 300 < before
-    assert folders(opened.path) == ["00000002"]
+    assert folders(opened.path) == ["00000003"]
     assert sorted(entry.name for entry in opened.path.iterdir()) == ["CURRENT", "checkpoints", "lock", "log-00000002"]
 
 
 @pytest.mark.parametrize("last_sequence", [5, LAST])
 def test_a_flipped_bit_in_a_log_that_nothing_was_appended_to_is_damage(opened, last_sequence):
     """All its rows are one batch, which must not look as one that a power cut left."""
-    opened.compact(sums(last_sequence), last_sequence=last_sequence)
+    commit(opened.compact, last_sequence)
     opened.close()
     flip_row(opened.path, LAST - 1)
     assert damage(opened.path)
@@ -104,11 +63,11 @@ def test_a_damaged_row_keeps_all_from_being_given_up(opened, row, arrays):
     with Store.open(opened.path) as again:
         with pytest.raises(DamageError, match=r"row 7 is not as it was written|repair the store"):
             compact(again, 5)
-        assert (again.compacted, folders(again.path)) == (0, ["00000001"])
+        assert (again.compacted, folders(again.path)) == (0, ["00000002"])
         assert log_of(again.path).read_bytes() == before
         if arrays:  # where the compaction checkpoint stands for it, its arrays are given up anyway
             compact(again, 7)
-            assert agrees(again, 7)
+            assert holds(again, compacted=7, latest=LAST)
 
 
 @pytest.mark.parametrize("name", ["create_log", "write_checkpoint"])
@@ -126,64 +85,9 @@ def test_what_was_written_is_read_back_before_it_counts(opened, monkeypatch, nam
     with monkeypatch.context() as broken, pytest.raises(DamageError):
         broken.setattr(scroll_tactile_store.checkpoints, name, forgetful)
         compact(opened, 5)
-    assert agrees(opened, 0)
+    assert holds(opened, latest=LAST)
     compact(opened, 5)
-    assert agrees(opened, 5)
-
-
-def failing(monkeypatch, at, error, *, after):
-    """Let the rename of this number raise, before or after it is done; the list of renames."""
-    real, calls = os.replace, []
-
-    def call(*args, **options):
-        calls.append(args)
-        if len(calls) == at:
-            if after:
-                real(*args, **options)
-            raise error
-        return real(*args, **options)
-
-    monkeypatch.setattr(os, "replace", call)
-    return calls
-
-
-class KilledError(BaseException):
-    pass
-
-
-KILLED = KilledError()
-HOW = {
-    "fails": (OSError(errno.EIO, "the disk says no"), False),
-    "fails, and has done it": (OSError(errno.EIO, "the disk says no"), True),
-    "killed": (KILLED, True),
-}
-
-
-@pytest.mark.parametrize(("error", "after"), HOW.values(), ids=HOW)
-def test_whatever_rename_fails_all_that_was_acknowledged_is_there(made, tmp_path, monkeypatch, error, after):
-    """For this process, which goes on, and for another; `tests/faults/each_call.py` has every call fail."""
-    for at in itertools.count(1):
-        with Store.open(shutil.copytree(made, tmp_path / f"s{at}")) as opened:
-            raised = None
-            with monkeypatch.context() as broken:
-                calls = failing(broken, at, error, after=after)
-                try:
-                    compact(opened, 5)
-                except (StoreError, KilledError) as caught:
-                    raised = caught
-            if len(calls) < at:
-                break
-            left = as_after_a_crash(opened, tmp_path / f"left{at}")
-            add(opened, LAST + 1)
-            assert (raised is None, opened.compacted) in {(True, 5), (False, 0), (False, 5)}
-            assert agrees(opened, opened.compacted, LAST + 1)
-            with Store.open(opened.path, mode="read") as reader:
-                assert agrees(reader, opened.compacted, LAST + 1)
-        assert damage(opened.path) == []
-        with Store.open(left) as again:
-            assert agrees(again, again.compacted)
-            assert add(again, LAST + 1) == LAST + 1
-        assert check_store(left) == []
+    assert holds(opened, compacted=5, latest=LAST)
 
 
 def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
@@ -194,9 +98,9 @@ def test_what_cannot_be_removed_is_no_failure(opened, monkeypatch, caplog):
         broken.setattr(scroll_tactile_store.checkpoints, "remove_unnamed", stuck)
         compact(opened, 5)
     assert "what was replaced could not be removed" in caplog.text
-    assert agrees(opened, 5)
+    assert holds(opened, compacted=5, latest=LAST)
     assert len(folders(opened.path)) == 3
-    opened.commit(sums(LAST), last_sequence=LAST)
+    commit(opened.commit, LAST)
     assert len(folders(opened.path)) == 2
 
 
@@ -214,7 +118,7 @@ def test_a_reader_in_the_middle_gets_the_rest_or_is_told(opened):
             next(early)
         assert [row.sequence for row in late] == list(range(8, LAST + 1))
         assert [head.sequence for head in heads] == list(range(1, LAST + 1))
-        assert agrees(reader, 5)
+        assert holds(reader, compacted=5, latest=LAST)
 
 
 def test_a_reader_stays_open_over_compactions(opened):
@@ -222,11 +126,48 @@ def test_a_reader_stays_open_over_compactions(opened):
         files = open_files()
         last = LAST
         for last_sequence in range(1, 5):
-            assert add(opened, last := last + 1) == last
+            assert add(opened, last := last + 1).sequence == last
             compact(opened, last_sequence)
-            assert agrees(reader, last_sequence, last)
-            assert reader.latest().last_sequence == last
-        assert agrees(lazy, 4, last)
+            assert holds(reader, kept=last, compacted=last_sequence, latest=last)
+        assert holds(lazy, kept=last, compacted=4, latest=last)
         assert log_of(opened.path).name == "log-00000005"
         assert open_files() == files
     assert damage(opened.path) == []
+
+
+# What the judges of tests/faults found.
+
+
+@pytest.mark.parametrize(
+    "module", [scroll_tactile_store.archive, scroll_tactile_store.backup], ids=["a reader", "a backup"]
+)
+def test_whoever_comes_while_a_log_takes_the_place_of_another_takes_the_new_one(plain, monkeypatch, module):
+    path = plain
+    before = [read_current(path / "CURRENT")]
+    with Store.open(path) as writer:
+        commit(writer.compact, 16)
+    with Store.open(path, mode="read") as reader:
+        monkeypatch.setattr(module, "read_current", lambda *given: before.pop() if before else read_current(*given))
+        if module is scroll_tactile_store.backup:
+            reader.backup(path.parent / "copy")
+            path = path.parent / "copy"
+        with Store.open(path, mode="read") as again:
+            assert (again.last, again.compacted, before) == (LAST, 16, [])
+
+
+def test_a_compaction_that_is_committed_stands_though_its_log_cannot_be_opened_at_once(plain, monkeypatch, caplog):
+    path = plain
+    synced = scroll_tactile_store.log_writer.sync_open
+
+    def failing(descriptor, **how):
+        if read_current(path / "CURRENT").log == 2:
+            monkeypatch.setattr(scroll_tactile_store.log_writer, "sync_open", synced)
+            raise OSError(errno.EIO, "the disk")
+        synced(descriptor, **how)
+
+    with Store.open(path) as writer:
+        monkeypatch.setattr(scroll_tactile_store.log_writer, "sync_open", failing)
+        commit(writer.compact, 16)
+        assert "could not be opened yet" in caplog.text
+        assert (writer.compacted, add(writer, LAST + 1).sequence) == (16, LAST + 1)
+    assert (check_store(path), log_of(path).name) == ([], "log-00000002")

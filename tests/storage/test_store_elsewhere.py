@@ -123,6 +123,15 @@ def test_a_link_that_comes_while_a_store_is_read_is_not_followed(tmp_path):
             list(reader.heads())
 
 
+def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(tmp_path):
+    path = build(tmp_path / "s")
+    with Store.open(path, mode="read") as reader:
+        os.truncate(path / LOG, 2**40)
+        with pytest.raises(DamageError, match="nothing of it was read"):
+            reader.last  # noqa: B018
+    assert any("nothing of it was read" in problem.what for problem in check_store(path))
+
+
 def of_holes(path, outside):
     with path.open("r+b") as file:
         file.truncate(2**40)

@@ -59,17 +59,6 @@ def test_damaged_heads_are_named(opened, covered):
         assert sequences(reader.heads(label="é'\"\U0001f9f6")) == [1, 3, 5, 7, 9]
 
 
-@pytest.mark.parametrize("gone", [(4, 5, 6), (1, 2), (9, 10)])
-def test_missing_heads_are_named_where_all_are_asked_for(opened, gone):
-    opened.commit({}, last_sequence=10)
-    opened.close()
-    lose_rows(opened.path, *gone)
-    with Store.open(opened.path, mode="read") as reader:
-        with pytest.raises(DamageError, match=f"rows {gone[0]} to {gone[-1]} are missing"):
-            list(reader.heads())
-        assert set(sequences(reader.heads(kind="take"))) == {3, 6, 9} - set(gone)
-
-
 def test_a_single_record(opened):
     record = opened.record(7)
     assert isinstance(record, Record)

@@ -14,9 +14,7 @@ from scroll_tactile_store import (
     RecordError,
     Store,
     StoreClosedError,
-    check_store,
 )
-from store_builds import contents
 
 
 def test_a_new_store_keeps_its_identity_and_a_later_one_does_not_replace_it(tmp_path):
@@ -147,21 +145,3 @@ def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_pa
 def test_a_mode_is_read_or_write(tmp_path):
     with pytest.raises(RecordError, match="append"):
         Store.open(tmp_path, identity={}, mode="append")
-
-
-@pytest.mark.parametrize(
-    "died", ["os.replace", "scroll_tactile_store.lock.write_current", "scroll_tactile_store.files.sync_file"]
-)
-def test_an_interrupted_creation_is_finished_by_the_next(tmp_path, monkeypatch, died):
-    path = tmp_path / "s"
-    with monkeypatch.context() as broken, pytest.raises(KeyboardInterrupt):
-        broken.setattr(died, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        Store.open(path, identity={"a": 0})
-    (path / "log-00000001.new").write_bytes(b"half")
-    (path / "CURRENT.new").write_bytes(b"half")
-    with pytest.raises(NotAStoreError):
-        Store.open(path, mode="read")
-    with Store.open(path, identity={"a": 1}) as opened:
-        assert (opened.append("a", "b", b"").sequence, opened.identity) == (1, {"a": 1})
-        assert contents(path).keys() == {"CURRENT", "lock", "holder.json", "log-00000001"}
-    assert check_store(path) == []

@@ -199,16 +199,14 @@ class Rest:
     def resume(self, numbers: Whole) -> None:
         """Follow the level from readings after a contact: it may have moved. The noise stays as it was learned."""
         self._levels.clear()
-        self._levels.append((numbers.sum(axis=0), len(numbers)))
-        self._relevel()
+        self._relevel(numbers)
 
     def _take(self, numbers: Whole) -> None:
         away = numbers - self.level
         total = away.sum(axis=0)
         # Whole numbers below 2⁵³ times 2: exact in whatever order.
         self._scatter += (len(numbers) * (away.T @ away) - np.outer(total, total)).astype(np.int64)
-        self._levels.append((numbers.sum(axis=0), len(numbers)))
-        self._relevel()
+        self._relevel(numbers)
         self._blocks += 1
 
     def _measure(self, distances: list[float]) -> None:
@@ -218,7 +216,8 @@ class Rest:
         self._sum, self._squares = self._sum + total, self._squares + total**2
         self._fourths += math.fsum(min(distance, self.alarm) ** 2 for distance in distances)
 
-    def _relevel(self) -> None:
+    def _relevel(self, numbers: Whole) -> None:
+        self._levels.append((numbers.sum(axis=0), len(numbers)))
         count = sum(count for _, count in self._levels)
         self.level = np.floor(sum(total for total, _ in self._levels) / count + 0.5)
 

@@ -98,24 +98,21 @@ class Clock:
 
     def places(self, rows: Rows, seconds: list[float]) -> Iterator[ClockPart]:
         """The readings, shape (k, …), in their places."""
-        first, taken = 0, 0  # rows[first:taken] follow each other and were not yet given
+        first = 0  # rows[first:i] follow each other and were not yet given
         for i, stamp in enumerate(seconds):
             steps, breaks = self._place(stamp, rows[i])
-            if steps != 1 or breaks or taken != i:
-                if taken > first:
-                    yield ClockPart(rows[first:taken], time=seconds[first])
-                first = i
+            if steps != 1 or breaks:
+                if i > first:
+                    yield ClockPart(rows[first:i], time=seconds[first])
+                first = i if steps else i + 1
+            if breaks:
+                yield ClockPart(rows[i:i], breaks, stamp)
+            elif steps > 1 and self._row is not None:
+                yield ClockPart(_line(self._row, rows[i], steps), time=stamp - (steps - 1) / self._rate)
             if steps:
-                if breaks:
-                    yield ClockPart(rows[i:i], breaks, stamp)
-                elif steps > 1 and self._row is not None:
-                    yield ClockPart(_line(self._row, rows[i], steps), time=stamp - (steps - 1) / self._rate)
                 self._row = rows[i]
-                taken = i + 1
-            else:
-                first = taken = i + 1
-        if taken > first:
-            yield ClockPart(rows[first:taken], time=seconds[first])
+        if len(rows) > first:
+            yield ClockPart(rows[first:], time=seconds[first])
         if self._row is not None:
             self._row = np.array(self._row)  # and not the caller's
 

@@ -31,7 +31,7 @@ from scroll_tactile.prediction.predictor import Predictor, nothing_known
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.results import Estimate, Health, Prediction
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.contact import MOST_FRAMES, Rest
+from scroll_tactile.signals.contact import MOST_FRAMES
 from scroll_tactile.signals.correction import Correction, corrected_stream
 from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings, validate
 from scroll_tactile.signals.windows import Scale
@@ -105,11 +105,10 @@ class GrowingTouch:
 
     candidates: the materials that it may be of. rows: its readings, of a camera behind the resting image, and at most
     `limit` of them; came: how many there were. at: when it began. moments: that are to come, in readings; the next is
-    the last of them. before: readings that are no part of it, such as a camera's resting image. earlier: the touches of
-    the same thing before it; encoded: they, as its model reads them. estimator: None where no quantity was declared.
-    widths: quantity → how narrow its interval is to be. rest: readings before it. correction: through which they are
-    read: that of the memory when the touch began. estimates: by quantity, as of `stage`; settled: whether every
-    interval was as narrow as it is to be, False where none is asked to be.
+    the last of them. earlier: the touches of the same thing before it; encoded: they, as its model reads them.
+    estimator: None where no quantity was declared. widths: quantity → how narrow its interval is to be. rest: readings
+    before it. correction: through which they are read: that of the memory when the touch began. estimates: by quantity,
+    as of `stage`; settled: whether every interval was as narrow as it is to be, False where none is asked to be.
     """
 
     predictor: Predictor
@@ -121,7 +120,6 @@ class GrowingTouch:
     frozen: FrozenModel
     rule: DecisionRule
     moments: list[int]
-    before: int
     earlier: tuple[Stream, ...]
     estimator: Estimator | None
     widths: Mapping[str, float]
@@ -191,9 +189,8 @@ class GrowingTouch:
             return
         stage = estimator.stage(encoded.steps)
         if stage != self.stage or stage == estimator.last:
-            names = estimator.wanted(None)
             self.estimates = estimates_of(
-                estimator, names, encoded, self.extractor, prediction, self.rule.risk, known=None
+                estimator, estimator.wanted(None), encoded, self.extractor, prediction, self.rule.risk, known=None
             )
             self.stage = stage
             widths = ((self.estimates[name].width, width) for name, width in self.widths.items())
@@ -225,7 +222,8 @@ class LiveSession:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
         self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
         self.sensor = sensor = predictor.recipe.sensor
-        self._rest: Rest = capabilities_of(self._extractor.embedding).rest
+        rest = capabilities_of(self._extractor.embedding).rest
+        self._before = int(sensor.camera and isinstance(rest, str))  # frames that are no part of a touch
         frozen = predictor.frozen()  # until the rule is measured, which takes seconds
         model = frozen.model
         candidates_of(scene, model.names, model.known)
@@ -234,7 +232,7 @@ class LiveSession:
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
             self._detector = (
-                PressDetector(sensor, self._rest)
+                PressDetector(sensor, rest)
                 if sensor.camera
                 else ContactDetector(sensor, false_contacts, partial(_is_touch, predictor))
             )
@@ -336,7 +334,7 @@ class LiveSession:
         self._scene, self._risk = scene, risk
 
     def close(self) -> None:
-        """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
+        """End the touch under way, if any; a second call does nothing. `touch` and `report` stay."""
         if self._closed:
             return
         self._closed = True
@@ -344,8 +342,6 @@ class LiveSession:
             self._end("closed")
         if self._notes is not None:
             self._notes.take(None)
-        self._detector = None
-        self._recent.clear()
 
     def __enter__(self) -> Self:
         return self
@@ -423,10 +419,9 @@ class LiveSession:
         model, scene = frozen.model, self._scene
         rule = self._rule(model, self._risk)
         prefix = None if self._detector is None else self._detector.prefix
-        before, frame, limit = 0, 1, max(round(KEPT * self.sensor.rate), 4 * model.longest)
+        before, frame, limit = self._before, 1, max(round(KEPT * self.sensor.rate), 4 * model.longest)
         if self.sensor.camera:
-            before, frame = int(isinstance(self._rest, str)), model.plan.widths[0]
-            limit = MOST_FRAMES + before
+            frame, limit = model.plan.widths[0], MOST_FRAMES + before
         if prefix is not None:
             rows = np.concatenate([prefix, rows]).astype(self._dtype)
         earlier, self._again = self._thing if self._again else (), False
@@ -440,7 +435,6 @@ class LiveSession:
             frozen=frozen,
             rule=rule,
             moments=sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True),
-            before=before,
             earlier=earlier,
             estimator=self._predictor.estimator(),
             widths=self._widths,
@@ -474,7 +468,7 @@ class LiveSession:
         if touch is None:
             return
         try:
-            if len(touch.rows) - touch.before < fewest_readings(self.sensor):
+            if len(touch.rows) - self._before < fewest_readings(self.sensor):
                 raise StreamError
             stream = touch.beginning(touch.limit)
         except StreamError:  # nothing that could be observed
@@ -519,7 +513,7 @@ class LiveSession:
     def _state(self) -> LiveState:
         touch, ended = self._under_way, tuple(self._ended)
         if touch is not None:
-            seconds = max(0, touch.came - touch.before) / self.sensor.rate
+            seconds = max(0, touch.came - self._before) / self.sensor.rate
             return LiveState(
                 contact=True,
                 seconds=seconds,

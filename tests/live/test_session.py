@@ -299,12 +299,12 @@ def test_a_touch_that_never_ends_is_kept_up_to_a_limit():
     touch = slide("a", limit + 500, RANDOM)
     with made.live() as live:
         live.push(rest(800, RANDOM))
-        ring = len(live._recent._ring)
+        ring = live._recent.maxlen
         first = live.push(touch)
-        room = live._under_way.rows._room.nbytes
+        room = len(live._under_way.rows)
         for _ in range(3):
             now = live.push(slide("a", limit, RANDOM))
-        assert (live._under_way.rows._room.nbytes, len(live._recent._ring)) == (room, ring)
+        assert (len(live._under_way.rows), live._recent.maxlen) == (room, ring)
         assert now.contact and now.seconds > 3 * KEPT
         assert first.prediction == now.prediction
         done = live.push(rest(200, RANDOM))

@@ -7,8 +7,8 @@ gain, an offset and noise from what else moves, P the inverse of the scatter of 
 the touch itself and treats it as the others, so that its rank among the touches of its own cell (material, length and
 level) is uniform and independent of all before it, whatever mixture of materials comes (transductive, Mondrian: Vovk,
 Gammerman, Shafer, Algorithmic Learning in a Random World, 2005). A simple jumper bets on each score (Volkhonskiy and
-others, COPA 2017): factors 1 + ε (p − 1/2), capital moved between the ε at a rate J. The mean of all martingales is one, too,
-and reaches 1/bound with a probability of at most the bound, ever (Ville).
+others, COPA 2017): factors 1 + ε (p − 1/2), capital moved between the ε at a rate J. The mean of all martingales is
+one, too, and reaches 1/bound with a probability of at most the bound, ever (Ville).
 """
 
 from __future__ import annotations

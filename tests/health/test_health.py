@@ -66,7 +66,6 @@ def sound(rounds: int, first: int = 0) -> list[tuple[str, Stream]]:
         ("offset", lambda values: values + 20),
         ("dead", lambda values: 0 * values),
         ("noisier", noisier),
-        ("gain", lambda values: 0.8 * values + 60),  # in two ways: called by the greater
     ],
 )
 def test_a_changed_channel_is_named(kind: str, change: Change) -> None:
@@ -77,6 +76,13 @@ def test_a_changed_channel_is_named(kind: str, change: Change) -> None:
     assert watch.alarmed is not None
     assert 150 < watch.alarmed <= 150 + 60
     assert abs(watch.change.since - 150) <= 20
+
+
+def test_a_channel_that_changed_in_two_ways_is_called_by_the_greater() -> None:
+    weaker = on_channel(lambda values: 0.8 * values + 60)
+    change = watched([*sound(30), *[(name, touch(name, i, weaker)) for i in range(30, 50) for name in NAMES]]).change
+    assert change is not None
+    assert (change.kind, change.channels) == ("gain", (CHANNEL,))
 
 
 @pytest.mark.parametrize(

@@ -88,3 +88,12 @@ def predictions(live, rows, sizes):
         if now.contact and now.prediction is not None and now.prediction not in shown:
             shown.append(now.prediction)
     return shown, ended
+
+
+def touched(live, rows, again=False):
+    """A touch from begin to end of a manual session, `again` or not, as it ended."""
+    if again:
+        live.again()
+    live.begin()
+    live.push(rows)
+    return live.end().touches[0]

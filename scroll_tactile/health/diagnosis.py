@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from copy import copy
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple
@@ -53,8 +52,6 @@ class Scatter:
         self.channels, size = channels, KINDS * channels + 1
         self.inverse: Floats = np.eye(size) / (size * PRIOR**2)
         self.count = 0
-        self._room: Floats = np.empty((size, size))
-        self._signed: Floats = np.empty((size, KINDS * channels))
 
     def take(self, away: Floats, among: int) -> None:
         """Add a touch that lies so far from the mean of the others of its cell, (size,) in logarithms, so many."""
@@ -62,14 +59,7 @@ class Scatter:
         taken = away * math.sqrt(among / (among + 1))
         moved = self.inverse @ taken
         # A product of matrices takes half the time of one with broadcasting, and is the same to the bit.
-        np.dot(moved[:, None], (moved / (1 + taken @ moved))[None], out=self._room)
-        self.inverse -= self._room
-
-    def copy(self) -> Scatter:
-        """One that goes on independently."""
-        twin = copy(self)
-        twin.inverse = self.inverse.copy()
-        return twin
+        self.inverse -= np.dot(moved[:, None], (moved / (1 + taken @ moved))[None])
 
     def without(self, away: Floats, among: npt.NDArray[np.int64]) -> Scatter:
         """That of the other touches: away and among are those of some that were taken, (k, size) and (k,)."""
@@ -98,13 +88,8 @@ class Scatter:
         """Of rows (k, size) the scores of each channel, (k, 3 n): gain, offset and noise told from what else moves."""
         n = self.channels
         level, spread, noise = (self.inverse[:, at : at + n] for at in (0, n, 2 * n))
-        gain, offset = self._signed[:, :n], self._signed[:, n : 2 * n]
-        np.subtract(level, np.add.reduce(level, axis=1, keepdims=True) / n, out=offset)
-        offset += self.inverse[:, -1:] / n
-        np.add(offset, spread, out=gain)
-        gain += noise
-        self._signed[:, 2 * n :] = noise
-        return np.asarray((rows * UNIT) @ self._signed)
+        offset = level - level.mean(axis=1, keepdims=True) + self.inverse[:, -1:] / n
+        return np.asarray((rows * UNIT) @ np.concatenate([offset + spread + noise, offset, noise], axis=1))
 
 
 @dataclass(frozen=True)
@@ -146,8 +131,13 @@ def diagnose(
         signature = before.signatures()[:, found[0][1] * n + found[0][0]]
         weighted = before.inverse @ signature
         sizes = away @ weighted / float(signature @ weighted)
-        own = _began(sizes, own)
-    dead = _dead(away[own], n)
+        size = float(np.median(sizes[own]))
+        grown = np.cumsum((size * (sizes - size / 2))[::-1])[::-1]
+        own = np.arange(len(sizes)) >= grown.argmax()  # where sizes change from 0 to their median: the most likely
+    lively = away[own, n : 2 * n] + away[own, 2 * n : 3 * n]
+    if n >= FEWEST_CHANNELS:
+        lively -= np.median(lively, axis=1, keepdims=True)
+    dead = tuple(np.flatnonzero(np.median(lively, axis=0) < 2 * DEAD).tolist())  # their spread and noise fell so far
     names = [each.material for each, mine in zip(recent, own, strict=True) if mine]
     row, all_names = recent[int(own.argmax())].row, tuple(sorted(set(names)))
     if dead and (len(dead) < MANY * n or n < FEWEST_CHANNELS):
@@ -160,22 +150,12 @@ def diagnose(
 
 def _kind(found: Sequence[tuple[int, int, float]], n: int) -> ChangeKind:
     _, kind, size = found[0]
-    if n >= FEWEST_CHANNELS and len(found) > MANY * n:
+    if n >= FEWEST_CHANNELS and len(found) > min(2, MANY * n):
         alike = len({size > 0 for _, _, size in found}) == 1
-        return "all gains" if alike else "gains"
-    if n >= FEWEST_CHANNELS and len(found) > 2:
-        return "gains"
+        return "all gains" if alike and len(found) > MANY * n else "gains"
     if kind == KINDS - 1:
         return "noisier" if size > 0 else "slower"
     return "offset" if kind else "gain"
-
-
-def _dead(away: Floats, n: int) -> tuple[int, ...]:
-    """The channels whose spread and noise fell so far below those of the others that they say nothing any more."""
-    lively = away[:, n : 2 * n] + away[:, 2 * n : 3 * n]
-    if n >= FEWEST_CHANNELS:
-        lively = lively - np.median(lively, axis=1, keepdims=True)
-    return tuple(np.flatnonzero(np.median(lively, axis=0) < 2 * DEAD).tolist())
 
 
 def _explained(away: Floats, scatter: Scatter, bound: float) -> list[tuple[int, int, float]]:
@@ -198,13 +178,6 @@ def _explained(away: Floats, scatter: Scatter, bound: float) -> list[tuple[int, 
     return found
 
 
-def _began(sizes: Floats, behind: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Which rows lie behind the place where sizes change from 0 to their median behind: the most likely, if normal."""
-    size = float(np.median(sizes[behind]))
-    grown = np.cumsum((size * (sizes - size / 2))[::-1])[::-1]
-    return np.asarray(np.arange(len(sizes)) >= grown.argmax())
-
-
 def _alone(names: Sequence[str], sizes: Floats, size: float) -> str | None:
     """The material that shows a change of this size which others, touched as well, do not; None where none does."""
     own = {name: sizes[[other == name for other in names]] for name in names}
@@ -221,7 +194,9 @@ def diagnose_rest(recent: Sequence[Deviation], rows: Rows, channels: int, *, lev
     n = channels
     away = np.array([each.away for each in recent])
     level, noise = away[:, :n] + away[:, -1:], away[:, 2 * n : 3 * n]
-    own = _moved(level if levels else noise)
+    sums = np.cumsum((level if levels else noise)[::-1], axis=0)[::-1]
+    likely = np.square(sums).sum(axis=1) / np.arange(len(sums), 0, -1)
+    own = np.arange(len(sums)) >= likely.argmax()  # where the mean changes from 0: the most likely, if normal
     row, moved = recent[int(own.argmax())].row, np.median(level[own], axis=0)
     before = np.exp(np.median(rows[:, :n] + rows[:, -1:].astype(np.int32), axis=0) * UNIT)
     shift = before * np.expm1(moved)
@@ -235,13 +210,6 @@ def diagnose_rest(recent: Sequence[Deviation], rows: Rows, channels: int, *, lev
     gain = float(shift @ before / (before @ before))
     better = np.square(shift - gain * before).sum() < np.square(shift - shift.mean()).sum()
     return SensorChange(row, which, "all gains" if better else "all offsets", ())
-
-
-def _moved(sizes: Floats) -> npt.NDArray[np.bool_]:
-    """Which rows (k, n) lie behind the place where their mean changes from 0: the most likely, if normal."""
-    sums = np.cumsum(sizes[::-1], axis=0)[::-1]
-    likely = np.square(sums).sum(axis=1) / np.arange(len(sizes), 0, -1)
-    return np.asarray(np.arange(len(sizes)) >= likely.argmax())
 
 
 def _far(sizes: Floats) -> tuple[int, ...]:

@@ -115,7 +115,7 @@ class _PosteriorFit:
         self.means = np.array([reference.mean(name) for name in materials])
         self.weights = np.array([1 / (1 + 1 / reference.counts[name]) for name in materials])
         none = np.zeros(n)
-        away = self.numbers(none, none) - self.means
+        away = self._joined(self._measured(none, none)) - self.means
         lively = away[:, n : 2 * n] + away[:, 2 * n : 3 * n]
         clipped = np.mean([((shares <= 0) | (shares >= 1)).mean(axis=0) for shares in touches], axis=0)
         clipped = (clipped > ends + CLIPPED) & (ends < MOSTLY)
@@ -127,7 +127,7 @@ class _PosteriorFit:
         self.dimension = len(chosen)
 
     def _measured(self, logs: Floats, offsets: Floats) -> Floats:
-        """Level, log spread and log noise of each touch and channel, corrected: (touches, 3, n)."""
+        """Level, log spread and log noise of each touch and channel, corrected: (touches, 3, n); offsets in spans."""
         found = np.empty((len(self.touches), KINDS, self.n))
         for own, shares in zip(found, self.touches, strict=True):
             values = corrected(shares, np.exp(logs), offsets * self.spans)
@@ -136,18 +136,15 @@ class _PosteriorFit:
             own[2] = np.log(np.abs(np.diff(values, 2, axis=0)).mean(axis=0) + FLOOR / 4)
         return found
 
-    def numbers(self, logs: Floats, offsets: Floats) -> Floats:
-        """The numbers of the touches, corrected, (touches, 3 n + 1); offsets in spans."""
-        return self._joined(self._measured(logs, offsets))
-
     def _joined(self, measured: Floats) -> Floats:
+        """The numbers of the touches, (touches, 3 n + 1)."""
         level, spread, noise = measured.transpose(1, 0, 2)
         total = np.log(level.mean(axis=1, keepdims=True) + FLOOR)
         return np.concatenate([np.log(level + FLOOR) - total, spread, noise, total], axis=1)
 
     def loss(self, logs: Floats, offsets: Floats) -> Floats:
         """rᵀ P r of each touch, (touches,)."""
-        away = (self.numbers(logs, offsets) - self.means) @ self.whitened.T
+        away = (self._joined(self._measured(logs, offsets)) - self.means) @ self.whitened.T
         return np.asarray(np.square(away).sum(axis=1))
 
     def _slopes(self, logs: Floats, offsets: Floats) -> tuple[Floats, Floats]:
@@ -223,8 +220,14 @@ def fitted(reference: Reference, touches: Sequence[Floats], materials: Sequence[
     limit = np.log(GREATEST_GAIN)
     gains = np.where(fit.known, np.exp(np.clip(best[:n], -limit, limit)), 1.0)
     offsets = np.where(fit.known, np.clip(best[n:] * reference.spans, -1.0, 1.0), 0.0)
-    first, second = (float(each.mean()) / fit.dimension for each in (before, after))
-    return Fitted(gains, offsets, fit.lost, first, second, float((before - after).sum()) / 2)
+    return Fitted(
+        gains,
+        offsets,
+        fit.lost,
+        before=float(before.mean()) / fit.dimension,
+        after=float(after.mean()) / fit.dimension,
+        gained=float((before - after).sum()) / 2,
+    )
 
 
 def guess_of_lost(touches: Iterable[Floats], lost: npt.NDArray[np.bool_], step: float) -> npt.NDArray[np.float32]:

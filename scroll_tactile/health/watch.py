@@ -6,10 +6,9 @@ Of each channel three scores are ranked, by what a change of it would do: the li
 gain, an offset and noise from what else moves, P the inverse of the scatter of touches within materials. P contains
 the touch itself and treats it as the others, so that its rank among the touches of its own cell (material, length and
 level) is uniform and independent of all before it, whatever mixture of materials comes (transductive, Mondrian: Vovk,
-Gammerman,
-Shafer, Algorithmic Learning in a Random World, 2005). A simple jumper bets on each score (Volkhonskiy and others,
-COPA 2017): factors 1 + ε (p − 1/2), capital moved between the ε at a rate J. The mean of all martingales is one, too,
-and reaches 1/bound with a probability of at most the bound, ever (Ville).
+Gammerman, Shafer, Algorithmic Learning in a Random World, 2005). A simple jumper bets on each score (Volkhonskiy and
+others, COPA 2017): factors 1 + ε (p − 1/2), capital moved between the ε at a rate J. The mean of all martingales is
+one, too, and reaches 1/bound with a probability of at most the bound, ever (Ville).
 """
 
 from __future__ import annotations
@@ -79,24 +78,6 @@ class Bets:
         self.log[first : first + len(ranks)] += np.log(total)
 
 
-def own_scores(rows: Rows) -> Whole:
-    """Of rows (k, size) the level of each channel, and how lively it is beside the others, in `UNIT`, (k, 2 n).
-
-    A large change widens the scatter, in which the linear scores hide it; these scores show it.
-    """
-    n, whole = rows.shape[1] // KINDS, rows.astype(np.int32)
-    lively = whole[:, n : 2 * n] + whole[:, 2 * n : 3 * n]
-    ordered = np.sort(lively, axis=1)
-    lively -= np.rint((ordered[:, (n - 1) // 2] + ordered[:, n // 2]) / 2).astype(np.int32)[:, None]
-    return np.concatenate([whole[:, :n], lively], axis=1)
-
-
-def resting_scores(rows: Rows) -> Whole:
-    """Of a resting sensor's rows (k, size): the level of each channel by itself, and its noise, (k, 2 n)."""
-    n, whole = rows.shape[1] // KINDS, rows.astype(np.int32)
-    return np.concatenate([whole[:, :n] + whole[:, -1:], whole[:, 2 * n : 3 * n]], axis=1)
-
-
 def beside_level(scores: Floats, levels: Rows) -> Floats:
     """What the level of a touch does not explain of its scores (k, count), by the line through the rows of a cell.
 
@@ -125,32 +106,34 @@ def tie_break(sequence: int) -> float:
 
 
 class Cell(NamedTuple):
-    """The rows (k, size) of one cell, those scores of each that nothing else changes, (k, 2 n), and the rows' sum.
+    """The rows (k, size) of one cell, and those scores of each that nothing else changes, (k, 2 n).
 
     None of it changes: a copy of a watch has the same cells.
     """
 
     rows: Rows
     scores: Whole
-    total: npt.NDArray[np.int64]
 
     @classmethod
     def of(cls, place: Place, rows: Rows) -> Cell:
-        """The cell of a place, with these rows."""
-        scores = resting_scores(rows) if place == AT_REST else own_scores(rows)
-        return cls(rows, scores, rows.sum(axis=0, dtype=np.int64))
+        """The cell of a place, with these rows.
+
+        The scores are the level of each channel, and how lively it is beside the others: a large change widens the
+        scatter, in which the linear scores hide it, and these show it. At rest they are each channel's level by itself,
+        and its noise. All in `UNIT`.
+        """
+        n, whole = rows.shape[1] // KINDS, rows.astype(np.int32)
+        level, noise = whole[:, :n], whole[:, 2 * n : 3 * n]
+        if place == AT_REST:
+            return cls(rows, np.concatenate([level + whole[:, -1:], noise], axis=1))
+        lively = whole[:, n : 2 * n] + noise
+        ordered = np.sort(lively, axis=1)
+        lively -= np.rint((ordered[:, (n - 1) // 2] + ordered[:, n // 2]) / 2).astype(np.int32)[:, None]
+        return cls(rows, np.concatenate([level, lively], axis=1))
 
     def joined(self, other: Cell) -> Cell:
         """The cell with the rows of another behind its own."""
-        rows, scores = np.concatenate([self.rows, other.rows]), np.concatenate([self.scores, other.scores])
-        return Cell(rows, scores, self.total + other.total)
-
-    def bounded(self) -> Cell:
-        """The cell, without its older half where it is full, so that later rows are ranked among others."""
-        if len(self.rows) <= MOST_ROWS:
-            return self
-        rows = self.rows[MOST_ROWS // 2 :].copy()
-        return Cell(rows, self.scores[MOST_ROWS // 2 :].copy(), rows.sum(axis=0, dtype=np.int64))
+        return Cell(np.concatenate([self.rows, other.rows]), np.concatenate([self.scores, other.scores]))
 
 
 class Watch:
@@ -180,7 +163,7 @@ class Watch:
     def copy(self) -> Watch:
         """One that goes on independently, but for the list of what grew."""
         twin = copy(self)
-        twin.bets, twin.scatter = deepcopy(self.bets), self.scatter.copy()
+        twin.bets, twin.scatter = deepcopy(self.bets), deepcopy(self.scatter)
         twin.least, twin.since = self.least.copy(), self.since.copy()
         twin.cells, twin.touched, twin.rested = dict(self.cells), self.touched.copy(), self.rested.copy()
         return twin
@@ -194,9 +177,11 @@ class Watch:
         before, cell = self.cells.get(place), Cell.of(place, numbers[None])
         if before is not None:
             cell = before.joined(cell)
-            self._bet(sequence, material, (numbers - before.total / len(before.rows)) * UNIT, cell)
+            self._bet(sequence, material, (numbers - before.rows.mean(axis=0)) * UNIT, cell)
             self._judge(sequence)
-        self.cells[place] = cell.bounded()
+        if len(cell.rows) > MOST_ROWS:  # its older half goes, so that later rows are ranked among others
+            cell = Cell.of(place, cell.rows[MOST_ROWS // 2 :].copy())
+        self.cells[place] = cell
         self.taken += 1
 
     def _bet(self, sequence: int, material: str, away: Floats, cell: Cell) -> None:
@@ -273,17 +258,15 @@ class WatchedRows:
 
     def __init__(self, rules: WatchRules, watch: Watch, *, last: int, known: int, lost: int) -> None:
         self.rules, self.watch, self.last, self.known, self.lost = rules, watch, last, known, lost
-        self._earlier: list[_Earlier] = []
-        self._health: Health | None = None
+        self._earlier = [_Earlier(rules.after, Watch(watch.channels, rules.bound), 0)]  # the first is before all rows
 
     def take(self, row: WatchedRow) -> None:
         """Take the next row."""
         watch = self.watch
         if row.numbers is not None and watch.alarmed is None:
-            if not self._earlier or watch.taken >= self._earlier[-1].watch.taken + EVERY:
+            if watch.taken >= self._earlier[-1].watch.taken + EVERY:
                 self._keep_copy()
             watch.take(row.sequence, row.material, row.steps, row.numbers)
-            self._health = None
         self.last = row.sequence
 
     def _keep_copy(self) -> None:
@@ -298,30 +281,24 @@ class WatchedRows:
         """Be as before this row was taken; the rows between are to be taken again."""
         if sequence > self.last or (self.watch.alarmed is not None and sequence > self.watch.alarmed):
             return
-        while self._earlier and self._earlier[-1].last >= sequence:
+        while len(self._earlier) > 1 and self._earlier[-1].last >= sequence:
             self._earlier.pop()
-        if not self._earlier:
-            self.watch, self.last = Watch(self.watch.channels, self.rules.bound), self.rules.after
-        else:
-            self.last, watch, grown = self._earlier[-1]
-            self.watch = watch.copy()
-            del self.watch.grew[grown:]
-        self._health = None
+        self.last, watch, grown = self._earlier[-1]
+        self.watch = watch.copy()
+        del self.watch.grew[grown:]
 
     def health(self, time_of: Callable[[int], float | None]) -> Health:
-        """What it says, made anew where a row came that counts. time_of: a row's, in seconds since 1970."""
-        if self._health is None:
-            watch, change = self.watch, self.watch.change
-            self._health = Health(
-                since=None if change is None else change.since,
-                time=None if change is None else time_of(change.since),
-                channels=() if change is None else change.channels,
-                kind="" if change is None else change.kind,
-                evidence=math.exp(min(watch.evidence, 700.0)),
-                bound=watch.bound,
-                touches=watch.taken,
-                alarmed=None if change is None else watch.alarmed,
-                materials=() if change is None else change.materials,
-                grew=tuple(watch.grew),
-            )
-        return self._health
+        """What it says. time_of: a row's, in seconds since 1970."""
+        watch, change = self.watch, self.watch.change
+        return Health(
+            since=None if change is None else change.since,
+            time=None if change is None else time_of(change.since),
+            channels=() if change is None else change.channels,
+            kind="" if change is None else change.kind,
+            evidence=math.exp(min(watch.evidence, 700.0)),
+            bound=watch.bound,
+            touches=watch.taken,
+            alarmed=watch.alarmed,
+            materials=() if change is None else change.materials,
+            grew=tuple(watch.grew),
+        )

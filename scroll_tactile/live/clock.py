@@ -62,22 +62,20 @@ class Clock:
         Raises InputError for other kinds, for another number of them, and for times in other units than seconds.
         """
         try:
-            if isinstance(time, str | bytes):
-                raise TypeError
             stamps = np.asarray(time)
             if stamps.dtype.kind not in "fiu":
                 raise TypeError
-            seconds = [float(stamps)] if stamps.ndim == 0 else stamps.astype(np.float64).tolist()
         except (TypeError, ValueError):
             raise InputError(
                 f"expected time as numbers, in seconds; came {type(time).__name__} {time!r:.60}. "
                 "Of text or dates take the seconds since some moment"
             ) from None
-        if np.ndim(stamps) > 1 or len(seconds) != count:
+        if stamps.ndim > 1 or stamps.size != count:
             raise InputError(
-                f"expected a time for each of {count} readings; came times of shape {np.shape(stamps)}. "
+                f"expected a time for each of {count} readings; came times of shape {stamps.shape}. "
                 "A block (k, n) has times (k,)"
             )
+        seconds: list[float] = stamps.astype(np.float64).ravel().tolist()
         if not all(map(math.isfinite, seconds)):
             raise InputError(f"expected finite times; came {next(s for s in seconds if not math.isfinite(s))}")
         self._require_seconds(seconds)
@@ -87,7 +85,8 @@ class Clock:
         """Raise InputError where two steps in turn are as long as those of another unit."""
         last, before = self._last, self._unit
         for stamp in seconds:
-            unit = self._unit_of(stamp - last)
+            step = (stamp - last) * self._rate
+            unit = next((unit for unit in CLOCK_UNITS if 0.2 * unit < step < 5 * unit), 0.0)
             if unit and unit == before:
                 raise InputError(
                     f"expected times in seconds; those that came differ by {stamp - last:.6g} from reading to reading, "
@@ -97,29 +96,23 @@ class Clock:
             last, before = stamp, unit
         self._unit = before
 
-    def _unit_of(self, step: float) -> float:
-        return next((unit for unit in CLOCK_UNITS if 0.2 * unit < step * self._rate < 5 * unit), 0.0)
-
     def places(self, rows: Rows, seconds: list[float]) -> Iterator[ClockPart]:
         """The readings, shape (k, …), in their places."""
-        first, taken = 0, 0  # rows[first:taken] follow each other and were not yet given
+        first = 0  # rows[first:i] follow each other and were not yet given
         for i, stamp in enumerate(seconds):
             steps, breaks = self._place(stamp, rows[i])
-            if steps != 1 or breaks or taken != i:
-                if taken > first:
-                    yield ClockPart(rows[first:taken], time=seconds[first])
-                first = i
+            if steps != 1 or breaks:
+                if i > first:
+                    yield ClockPart(rows[first:i], time=seconds[first])
+                first = i if steps else i + 1
+            if breaks:
+                yield ClockPart(rows[i:i], breaks, stamp)
+            elif steps > 1 and self._row is not None:
+                yield ClockPart(_line(self._row, rows[i], steps), time=stamp - (steps - 1) / self._rate)
             if steps:
-                if breaks:
-                    yield ClockPart(rows[i:i], breaks, stamp)
-                elif steps > 1 and self._row is not None:
-                    yield ClockPart(_line(self._row, rows[i], steps), time=stamp - (steps - 1) / self._rate)
                 self._row = rows[i]
-                taken = i + 1
-            else:
-                first = taken = i + 1
-        if taken > first:
-            yield ClockPart(rows[first:taken], time=seconds[first])
+        if len(rows) > first:
+            yield ClockPart(rows[first:], time=seconds[first])
         if self._row is not None:
             self._row = np.array(self._row)  # and not the caller's
 
@@ -128,34 +121,28 @@ class Clock:
         if stamp == self._last:
             return self._standing(row), ""
         off = (stamp - self._expected) * self._rate
-        resumed, self._still = self._still > self._gap, 0
-        if math.isnan(off) or resumed:
-            return self._anew(stamp), ""
-        if stamp < self._last and (self._last - stamp) * self._rate > self._gap:
+        anew, breaks = math.isnan(off) or self._still > self._gap, ""
+        self._still = 0
+        if not anew and (self._last - stamp) * self._rate > self._gap:
             self._report.steps_back += 1
-            return self._anew(stamp), "time went back"
-        if off > self._gap:
+            breaks = "time went back"
+        elif not anew and off > self._gap:
             self._report.gaps += 1
-            return self._anew(stamp), "gap"
-        return self._next(stamp, off), ""
-
-    def _next(self, stamp: float, off: float) -> int:
-        """Where a reading belongs whose stamp lies so many periods off from where the next is expected."""
+            breaks = "gap"
+        if anew or breaks:
+            self._last, self._expected = stamp, stamp + 1 / self._rate
+            return 1, breaks
         if stamp < self._last:
             self._report.late += 1
-            return 0
+            return 0, ""
         self._last = stamp
         if off < -WITHIN:
             self._report.surplus += 1
-            return 0
+            return 0, ""
         lost = round(off) if off > WITHIN else 0
         self._report.lost += lost
         self._expected += (1 + lost + FOLLOWED * (off - lost)) / self._rate
-        return 1 + lost
-
-    def _anew(self, stamp: float) -> int:
-        self._last, self._expected = stamp, stamp + 1 / self._rate
-        return 1
+        return 1 + lost, ""
 
     def _standing(self, row: Rows) -> int:
         """Where a reading belongs that has the stamp of the last."""

@@ -102,28 +102,27 @@ def _least_sure_of(trajectories: Trajectories, known: npt.NDArray[np.bool_], ris
 
 
 def in_pairs(
-    trajectories: Trajectories, thresholds: FloatArray, dependence: Dependence
+    of: Trajectories, thresholds: FloatArray, dependence: Dependence
 ) -> tuple[Trajectories, npt.NDArray[np.bool_]]:
     """The probabilities and novelties of held-out touches behind another of their material, and whether each is known.
 
     thresholds: the largest novelty of a known touch at each moment. The first touch counts as at its last moment.
     """
-    reached = [np.flatnonzero(~np.isnan(of)).tolist() for of in trajectories.novelty]
+    reached = [np.flatnonzero(~np.isnan(novelty)).tolist() for novelty in of.novelty]
     pairs: list[tuple[int, int]] = []
-    for target in sorted(set(trajectories.targets.tolist())):
-        own = [i for i in np.flatnonzero(trajectories.targets == target).tolist() if reached[i]]
+    for target in sorted(set(of.targets.tolist())):
+        own = [i for i in np.flatnonzero(of.targets == target).tolist() if reached[i]]
         pairs += zip(own, [*own[1:], *own[:1]], strict=True) if len(own) > 1 else ()
-    chances = np.full((len(pairs), *trajectories.chances.shape[1:]), np.nan)
-    novelty = np.full((len(pairs), trajectories.novelty.shape[1]), np.nan)
+    chances = np.full((len(pairs), *of.chances.shape[1:]), np.nan)
+    novelty = np.full((len(pairs), of.novelty.shape[1]), np.nan)
     known = np.zeros(novelty.shape, dtype=np.bool_)
     for row, (first, second) in enumerate(pairs):
         last = reached[first][-1]
         for moment in reached[second]:
-            both = (first, last), (second, moment)
-            chances[row, moment] = dependence.probability([trajectories.chances[at] for at in both])
-            novelty[row, moment] = dependence.standard([trajectories.novelty[at] for at in both])
+            chances[row, moment] = dependence.probability([of.chances[first, last], of.chances[second, moment]])
+            novelty[row, moment] = dependence.standard([of.novelty[first, last], of.novelty[second, moment]])
             known[row, moment] = novelty[row, moment] <= (thresholds[last] + thresholds[moment]) / 2
-    return Trajectories(chances, novelty, trajectories.targets[[second for _, second in pairs]]), known
+    return Trajectories(chances, novelty, of.targets[[second for _, second in pairs]]), known
 
 
 def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -> float:
@@ -138,9 +137,8 @@ def least_sure(chances: FloatArray, right: npt.NDArray[np.bool_], risk: float) -
         reached = np.nan_to_num(chances) >= bound
         decided = reached.any(axis=1)
         first = reached.argmax(axis=1)[decided]
-        wrong = float((~right[decided, first]).sum())
-        doubt = float((1 - chances[decided, first]).sum())
-        if (wrong + doubt) / 2 > allowed * len(chances):
+        wrong, doubt = ~right[decided, first], 1 - chances[decided, first]
+        if (wrong.sum() + doubt.sum()) / 2 > allowed * len(chances):
             break
         sure = float(bound)
     return sure

@@ -99,10 +99,6 @@ class Rest:
         least = max(round(LEARNED * sensor.rate), 2 * sensor.channels, 2 * self.block)  # one block has no scatter
         self.needed = -(-least // self.block) * self.block
         self.level: Whole = np.zeros(sensor.channels)
-        self._unread: list[int] = []  # channels of which nothing was read yet
-        self._levels: deque[tuple[Whole, int]] = deque(maxlen=FOLLOWED)
-        self._scatter: npt.NDArray[np.int64] = np.zeros((sensor.channels, sensor.channels), np.int64)
-        self.mean = self.kappa = self.alarm = self.inner = self.near = math.inf
 
     def whole(self, rows: npt.NDArray[np.float64]) -> Whole:
         """Readings (k, n) as whole numbers within the range; NaN where a value is missing."""
@@ -154,11 +150,11 @@ class Rest:
 
     def learn(self, numbers: Whole) -> None:
         """Begin with readings at rest, a whole number of blocks of them: what was learned before is gone."""
-        self._unread = np.flatnonzero(np.isnan(numbers).all(axis=0)).tolist()
+        self._unread: list[int] = np.flatnonzero(np.isnan(numbers).all(axis=0)).tolist()  # channels without a say yet
         numbers = _interpolated(numbers)
         self._floor = _floor(numbers)
-        self._scatter[:] = 0
-        self._levels.clear()
+        self._scatter: npt.NDArray[np.int64] = np.zeros((self.channels, self.channels), np.int64)
+        self._levels: deque[tuple[Whole, int]] = deque(maxlen=FOLLOWED)
         self._blocks = self.measured = 0
         self._sum = self._squares = self._fourths = 0.0  # of d² over blocks, of its square over them and one by one
         blocks = [numbers[first : first + self.block] for first in range(0, len(numbers), self.block)]
@@ -199,16 +195,14 @@ class Rest:
     def resume(self, numbers: Whole) -> None:
         """Follow the level from readings after a contact: it may have moved. The noise stays as it was learned."""
         self._levels.clear()
-        self._levels.append((numbers.sum(axis=0), len(numbers)))
-        self._relevel()
+        self._relevel(numbers)
 
     def _take(self, numbers: Whole) -> None:
         away = numbers - self.level
         total = away.sum(axis=0)
         # Whole numbers below 2⁵³ times 2: exact in whatever order.
         self._scatter += (len(numbers) * (away.T @ away) - np.outer(total, total)).astype(np.int64)
-        self._levels.append((numbers.sum(axis=0), len(numbers)))
-        self._relevel()
+        self._relevel(numbers)
         self._blocks += 1
 
     def _measure(self, distances: list[float]) -> None:
@@ -218,7 +212,8 @@ class Rest:
         self._sum, self._squares = self._sum + total, self._squares + total**2
         self._fourths += math.fsum(min(distance, self.alarm) ** 2 for distance in distances)
 
-    def _relevel(self) -> None:
+    def _relevel(self, numbers: Whole) -> None:
+        self._levels.append((numbers.sum(axis=0), len(numbers)))
         count = sum(count for _, count in self._levels)
         self.level = np.floor(sum(total for total, _ in self._levels) / count + 0.5)
 

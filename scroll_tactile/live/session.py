@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from numbers import Real
 from types import TracebackType
@@ -21,14 +23,18 @@ from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event, PressDetector
-from scroll_tactile.live.readings import GrowingTouch, Recent, TouchRows, is_touch
-from scroll_tactile.prediction.features import WindowCache
+from scroll_tactile.prediction.current import FrozenModel
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
+from scroll_tactile.prediction.judging import estimates_of
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.predictor import Predictor
-from scroll_tactile.results import Health, Prediction
+from scroll_tactile.prediction.predictor import Predictor, nothing_known
+from scroll_tactile.readouts.estimation import Estimator
+from scroll_tactile.results import Estimate, Health, Prediction
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.contact import MOST_FRAMES, Rest
-from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings
+from scroll_tactile.signals.contact import MOST_FRAMES
+from scroll_tactile.signals.correction import Correction, corrected_stream
+from scroll_tactile.signals.stream import Stream, as_rows, fewest_readings, validate
+from scroll_tactile.signals.windows import Scale
 
 __all__ = ["HealthNotes", "LiveSession"]
 
@@ -72,29 +78,124 @@ class HealthNotes:
         """Take the touch that ended; None where the session did: note the touch before it and the rest, and look."""
         touch, self._last = self._last, ended
         try:
-            if touch is not None and self._counts(touch):
+            certain = touch is not None and self._materials and touch.decided and touch.prediction.known
+            if touch is not None and certain and not self._learner.names_of(touch.stream):  # its row has channels, too
                 self._learner.sense(touch.stream, touch.prediction.material)
             if ended is not None and ended.rest is not None:
                 self._learner.sense(ended.rest)
-            found = None if self._changed is None else self._learner.health()
+            if self._changed is None:
+                return
+            found = self._learner.health()
         except (ScrollTactileError, StoreError) as error:
             self._warn_once(error)
             return
-        if self._changed is not None and found is not None:
-            before, self._told = self._told, found.since is not None
-            if self._told and not before:
-                self._changed(found)
-
-    def _counts(self, touch: LiveTouch) -> bool:
-        """Whether a touch is noted: it was decided, is known, and was not learned, whose row has its channels, too."""
-        answer = touch.prediction
-        certain = self._materials and touch.decided and answer.known is True and answer.material is not None
-        return certain and not self._learner.names_of(touch.stream)
+        before, self._told = self._told, found.since is not None
+        if self._told and not before:
+            self._changed(found)
 
     def _warn_once(self, error: Exception) -> None:
         if type(error) not in self._warned:
             self._warned.add(type(error))
             self._warn(f"the health of the sensor cannot be told: {error}")
+
+
+@dataclass
+class GrowingTouch:
+    """The touch under way, and what is predicted of it with the model of the memory as it was when it began.
+
+    candidates: the materials that it may be of. rows: its readings, of a camera behind the resting image, and at most
+    `limit` of them; came: how many there were. at: when it began. moments: that are to come, in readings; the next is
+    the last of them. earlier: the touches of the same thing before it; encoded: they, as its model reads them.
+    estimator: None where no quantity was declared. widths: quantity → how narrow its interval is to be. rest: readings
+    before it. correction: through which they are read: that of the memory when the touch began. estimates: by quantity,
+    as of `stage`; settled: whether every interval was as narrow as it is to be, False where none is asked to be.
+    """
+
+    predictor: Predictor
+    extractor: FeatureExtractor
+    candidates: list[str]
+    rows: list[Array]
+    limit: int
+    at: float
+    frozen: FrozenModel
+    rule: DecisionRule
+    moments: list[int]
+    earlier: tuple[Stream, ...]
+    estimator: Estimator | None
+    widths: Mapping[str, float]
+    rest: Array | None
+    correction: Correction | None
+    came: int = 0
+    cache: WindowCache = field(default_factory=WindowCache)
+    encoded: list[Encoded] = field(default_factory=list)
+    prediction: Prediction | None = None
+    decided: bool = False
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    stage: int | None = None
+    settled: bool = False
+
+    def add(self, rows: Array) -> None:
+        """Add readings (k, …), as far as there is room within the limit."""
+        self.came += len(rows)
+        self.rows.extend(np.array(rows[: self.limit - len(self.rows)]))  # of its own, and not the caller's
+
+    def predict_in_time(self) -> None:
+        """Predict at the last moment that the touch has come to, if any is new, until both are what was asked for."""
+        moment = 0
+        while self.moments and self.moments[-1] <= self.came:
+            moment = self.moments.pop()
+        if moment:
+            with suppress(StreamError):  # too few frames in contact, or all values missing: no prediction yet
+                stream = self.beginning(moment)
+                if self.prediction is None or not self.decided:
+                    self.predict(stream)
+                else:  # the prediction stays; what is asked of intervals is not reached yet
+                    self._estimate(self._encoded(stream, self.cache), self.prediction)
+        if self.decided and (self.settled or not self.widths):
+            self.moments.clear()
+
+    def beginning(self, count: int) -> Stream:
+        """The stream of its first readings, corrected. Raises StreamError where they make none."""
+        return corrected_stream(self.extractor.stream(np.array(self.rows[:count])), self.correction)
+
+    def predict(self, stream: Stream) -> Prediction:
+        """The prediction for the beginning of it, as `learner.predict` gives it."""
+        if not self.candidates:
+            seconds = math.fsum({each.key: each.seconds for each in (*self.earlier, stream)}.values())
+            self.prediction = nothing_known(seconds)
+            return self.prediction
+        self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
+        current = self._encoded(stream, self.cache)
+        self.prediction = self.predictor.answer_of(
+            self.frozen.model, self.extractor, self.candidates, [*self.encoded, current]
+        )
+        self.decided |= self.rule.decided(self.prediction, current.steps, several=bool(self.earlier))
+        self._estimate(current, self.prediction)
+        return self.prediction
+
+    def _encoded(self, stream: Stream, cache: WindowCache) -> Encoded:
+        model, estimator = self.frozen.model, self.estimator
+
+        def scales_for(steps: int) -> list[Scale]:
+            own = model.scales_for(self.candidates, steps)
+            return own if estimator is None else sorted({*own, *estimator.scales_for(steps)})
+
+        return self.extractor.encode(stream, model.longest, scales_for, cache)
+
+    def _estimate(self, encoded: Encoded, prediction: Prediction) -> None:
+        """Estimate where the touch has come to another of its milestones, or has ended complete."""
+        estimator = self.estimator
+        if estimator is None:
+            return
+        stage = estimator.stage(encoded.steps)
+        if stage != self.stage or stage == estimator.last:
+            self.estimates = estimates_of(
+                estimator, estimator.wanted(None), encoded, self.extractor, prediction, self.rule.risk, known=None
+            )
+            self.stage = stage
+            widths = ((self.estimates[name].width, width) for name, width in self.widths.items())
+            narrow = [own is not None and own <= width for own, width in widths]
+            self.settled = self.settled or (bool(narrow) and all(narrow))
 
 
 class LiveSession:
@@ -112,8 +213,8 @@ class LiveSession:
         contact: Literal["auto", "manual"],
         false_contacts: float,
         scene: Sequence[str] | None,
-        widths: Mapping[str, float] | None = None,
-        notes: HealthNotes | None = None,
+        widths: Mapping[str, float] | None,
+        notes: HealthNotes | None,
     ) -> None:
         if contact not in ("auto", "manual"):
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
@@ -121,7 +222,8 @@ class LiveSession:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
         self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
         self.sensor = sensor = predictor.recipe.sensor
-        self._rest: Rest = capabilities_of(self._extractor.embedding).rest
+        rest = capabilities_of(self._extractor.embedding).rest
+        self._before = int(sensor.camera and isinstance(rest, str))  # frames that are no part of a touch
         frozen = predictor.frozen()  # until the rule is measured, which takes seconds
         model = frozen.model
         candidates_of(scene, model.names, model.known)
@@ -130,15 +232,15 @@ class LiveSession:
         self._detector: ContactDetector | PressDetector | None = None
         if not self._manual:
             self._detector = (
-                PressDetector(sensor, self._rest)
+                PressDetector(sensor, rest)
                 if sensor.camera
-                else ContactDetector(sensor, false_contacts, partial(is_touch, predictor))
+                else ContactDetector(sensor, false_contacts, partial(_is_touch, predictor))
             )
         self.report = LiveReport(learning=not self._manual and not sensor.camera)
         self._clock = Clock(sensor.rate, self.report)
         self._dtype = np.dtype(np.float32 if sensor.camera else np.float64)
-        count = 4 if sensor.camera else max(8, round(REMEMBERED * sensor.rate))
-        self._recent = Recent(count if not self._manual else 1, sensor.shape, self._dtype)
+        self._remembered = 4 if sensor.camera else max(8, round(REMEMBERED * sensor.rate))
+        self._recent: deque[Array] = deque(maxlen=self._remembered)
         self._since, self._came = 0.0, 0  # a time, and the readings that came from then on
         self._under_way: GrowingTouch | None = None
         self._ended: list[LiveTouch] = []
@@ -232,7 +334,7 @@ class LiveSession:
         self._scene, self._risk = scene, risk
 
     def close(self) -> None:
-        """End the touch under way, if any, and let all go; a second call does nothing. `touch` and `report` stay."""
+        """End the touch under way, if any; a second call does nothing. `touch` and `report` stay."""
         if self._closed:
             return
         self._closed = True
@@ -240,8 +342,6 @@ class LiveSession:
             self._end("closed")
         if self._notes is not None:
             self._notes.take(None)
-        self._detector = None
-        self._recent = Recent(1, self.sensor.shape, self._dtype)
 
     def __enter__(self) -> Self:
         return self
@@ -277,14 +377,13 @@ class LiveSession:
     def _advance(self, rows: Array) -> None:
         """Take readings that follow each other at the sensor's rate."""
         self.report.ticks += len(rows)
-        taken = 0
-        while taken < len(rows):
-            touch, part = self._under_way, rows[taken:]
+        while len(rows):
+            touch, part = self._under_way, rows
             if touch is not None and touch.moments:
-                part = part[: max(1, touch.moments[-1] - touch.rows.came)]
+                part = part[: max(1, touch.moments[-1] - touch.came)]
             used, event = (len(part), None) if self._detector is None else self._detector.feed(part)
             self._take(part[:used], event)
-            taken += used
+            rows = rows[used:]
 
     def _take(self, rows: Array, event: Event | None) -> None:
         """Take readings at whose last something may have happened."""
@@ -293,64 +392,57 @@ class LiveSession:
         if self._detector is not None:
             self.report.learning, self.report.restless = self._detector.learning, self._detector.restless
         if touch is None:
-            self._recent.add(rows)
+            self._recent.extend(np.array(rows[-self._remembered :]))
             if event is not None and event.kind == "began":
                 rested = max(3, round(RESTED * self.sensor.rate))
-                recent = self._recent.last(rested + event.readings)
+                recent = np.array(self._recent)[-rested - event.readings :]
                 place = max(0, len(recent) - event.readings)
                 self._begin(recent[place:], recent[:place] if place == rested else None)
         else:
-            touch.rows.add(rows)
+            touch.add(rows)
             if event is None:
                 touch.predict_in_time()
-            elif event.kind != "relearned":
-                touch.rows.drop(event.readings)
+            elif event.kind == "relearned":  # it was no touch: the next is of what it would have been of
+                self._under_way, self._again = None, bool(touch.earlier)
+            else:
+                touch.came -= event.readings
+                del touch.rows[touch.came :]
                 self._end("still" if event.kind == "still" else "released")
         if event is not None and event.kind == "relearned":
             self.report.relearned += 1
-            self._leave(touch)
             self._recent.clear()
 
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""
         self._recent.clear()
         frozen = self._predictor.frozen()
-        model = frozen.model
+        model, scene = frozen.model, self._scene
         rule = self._rule(model, self._risk)
         prefix = None if self._detector is None else self._detector.prefix
-        before, frame = 0, 1
+        before, frame, limit = self._before, 1, max(round(KEPT * self.sensor.rate), 4 * model.longest)
         if self.sensor.camera:
-            frame = model.plan.widths[0]
-            before = int(isinstance(self._rest, str))
+            frame, limit = model.plan.widths[0], MOST_FRAMES + before
         if prefix is not None:
             rows = np.concatenate([prefix, rows]).astype(self._dtype)
-        limit = MOST_FRAMES + before if self.sensor.camera else max(round(KEPT * self.sensor.rate), 4 * model.longest)
-        moments = sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True)
-        at = self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate
         earlier, self._again = self._thing if self._again else (), False
         self._under_way = GrowingTouch(
             predictor=self._predictor,
             extractor=self._extractor,
-            scene=self._scene,
-            rows=TouchRows(rows, limit),
-            at=at,
+            candidates=model.names if scene is None else sorted({name for name in scene if name in model.known}),
+            rows=[],
+            limit=limit,
+            at=self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate,
             frozen=frozen,
             rule=rule,
-            moments=moments,
-            before=before,
+            moments=sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True),
             earlier=earlier,
             estimator=self._predictor.estimator(),
             widths=self._widths,
-            rest=None if self.sensor.camera else rest,
+            rest=rest,
             correction=self._predictor.ledger.correction,
         )
+        self._under_way.add(rows)
         self._under_way.predict_in_time()
-
-    def _leave(self, touch: GrowingTouch | None) -> None:
-        """What seemed a touch was none: the next is of what it would have been of, and that may be nothing known."""
-        self._under_way = None
-        if touch is not None:
-            self._again = bool(touch.earlier)
 
     def _rule(self, model: Model, risk: float) -> DecisionRule:
         """When predictions are made with a model, and when they are decided; once for each model."""
@@ -376,12 +468,12 @@ class LiveSession:
         if touch is None:
             return
         try:
-            if touch.rows.kept - touch.before < fewest_readings(self.sensor):
+            if len(touch.rows) - self._before < fewest_readings(self.sensor):
                 raise StreamError
-            stream = touch.beginning(touch.rows.kept)
+            stream = touch.beginning(touch.limit)
         except StreamError:  # nothing that could be observed
             self.report.brief += 1
-            self._leave(touch)
+            self._again = bool(touch.earlier)  # the next is of what it would have been of
             return
         before = touch.prediction if touch.decided else None
         prediction = touch.predict(stream)
@@ -390,7 +482,10 @@ class LiveSession:
         self.report.touches += 1
         self.report.undecided += not touch.decided
         self.report.revised += revised is not None
-        self.report.truncated += touch.rows.came > touch.rows.kept
+        self.report.truncated += touch.came > touch.limit
+        rest = None
+        with suppress(StreamError):  # nothing but missing values
+            rest = None if touch.rest is None else corrected_stream(validate(touch.rest, self.sensor), touch.correction)
         ended = LiveTouch(
             stream=stream,
             prediction=prediction,
@@ -400,7 +495,7 @@ class LiveSession:
             earlier=touch.earlier,
             revised=revised,
             estimates=touch.estimates,
-            rest=touch.rest_before(),
+            rest=rest,
         )
         self._ended.append(ended)
         self._settled = touch.settled
@@ -409,7 +504,7 @@ class LiveSession:
 
     def _break(self, why: str) -> None:
         """Time begins anew; a touch that has no reading yet begins after it."""
-        if self._under_way is None or self._under_way.rows.came:
+        if self._under_way is None or self._under_way.came:
             self._end("gap" if why == "gap" else "time went back")
         self._recent.clear()
         if self._detector is not None:
@@ -418,7 +513,7 @@ class LiveSession:
     def _state(self) -> LiveState:
         touch, ended = self._under_way, tuple(self._ended)
         if touch is not None:
-            seconds = max(0, touch.rows.came - touch.before) / self.sensor.rate
+            seconds = max(0, touch.came - self._before) / self.sensor.rate
             return LiveState(
                 contact=True,
                 seconds=seconds,
@@ -430,7 +525,7 @@ class LiveSession:
                 settled=touch.settled,
             )
         if not ended:
-            return _AT_REST
+            return LiveState()
         last = ended[-1]
         return LiveState(
             seconds=last.stream.seconds,
@@ -441,6 +536,22 @@ class LiveSession:
             estimates=last.estimates,
             settled=self._settled,
         )
+
+
+def _is_touch(predictor: Predictor, rows: Array) -> bool:
+    """Whether readings (k, n) that came while rest was to be learned are a touch, or hold a part of one.
+
+    They are judged as far as a learned touch lasts, the last and the first of them: shorter parts, which look like the
+    beginning of one, were touches in 12 of 60 rests of RoboSkin, these in none. What is like a learned touch but for
+    its level, or through noise alone, is rest: it has no features but noise.
+    """
+    model = predictor.frozen().model
+    if not model.names:
+        return False
+    n = model.longest
+    parts = (rows[-n:], rows[:n]) if len(rows) > n else (rows,)
+    found = (predictor.predict((part,), None) for part in parts)
+    return any(each.known is True and not {"noisy", "zero moved"} & set(each.unusual) for each in found)
 
 
 def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[str, float]:
@@ -465,5 +576,4 @@ def _says(prediction: Prediction) -> str | None:
     return None if prediction.known is False else prediction.material
 
 
-_AT_REST = LiveState()
 _RULES: WeakKeyDictionary[Model, dict[float, DecisionRule]] = WeakKeyDictionary()  # by risk

@@ -148,7 +148,17 @@ def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor
             + ("pixels" if sensor.camera else f"{sensor.channels}; at most {MOST_CHANNELS} can be told apart")
         )
     found: dict[Stream, str] = {}
-    for material, readings in _pairs(touches):
+    try:
+        pairs = [
+            (material, readings)
+            for material, readings in (touches.items() if isinstance(touches, Mapping) else touches)
+        ]
+    except (TypeError, ValueError):
+        raise InputError(
+            "expected touches as pairs of a material and its readings, or a mapping from materials to readings; came "
+            f"{type(touches).__name__} {touches!r:.60}"
+        ) from None
+    for material, readings in pairs:
         stream = validate(readings, sensor)
         stream = stream if stream.raw is None else stream.raw
         if len(stream) < 3:
@@ -161,17 +171,6 @@ def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor
             f"so that a changed skin is told from a changed material; came {dict(Counter(found.values()))}"
         )
     return found
-
-
-def _pairs(touches: Any) -> list[tuple[str, Any]]:
-    try:
-        pairs = list(touches.items() if isinstance(touches, Mapping) else touches)
-        return [(material, readings) for material, readings in pairs]
-    except (TypeError, ValueError):
-        raise InputError(
-            "expected touches as pairs of a material and its readings, or a mapping from materials to readings; came "
-            f"{type(touches).__name__} {touches!r:.60}"
-        ) from None
 
 
 def adapt_to(
@@ -188,10 +187,12 @@ def adapt_to(
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
         own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
-        kept = _kept_before(store, memory, own, until)
-        ends = _at_ends(kept, sensor.channels)
+        out = own if until is None else own | {head.key for head in store.heads(until)}
+        kept = [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
         reference = _reference(store, memory, sensor.channels, own, until)
     _require_known(reference, sorted(set(touches.values())), store)
+    at_ends = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]  # of levels (n, T)
+    ends: Floats = np.mean(at_ends, axis=0) if kept else np.ones(sensor.channels)
     low, high = (np.asarray(limit, np.float64) for limit in sensor.limits)
     shares = [(touch.readings - low) / (high - low) for touch in touches]
     found = fitted(reference, shares, list(touches.values()), ends)
@@ -203,20 +204,20 @@ def adapt_to(
         found.lost.astype(np.bool_),
         guess_of_lost(earlier, found.lost, 1 / (LEVELS - 1)),
     )
-    why = _refusal(found) or _not_recognised(touches, correction, unknown_of)
-    return _result(correction, found, why, None if why else ledger.adapt(correction))
-
-
-def _kept_before(store: Store, memory: Memory, own: set[bytes], until: int | None) -> list[npt.NDArray[np.uint8]]:
-    """The levels, (n, T), of kept touches that were observed up to a row, but for some by their keys."""
-    out = own if until is None else own | {head.key for head in store.heads(until)}
-    return [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
-
-
-def _at_ends(kept: Sequence[npt.NDArray[np.uint8]], channels: int) -> Floats:
-    """The share of kept readings, (n, T), of each channel at an end of the range, (n,); 1 where none are kept."""
-    shares = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]
-    return np.asarray(np.mean(shares, axis=0) if shares else np.ones(channels), np.float64)
+    why = _refusal(found, touches, correction, unknown_of)
+    sequence = None if why else ledger.adapt(correction)
+    lost = np.flatnonzero(correction.lost).tolist()
+    left_out = f"; channels {lost} are left out" if lost else ""
+    return Adaptation(
+        kept=not why,
+        why=why or f"later touches are read through it{left_out}",
+        sequence=sequence,
+        gains=tuple(correction.gains.tolist()),
+        offsets=tuple(correction.offsets.tolist()),
+        left_out=tuple(lost),
+        before=found.before,
+        after=found.after,
+    )
 
 
 def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:
@@ -248,33 +249,16 @@ def _require_known(reference: Reference, materials: Sequence[str], store: Store)
         )
 
 
-def _refusal(found: Fitted) -> str:
-    """Why a correction is not kept; "" where it is."""
+def _refusal(
+    found: Fitted,
+    touches: Mapping[Stream, str],
+    correction: Correction,
+    unknown_of: Callable[[Iterable[Stream]], int],
+) -> str:
+    """Why a correction is not kept; "" where it is: most of its touches are known with it, or more than without."""
     if found.gained < LIKELIER:
         return "the touches are explained no better with any correction: the skin reads as it did, or changed otherwise"
-    return ""
-
-
-def _not_recognised(
-    touches: Mapping[Stream, str], correction: Correction, unknown_of: Callable[[Iterable[Stream]], int]
-) -> str:
-    """Why a correction is not kept; "" unless most of its touches are unknown with it, and no fewer than without."""
     after = unknown_of(corrected_stream(touch, correction) for touch in touches)
     if 2 * after > len(touches) and after >= unknown_of(touches):
         return f"{after} of {len(touches)} touches are unknown even so: gains and offsets do not explain the change"
     return ""
-
-
-def _result(correction: Correction, found: Fitted, why: str, sequence: int | None) -> Adaptation:
-    lost = np.flatnonzero(correction.lost).tolist()
-    reason = why or "later touches are read through it" + (f"; channels {lost} are left out" if lost else "")
-    return Adaptation(
-        kept=not why,
-        why=reason,
-        sequence=sequence,
-        gains=tuple(correction.gains.tolist()),
-        offsets=tuple(correction.offsets.tolist()),
-        left_out=tuple(lost),
-        before=found.before,
-        after=found.after,
-    )

@@ -18,7 +18,6 @@ from touches import spoil
 from scroll_tactile import Adaptation, Kernels, Scene, Sensor, TactileLearner, errors, sensors
 from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.report import memory_page
-from scroll_tactile.health import skin_fit
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, validate
@@ -100,15 +99,7 @@ def test_a_reading_at_an_end_of_the_range_stays_and_a_stream_is_corrected_once()
         with pytest.raises(errors.InputError, match="a gain and an offset"):
             Correction.from_text(wrong, PAD)
     none, nothing = Correction.none(8), np.zeros((8, 1), np.float32)
-    for gains, offsets, out, how in (
-        (0, 0, lost, guess),
-        (0.05, 0, lost, guess),
-        (17, 0, lost, guess),
-        (np.nan, 0, lost, guess),
-        (1, 2000, lost, guess),
-        (1, 0, lost, guess + np.float32(np.inf)),
-        (1, 0, lost | True, nothing),
-    ):
+    for gains, offsets, out, how in ((17, 0, lost, guess), (np.nan, 0, lost, guess), (1, 0, lost | True, nothing)):
         wrong = Correction(none.gains * np.float32(gains), none.offsets + np.float32(offsets), out, how)
         with pytest.raises(errors.InputError, match="expected gains"):
             Correction.from_text(wrong.to_text(), PAD)
@@ -241,10 +232,7 @@ def test_a_second_one_replaces_the_first_until_it_is_retracted(path: Path) -> No
         one = correction(learner)
         second = learner.adapt([(name, learner.stream(readings)) for name, readings in five(broken, 51)])
         two = correction(learner)
-        assert (first.left_out, second.left_out) == (
-            (),
-            (DEAD,),
-        )  # by what the skin read, and not by what was corrected
+        assert (first.left_out, second.left_out) == ((), (DEAD,))  # by what the skin read, not what was corrected
         again = learner.adapt([(name, learner.stream(readings)) for name, readings in five()])
         assert (again.gains, again.offsets) == (first.gains, first.offsets)
         learner.retract(again)
@@ -281,22 +269,6 @@ def test_later_and_retracted_touches_are_no_part_of_what_it_is_compared_with(pat
         learner.retract(first)
         learner.retract(50)
         assert learner.adapt(five()).gains == first.gains
-
-
-def test_three_touches_that_are_known_as_it_is_are_enough(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with TactileLearner.open(path) as learner:
-        monkeypatch.setattr(TactileLearner, "_unknown", lambda learner, touches: 0)
-        assert learner.adapt([*five()[:2], (NAMES[0], other(touch(NAMES[0], 51)))]).kept
-
-
-def test_answers_by_an_axis_are_read_through_it(path: Path) -> None:
-    with TactileLearner.open(path) as learner:
-        for i, name in [(i, name) for i in range(20, 23) for name in NAMES[:2]]:
-            learner.observe(name, touch(name, i), labels={"ground": f"on {name}"})
-        raw = other(touch(NAMES[0], 60))
-        before = learner.predict(raw, of="ground")
-        learner.adapt(five())
-        assert learner.predict(raw, of="ground") == learner.predict(learner.stream(raw), of="ground") != before
 
 
 def test_no_more_than_some_are_kept_to_come_back_to(path: Path) -> None:
@@ -427,24 +399,6 @@ def test_a_beginning_keeps_what_is_guessed_of_a_lost_channel(path: Path) -> None
         assert learner.predict(long).material == learner.predict(raw).material
 
 
-def test_touches_learned_through_the_first_are_no_reference_of_a_second(path: Path) -> None:
-    with TactileLearner.open(path) as learner:
-        learner.adapt(five())
-        done = learner.adapt(five(broken))
-        learner.retract(done)
-        for name, readings in five(broken):
-            learner.observe(name, readings)
-        assert learner.adapt(five(broken)).gains == done.gains
-
-
-def test_many_touches_take_a_time_that_grows_as_they_do(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    modes, mode = list[Any](), skin_fit._PosteriorFit.mode
-    monkeypatch.setattr(skin_fit._PosteriorFit, "mode", lambda *how: modes.append(how) or mode(*how))
-    with TactileLearner.open(path) as learner:
-        assert learner.adapt([pair for first in range(50, 58) for pair in five(other, first)]).kept
-    assert len(modes) == len(skin_fit.SIGMAS) * len(skin_fit.TAUS) + skin_fit.BLOCKS
-
-
 def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_path: Path) -> None:
     pairs = five()
     with TactileLearner.open(path) as learner:
@@ -472,12 +426,11 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
         done = learner.adapt(dict(pairs))
     with pytest.raises(errors.InputError, match=f"row {done.sequence}, of which"):
         learn(path, [str(tmp_path)])
-    with TactileLearner.open(path, mode="read") as learner, pytest.raises(ReadOnlyError):
-        learner.adapt(pairs)
-    with TactileLearner.open(path, mode="read") as learner, pytest.raises(ReadOnlyError):
-        learner.adapt(five(lambda stream: stream.readings))  # though it would be left as it is
-    with TactileLearner.open(path, mode="read") as learner, pytest.raises(ReadOnlyError):
-        learner.retract(done)
+    with TactileLearner.open(path, mode="read") as learner:
+        with pytest.raises(ReadOnlyError):
+            learner.adapt(five(lambda stream: stream.readings))  # though it would be left as it is
+        with pytest.raises(ReadOnlyError):
+            learner.retract(done)
     with pytest.raises(errors.InputError, match="without a path"):
         TactileLearner(sensor=PAD).adapt(pairs)
     with TactileLearner.open(tmp_path / "new", sensor=PAD, **HOW) as learner:
@@ -492,20 +445,7 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
         learner.adapt(pairs)
 
 
-@pytest.mark.parametrize(
-    "attributes",
-    [
-        {},
-        {"correction": 1},
-        {"correction": "AAAA"},
-        {"correction": Correction.none(9).to_text()},
-        {"correction": Correction.none(8).to_text(), "retracts": 1},
-        {"correction": Correction.none(8).to_text(), "more": 1},
-        {"retracts": 51},
-        {"retracts": True},
-        {"retracts": 0},
-    ],
-)
+@pytest.mark.parametrize("attributes", [{}, {"correction": "AAAA"}, {"retracts": 51}])
 def test_a_forged_row_is_refused(path: Path, attributes: dict[str, Any]) -> None:
     put_row(path, kind="adapt", label="", key=b"", attributes=attributes)
     with pytest.raises(StoreError, match="row 51"):
@@ -513,29 +453,15 @@ def test_a_forged_row_is_refused(path: Path, attributes: dict[str, Any]) -> None
     assert check_memory(path)
 
 
-def test_a_forged_retraction_and_a_forged_checkpoint_are_found(path: Path, tmp_path: Path) -> None:
-    shutil.copytree(path, tmp_path / "rows")
-    put_row(tmp_path / "rows", kind="adapt", label="", key=b"", attributes={"retracts": 7})
-    assert any("no adaptation" in wrong for wrong in check_memory(tmp_path / "rows"))
+def test_a_forged_checkpoint_is_refused(path: Path) -> None:
     text = Correction.none(8).to_text()
     with TactileLearner.open(path) as learner:
         learner.compact()
     attributes, arrays = checkpoint_of(path)
-    for wrong in (
-        {},
-        [],
-        [[1, "AAAA"]],
-        [[2, text], [1, text]],
-        [[51, text]],
-        [[i, text] for i in range(1, 18)],
-        [[1]],
-    ):
+    for wrong in ({}, [[1, "AAAA"]], [[51, text]]):
         put_checkpoint(path, {**attributes, "corrections": wrong}, arrays, compaction=True)
         with pytest.raises(StoreError, match="corrections"):
             TactileLearner.open(path)
-    put_checkpoint(path, {**attributes, "corrections": [[50, text]]}, arrays, compaction=True)
-    with TactileLearner.open(path) as learner:
-        assert correction(learner) == text
 
 
 def test_the_command_and_the_page(path: Path, tmp_path: Path) -> None:

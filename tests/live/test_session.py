@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from live_touches import EMBEDDINGS, GEL, frames, gel_learner, learner, predictions, rest, shift, slide
+from live_touches import EMBEDDINGS, GEL, frames, gel_learner, learner, predictions, rest, shift, slide, touched
 from touches import PAD
 
-from scroll_tactile import TactileLearner
+from scroll_tactile import Frames, TactileLearner
 from scroll_tactile.errors import (
     ChannelCountError,
     InputError,
@@ -47,16 +47,6 @@ def test_predictions_are_those_of_the_touch_s_beginnings(embedding, seed, length
     assert now.touches[0].stream == live.touch
     assert live.touch.readings.tobytes() == touch.astype(np.float32).tobytes()
     require_prefixes(made, shown, live.touch)
-
-
-def test_each_prediction_shows_when_readings_come_one_by_one():
-    made, touch = learner(), slide("b", 50, RANDOM)
-    with made.live(contact="manual", risk=1e-12) as live:
-        live.begin()
-        shown, _ = predictions(live, touch, [1] * 50)
-    assert len(shown) > 3
-    require_prefixes(made, shown, live.touch)
-    assert [prediction.seconds for prediction in shown] == sorted({prediction.seconds for prediction in shown})
 
 
 @settings(max_examples=3, deadline=None)
@@ -102,10 +92,7 @@ def test_a_touch_tells_the_half_second_at_rest_before_it():
         found = round(touch.at * PAD.rate)
         assert abs(found - begin) <= 3
         assert np.array_equal(touch.rest.readings, rows[found - 25 : found].astype(np.float32))
-    session = learner().live(contact="manual")
-    session.begin()
-    session.push(rows[places[0][0] : places[0][1]])
-    assert session.end().touches[0].rest is None
+    assert touched(learner().live(contact="manual"), rows[places[0][0] : places[0][1]]).rest is None
 
 
 def test_decided_never_goes_back_and_what_happens_in_a_block_is_not_lost():
@@ -123,17 +110,6 @@ def test_decided_never_goes_back_and_what_happens_in_a_block_is_not_lost():
     assert block.report.undecided == sum(not touch.decided for touch in now.touches)
 
 
-def test_what_stays_undecided_says_so():
-    made = learner()
-    strange = np.random.default_rng(0).uniform(0, 1, (50, 2))
-    with made.live(contact="manual") as live:
-        live.begin()
-        live.push(strange)
-        now = live.end()
-    assert not now.decided and not now.touches[0].decided
-    assert live.report.undecided == 1
-
-
 @pytest.mark.parametrize("count", [1, 3, 5, 30])
 def test_frames_are_found_behind_the_gel_at_rest(count):
     made, rows = gel_learner(), frames(GEL.materials[1], 7, count)
@@ -148,163 +124,18 @@ def test_frames_are_found_behind_the_gel_at_rest(count):
     require_prefixes(made, shown, live.touch)
 
 
-def test_frames_without_a_resting_image_need_a_hand():
-    from scroll_tactile import Frames
-
-    made = TactileLearner(sensor=GEL.sensor, embedding=Frames(rest=None))
-    with pytest.raises(InputError, match="manual"):
-        made.live()
-    with made.live(contact="manual") as live:
-        live.begin()
-        live.push(GEL.touch(GEL.materials[0], 0).readings)
-        assert live.end().touches[0].prediction.material is None
-
-
-def test_before_anything_was_observed_nothing_is_known():
-    with TactileLearner(sensor=PAD, embedding=EMBEDDINGS["kernels"]).live() as live:
-        now = live.push(shift("a")[0])
-    assert now.prediction.material is None and not now.decided and not now.prediction.known
-
-
-def test_sessions_opened_and_left_are_gone():
-    made = learner()
-    rows = rest(110, RANDOM)
-    threads = threading.active_count()
-
-    def opened():
-        live = made.live()
-        live.push(rows)
-
-    opened()
-    gc.collect()
-    before = len(gc.get_objects())
-    for _ in range(100):
-        opened()
-    gc.collect()
-    assert len(gc.get_objects()) - before < 50
-    assert threading.active_count() == threads
-
-
-def test_a_scene_is_asked_for_by_its_names():
-    made, touch = learner(), slide("a", 50, RANDOM)
-    with made.live(contact="manual", scene=["c", "b"]) as live:
-        live.begin()
-        live.push(touch)
-        now = live.end()
-    assert now.prediction == made.predict(touch, scene=["b", "c"])
-    with pytest.raises(UnknownMaterialError, match="'d'"):
-        made.live(scene=["d"])
-
-
-@pytest.mark.parametrize(
-    ("given_", "message"),
-    [
-        ({"risk": 0}, "risk"),
-        ({"risk": 1.5}, "risk"),
-        ({"contact": "always"}, "'auto' or 'manual'"),
-        ({"false_contacts": 0}, "false_contacts"),
-        ({"false_contacts": float("nan")}, "false_contacts"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(given_, message):
-    with pytest.raises(InputError, match=message):
-        learner().live(**given_)
-
-
-def test_begin_and_end_belong_to_manual_sessions_and_closed_ones_take_nothing():
-    with learner().live() as live:
-        with pytest.raises(InputError, match="manual"):
-            live.begin()
-        with pytest.raises(InputError, match="manual"):
-            live.end()
-    with pytest.raises(InputError, match="closed"):
-        live.push(rest(1, RANDOM))
-    live.close()
-
-
-def test_a_touch_under_way_ends_with_the_session():
-    with learner().live(contact="manual") as live:
-        live.begin()
-        live.push(slide("a", 20, RANDOM))
-    assert len(live.touch) == 20 and live.report.touches == 1
-
-
-def test_a_block_of_none_changes_nothing():
-    with learner().live(contact="manual") as live:
-        assert live.push(np.empty((0, 2))) == live.push([])
-        live.begin()
-        live.push(slide("a", 10, RANDOM))
-        before = live.push([])
-        assert live.push(np.empty((0, 2)), time=[]) == before
-        assert before.contact and before.seconds == 10 / PAD.rate
-
-
-def test_a_block_of_many_readings_is_one_block():
-    fast = PAD.model_copy(update={"rate": 1000.0})
-    random = np.random.default_rng(6)
-    rows = rest(10**5, random)
-    for first in range(2000, 10**5, 20_000):
-        rows[first : first + 500] = slide("a", 500, random)
-    with TactileLearner(sensor=fast, embedding=EMBEDDINGS["kernels"]).live() as live:
-        now = live.push(rows)
-    assert len(now.touches) == 5
-    assert live.report.ticks == 10**5
-
-
-@pytest.mark.parametrize("wrong", [np.zeros(3), np.zeros((4, 3)), np.zeros((2, 2, 2)), [[1.0, 2.0], [1.0]], 5.0])
-def test_another_number_of_channels_in_the_middle_of_a_touch(wrong):
-    touch = slide("a", 40, RANDOM)
-    with learner().live(contact="manual") as live:
-        live.begin()
-        live.push(touch[:20])
-        with pytest.raises(ChannelCountError):
-            live.push(wrong)
-        live.push(touch[20:])
-        assert live.end().prediction == learner().predict(touch)
-
-
-def test_values_that_are_no_readings():
-    with learner().live() as live:
-        with pytest.raises(ReadingsTypeError):
-            live.push(["a", "b"])
-        with pytest.raises(NotFiniteError):
-            live.push([np.nan, 0.5])
-        with pytest.raises(NotFiniteError):
-            live.push(np.array([np.inf, 0.5]))
-        assert live.report.readings == 0
-
-
-def test_missing_values_are_missing_where_the_sensor_says_so():
-    sensor = PAD.model_copy(update={"non_finite": "missing"})
-    made = TactileLearner(sensor=sensor, embedding=EMBEDDINGS["kernels"])
-    for repetition in range(3):
-        for material in "ab":
-            made.observe(material, slide(material, 50, np.random.default_rng(repetition)))
-    rows, places = shift("ab", 6)
-    rows[::7, 0] = np.nan
-    rows[[5, 130, 140]] = np.nan
-    with made.live() as live:
-        _, ended = predictions(live, rows, [1] * len(rows))
-        assert live.report.missing == np.isnan(rows).sum()
-    assert len(ended) == len(places)
-    for touch, (begin, _) in zip(ended, places, strict=True):
-        assert abs(touch.at * PAD.rate - begin) <= 3
-        first = round(touch.at * PAD.rate)
-        assert touch.prediction == made.predict(rows[first : first + len(touch.stream)])
-
-
 def test_a_touch_that_never_ends_is_kept_up_to_a_limit():
     made = learner()
     limit = round(KEPT * PAD.rate)
     touch = slide("a", limit + 500, RANDOM)
     with made.live() as live:
         live.push(rest(800, RANDOM))
-        ring = len(live._recent._ring)
+        ring = live._recent.maxlen
         first = live.push(touch)
-        room = live._under_way.rows._room.nbytes
+        room = len(live._under_way.rows)
         for _ in range(3):
             now = live.push(slide("a", limit, RANDOM))
-        assert (live._under_way.rows._room.nbytes, len(live._recent._ring)) == (room, ring)
+        assert (len(live._under_way.rows), live._recent.maxlen) == (room, ring)
         assert now.contact and now.seconds > 3 * KEPT
         assert first.prediction == now.prediction
         done = live.push(rest(200, RANDOM))
@@ -339,12 +170,102 @@ def test_a_decision_that_the_whole_touch_takes_back_is_called_revised():
         assert (live.report.touches, live.report.revised) == (2, 1)
 
 
-def test_a_touch_counts_where_the_sensor_said_nothing_before_it():
+def test_what_stays_undecided_says_so():
+    with learner().live(contact="manual") as live:
+        assert not touched(live, np.random.default_rng(0).uniform(0, 1, (50, 2))).decided
+    assert live.report.undecided == 1
+
+
+def test_frames_without_a_resting_image_need_a_hand_and_of_nothing_observed_nothing_is_known():
+    made = TactileLearner(sensor=GEL.sensor, embedding=Frames(rest=None))
+    with pytest.raises(InputError, match="manual"):
+        made.live()
+    with made.live(contact="manual") as live:
+        ended = touched(live, GEL.touch(GEL.materials[0], 0).readings)
+    assert ended.prediction.material is None and not ended.decided and not ended.prediction.known
+
+
+def test_sessions_opened_and_left_are_gone():
+    made, rows, threads, counts = learner(), rest(110, RANDOM), threading.active_count(), []
+    for _ in range(2):
+        for _ in range(50):
+            made.live().push(rows)
+        gc.collect()
+        counts.append(len(gc.get_objects()))
+    assert counts[1] - counts[0] < 50 and threading.active_count() == threads
+
+
+def test_a_scene_is_asked_for_by_its_names():
+    made, touch = learner(), slide("a", 50, RANDOM)
+    with made.live(contact="manual", scene=["c", "b"]) as live:
+        assert touched(live, touch).prediction == made.predict(touch, scene=["b", "c"])
+
+
+@pytest.mark.parametrize(
+    ("given_", "kind", "message"),
+    [
+        ({"risk": 0}, InputError, "risk"),
+        ({"risk": 1.5}, InputError, "risk"),
+        ({"contact": "always"}, InputError, "'auto' or 'manual'"),
+        ({"false_contacts": 0}, InputError, "false_contacts"),
+        ({"false_contacts": float("nan")}, InputError, "false_contacts"),
+        ({"scene": ["d"]}, UnknownMaterialError, "'d'"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(given_, kind, message):
+    with pytest.raises(kind, match=message):
+        learner().live(**given_)
+
+
+def test_begin_and_end_belong_to_manual_sessions_and_a_closed_one_ends_its_touch_and_takes_nothing():
+    with learner().live() as live:
+        for refused in (live.begin, live.end):
+            with pytest.raises(InputError, match="manual"):
+                refused()
+    with learner().live(contact="manual") as live:
+        assert live.push(np.empty((0, 2))) == live.push([])
+        live.begin()
+        live.push(slide("a", 20, RANDOM))
+        before = live.push([])
+        assert live.push(np.empty((0, 2)), time=[]) == before and before.seconds == 20 / PAD.rate
+    assert len(live.touch) == 20 and live.report.touches == 1
+    with pytest.raises(InputError, match="closed"):
+        live.push(rest(1, RANDOM))
+    live.close()
+
+
+def test_what_are_no_readings_is_refused_in_the_middle_of_a_touch_and_changes_nothing():
+    touch = slide("a", 40, RANDOM)
+    with learner().live(contact="manual") as live:
+        live.begin()
+        live.push(touch[:20])
+        for wrong in (np.zeros(3), np.zeros((4, 3)), np.zeros((2, 2, 2)), [[1.0, 2.0], [1.0]], 5.0):
+            with pytest.raises(ChannelCountError):
+                live.push(wrong)
+        for wrong, kind in ((["a", "b"], ReadingsTypeError), ([np.nan, 0.5], NotFiniteError)):
+            with pytest.raises(kind):
+                live.push(wrong)
+        with pytest.raises(NotFiniteError):
+            live.push(np.array([np.inf, 0.5]))
+        live.push(touch[20:])
+        assert live.end().prediction == learner().predict(touch) and live.report.readings == 40
+
+
+def test_missing_values_are_missing_where_the_sensor_says_so():
     sensor = PAD.model_copy(update={"non_finite": "missing"})
     made = TactileLearner(sensor=sensor, embedding=EMBEDDINGS["kernels"])
-    random = np.random.default_rng(0)
-    live = made.live()
-    live.push(rest(200, random))
-    live.push(np.full((30, PAD.channels), np.nan))
-    touches = [*live.push(slide("a", 60, random)).touches, *live.push(rest(80, random)).touches]
-    assert len(touches) == 1 and touches[0].rest is None
+    for repetition in range(3):
+        for material in "ab":
+            made.observe(material, slide(material, 50, np.random.default_rng(repetition)))
+    rows, places = shift("ab", 6)
+    rows[::7, 0] = np.nan
+    rows[[5, 130, 140]] = np.nan
+    rows[places[1][0] - 30 : places[1][0]] = np.nan  # nothing is read at rest before the second
+    with made.live() as live:
+        _, ended = predictions(live, rows, [1] * len(rows))
+        assert live.report.missing == np.isnan(rows).sum()
+    assert [touch.rest is None for touch in ended] == [False, True]
+    for touch, (begin, _) in zip(ended, places, strict=True):
+        first = round(touch.at * PAD.rate)
+        assert abs(first - begin) <= 3
+        assert touch.prediction == made.predict(rows[first : first + len(touch.stream)])

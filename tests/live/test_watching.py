@@ -106,7 +106,7 @@ def test_a_damaged_row_is_warned_of_once_and_ends_no_session(memory: Path, monke
         monkeypatch.setattr(learner, "health", damaged)
         notes = HealthNotes(learner, told.append, warned.append)
         for _ in range(2):
-            notes.take(ended(SCENE.touch(NAMES[0], 93), None, rest=rest()))
+            notes.take(ended(SCENE.touch(NAMES[0], 93), None, known=False, rest=rest()))
         assert warned == ["the health of the sensor cannot be told: row 7 is damaged"]
         assert rows().touches == before + 2
     with pytest.raises(errors.InputError, match="without a path"):

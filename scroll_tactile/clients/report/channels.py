@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -44,10 +45,8 @@ class ChannelSummary:
     """One channel, its levels as shares of its range.
 
     number: from 0. middle: the median; low, high: where 5 and 95 % of the readings lie. still: share of the touches in
-    which it never changes, and of the last ones. bottom, top: share of its readings at either end of the range. signed:
-    whether zero lies inside the range, so that its bottom is an end, too. missing: share that was not read. drift: of a
-    recording, from its first part to its last, and its standard error; None where it cannot be measured. change: what
-    the memory's health says became of it; "" where nothing did.
+    which it never changes. bottom, top: share of its readings at either end of the range. drift: of a recording, from
+    its first part to its last, and its standard error; None where it cannot be measured. faults: in words.
     """
 
     number: int
@@ -55,37 +54,23 @@ class ChannelSummary:
     low: float
     high: float
     still: float
-    still_lately: float
     bottom: float
     top: float
-    signed: bool
-    missing: float
     drift: tuple[float, float] | None
-    change: str = ""
-
-    @property
-    def faults(self) -> list[str]:
-        """What is wrong with it, in words."""
-        found = []
-        if self.change:
-            found.append(self.change)
-        elif self.still >= DEAD:
-            found.append("dead")
-        elif self.still_lately >= DEAD and self.still_lately - self.still > STEADY / 2:
-            found.append("died lately")
-        elif max(self.top, self.bottom if self.signed else 0.0) >= SATURATED:
-            found.append("saturated")
-        if self.drift is not None and not found and abs(self.drift[0]) >= max(DRIFTING, CERTAIN * self.drift[1]):
-            found.append("drifting")
-        if self.missing >= SATURATED:
-            found.append("missing readings")
-        return found
+    faults: list[str]
 
 
-def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *, ordered: bool) -> list[ChannelSummary]:
+def channels_of(
+    touches: Sequence[LevelArray],
+    signed: npt.NDArray[np.bool_],
+    *,
+    ordered: bool,
+    changed: Mapping[int, str] = MappingProxyType({}),
+) -> list[ChannelSummary]:
     """The channels of some touches, or of the parts of one recording, levels (C, T) each.
 
-    signed: whether zero lies inside the range of each, (C,). ordered: whether they follow each other, as parts do.
+    signed: whether zero lies inside the range of each, (C,), so that its bottom is an end, too. ordered: whether they
+    follow each other, as parts do. changed: channel → what the memory's health says became of it.
     """
     count, found = len(touches[0]), []
     still = np.array([_still(levels) for levels in touches])
@@ -94,61 +79,51 @@ def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *,
         placed = np.arange(count)[:, None] * 256 + levels
         counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
     drifts = drift(np.array([_mean(levels) for levels in touches]) / (LEVELS - 1)) if ordered else [None] * count
-    lately = (still[-LATELY:] if ordered else still).mean(axis=0)
+    always, lately = still.mean(axis=0), (still[-LATELY:] if ordered else still).mean(axis=0)
     for i, own in enumerate(counts):
         read = max(int(own[:MISSING].sum()), 1)
         reached = np.cumsum(own[:MISSING]) / read
-        low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
-        channel = ChannelSummary(
-            number=i,
-            middle=middle,
-            low=low,
-            high=high,
-            still=float(still[:, i].mean()),
-            still_lately=float(lately[i]),
-            bottom=float(own[0]) / read,
-            top=float(own[LEVELS - 1]) / read,
-            signed=bool(signed[i]),
-            missing=float(own[MISSING]) / max(int(own.sum()), 1),
-            drift=drifts[i],
-        )
-        found.append(channel)
+        places = [float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.5, 0.05, 0.95)]
+        bottom, top = float(own[0]) / read, float(own[LEVELS - 1]) / read
+        fault, moved = changed.get(i, ""), drifts[i]
+        if not fault and always[i] >= DEAD:
+            fault = "dead"
+        elif not fault and lately[i] >= DEAD and lately[i] - always[i] > STEADY / 2:
+            fault = "died lately"
+        elif not fault and max(top, bottom if signed[i] else 0.0) >= SATURATED:
+            fault = "saturated"
+        elif not fault and moved is not None and abs(moved[0]) >= max(DRIFTING, CERTAIN * moved[1]):
+            fault = "drifting"
+        missing = "missing readings" if own[MISSING] >= SATURATED * max(own.sum(), 1) else ""
+        faults = [each for each in (fault, missing) if each]
+        found.append(ChannelSummary(i, *places, float(always[i]), bottom, top, moved, faults))
     return found
 
 
 def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
     """Which channels never change in a touch, (C,)."""
-    read = levels != MISSING
-    high, low = np.where(read, levels, 0).max(axis=1), np.where(read, levels, LEVELS).min(axis=1)
-    return np.asarray(high <= low)
+    read = np.ma.masked_equal(levels, MISSING)
+    return np.asarray((read.max(axis=1) <= read.min(axis=1)).filled(True))
 
 
 def _mean(levels: LevelArray) -> FloatArray:
     """The mean level of each channel, (C,); NaN where nothing was read."""
-    read = levels != MISSING
-    sums = np.where(read, levels, 0).sum(axis=1, dtype=np.int64)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(sums / read.sum(axis=1))
+    return np.asarray(np.ma.masked_equal(levels, MISSING).mean(axis=1).filled(np.nan))
 
 
-def drift(means: FloatArray) -> list[tuple[float, float] | None]:
+def drift(means: FloatArray) -> Sequence[tuple[float, float] | None]:
     """How far each channel's level moves from the first part of a recording to the last, and its standard error.
 
-    means: (parts, C), in order: the slope over the place in that order.
+    means: (parts, C), in order: the slope over the place in that order. None where a part was not read, or of few.
     """
-    count = len(means)
-    found: list[tuple[float, float] | None] = [None] * means.shape[1]
-    if count < LATELY:
-        return found
-    place = np.linspace(-0.5, 0.5, count)
-    spread = float(place @ place)
-    for i, level in enumerate(means.T):
-        if np.isfinite(level).all():
-            rest = level - level.mean()
-            slope = float(place @ rest) / spread
-            left = rest - slope * place
-            found[i] = slope, float(np.sqrt(max(left @ left, 0.0) / (count - 2) / spread))
-    return found
+    if (count := len(means)) < LATELY:
+        return [None] * means.shape[1]
+    place = np.linspace(-0.5, 0.5, count)[:, None]
+    rest, spread = means - means.mean(axis=0), float((place**2).sum())
+    slopes = (place * rest).sum(axis=0) / spread
+    errors = np.sqrt(((rest - slopes * place) ** 2).sum(axis=0) / (count - 2) / spread)
+    both = zip(slopes.tolist(), errors.tolist(), strict=True)
+    return [(slope, error) if math.isfinite(slope) else None for slope, error in both]
 
 
 def health_cards(found: Health | None) -> list[Card]:
@@ -205,11 +180,10 @@ def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
 def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
     """The channels by kept touches, and what the memory's health says became of them."""
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
-    found = channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False)
-    if health is None or health.since is None or health.kind not in CHANGED:
-        return found
-    what = f"{CHANGED[health.kind]} since observation {health.since}"
-    return [replace(own, change=what) if own.number in health.channels else own for own in found]
+    changed = {}
+    if health is not None and health.kind in CHANGED:
+        changed = dict.fromkeys(health.channels, f"{CHANGED[health.kind]} since observation {health.since}")
+    return channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False, changed=changed)
 
 
 def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None, *, ordered: bool) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.clients.report.drawing import as_counted, brief, clipped_name, evidence, png, shown
-from scroll_tactile.clients.report.page import Card, figure, name_of, note, table
+from scroll_tactile.clients.report.page import Card, State, figure, name_of, note, table
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
@@ -35,9 +35,11 @@ LONGEST = 160  # columns of a picture
 HIGHEST = 64  # rows
 FRAME = (60, 80)  # of a camera's picture
 COLUMNS = 400  # touches beside each other in the picture of all
-CHANGED = {kind: kind for kind in ("dead", "noisier", "slower")}
-CHANGED |= dict.fromkeys(("gain", "gains", "all gains"), "another gain")
-CHANGED |= dict.fromkeys(("offset", "all offsets"), "another offset")
+CHANGED = {
+    **{kind: kind for kind in ("dead", "noisier", "slower")},
+    **dict.fromkeys(("gain", "gains", "all gains"), "another gain"),
+    **dict.fromkeys(("offset", "all offsets"), "another offset"),
+}
 
 
 @dataclass(frozen=True)
@@ -142,12 +144,12 @@ def health_section(found: Health) -> str:
     if not found.grew:
         return note("No two touches of a material are alike enough in length and level to be compared.")
     alarm = -math.log10(found.bound)
-    caption = (
-        f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
-        f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on."
-    )
     told = note(f"{in_words(found)}. {advice(found)}") if found.since is not None else ""
-    return told + figure(evidence(found.grew, alarm), caption)
+    return told + figure(
+        evidence(found.grew, alarm),
+        f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
+        f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on.",
+    )
 
 
 def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> Card:
@@ -168,13 +170,13 @@ def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
             wrong.setdefault(fault, []).append(str(channel.number))
     if not wrong:
         return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or changed, by {by}."
-    worst = any(fault.startswith(("dead", "died")) for fault in wrong)
+    state: State = "bad" if any(fault.startswith(("dead", "died")) for fault in wrong) else "look"
     answer = "; ".join(f"{len(own)} {fault}" for fault, own in sorted(wrong.items()))
     more = ". ".join(
         f"{fault.capitalize()}: {', '.join(own[:8])}{f' and {len(own) - 8} more' if len(own) > 8 else ''}"
         for fault, own in sorted(wrong.items())
     )
-    return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
+    return state, "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
 def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
@@ -196,11 +198,12 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | 
             "made with kept_touches=0."
         )
     found = _channels(sensor, kept, health)
-    means = np.nan_to_num(np.stack([_mean(touch.levels) for touch in kept], axis=1))
-    order = "in the order of observation" if ordered else "by material"
-    caption = (
-        f"Each row is a channel, 0 at the top; each column a touch, {order}. Dark is the least mean level that "
-        "the channel had, yellow the most. A dead channel is a stripe of one colour."
+    head = level_picture(
+        np.nan_to_num(np.stack([_mean(touch.levels) for touch in kept], axis=1)),
+        f"mean level of each channel in each of {len(kept)} touches",
+        f"Each row is a channel, 0 at the top; each column a touch, "
+        f"{'in the order of observation' if ordered else 'by material'}. Dark is the least mean level that "
+        "the channel had, yellow the most. A dead channel is a stripe of one colour.",
     )
     words = (
         f"Dead: never changes in {DEAD:.0%} of the touches (or no touch ever reached it). Saturated: {SATURATED:.0%} "
@@ -208,7 +211,6 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | 
     )
     unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
     low, high = (np.broadcast_to(limit, (sensor.channels,)).astype(np.float64) for limit in sensor.limits)
-    head = level_picture(means, f"mean level of each channel in each of {len(kept)} touches", caption)
     return head + note(words) + state_rows(found, low, high, unit)
 
 
@@ -217,21 +219,21 @@ def state_rows(
 ) -> str:
     """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
     drifts = any(channel.drift for channel in found)
-    shown_channels = [channel for channel in found if channel.faults or len(found) <= MOST_ROWS]
-    rows = []
-    for channel in sorted(shown_channels, key=lambda channel: not channel.faults)[:MOST_ROWS]:
+    rows, listed = [], [channel for channel in found if channel.faults or len(found) <= MOST_ROWS]
+    for channel in sorted(listed, key=lambda channel: not channel.faults)[:MOST_ROWS]:
         bottom, top = float(low[channel.number]), float(high[channel.number])
         median, least, most = (
             brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
         )
         moved = None if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
-        state = ", ".join(channel.faults) or "fine"
-        ends = f"{channel.still:.0%}", f"{channel.bottom:.1%}", f"{channel.top:.1%}"
-        rows.append([channel.number, state, median, f"{least} to {most}", *ends, *([moved] if drifts else [])])
-    header = ["channel", "state", f"median ({unit})" if unit else "median", "90% lie in", "never changes", "at bottom"]
+        state, ends = ", ".join(channel.faults) or "fine", (f"{channel.bottom:.1%}", f"{channel.top:.1%}")
+        row = [channel.number, state, median, f"{least} to {most}", f"{channel.still:.0%}", *ends, moved]
+        rows.append(row if drifts else row[:-1])
+    median = f"median ({unit})" if unit else "median"
+    header = ["channel", "state", median, "90% lie in", "never changes", "at bottom", "at top", "drift"]
     left = len(found) - len(rows)
     more = note(f"{left} more channels have no row, those without a fault first.") if left else ""
-    return table([*header, "at top", *(["drift"] if drifts else [])], rows, "channels") + more
+    return table(header if drifts else header[:-1], rows, "channels") + more
 
 
 def _averaged(levels: npt.NDArray[np.number], columns: int) -> npt.NDArray[np.float64]:
@@ -276,13 +278,11 @@ def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapp
                 found[touch.material] = png(_thinned(_touch(touch.levels), LONGEST))
     if not found:
         return note("Not shown: no readings are kept, neither as exemplars nor to match with.")
-    names = {*exemplars, *(touch.material for touch in kept)}
-    what = (
-        "The middle frame of one touch of each material."
-        if sensor.camera
-        else "One touch of each material: rows are channels, from least (dark) to most each; time runs to the right."
-    )
-    more = f" {len(names) - len(found)} more are not shown." if len(names) > len(found) else ""
+    what = "One touch of each material: rows are channels, from least (dark) to most each; time runs to the right."
+    if sensor.camera:
+        what = "The middle frame of one touch of each material."
+    left = len({*exemplars, *(touch.material for touch in kept)}) - len(found)
+    more = f" {left} more are not shown." if left else ""
     items = "".join(
         f'<figure><img src="{data}" alt="a touch of {shown(name)}">'
         f"<figcaption>{name_of(clipped_name(name, 260))}</figcaption></figure>"

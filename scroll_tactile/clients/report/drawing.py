@@ -50,8 +50,7 @@ def clipped_name(name: str, room: float = LEFT - 8) -> str:
     sizes = [_size(letter) for letter in name]
     if sum(sizes) <= room:
         return name
-    reach = room - _size("…")
-    kept = sum(total <= reach for total in itertools.accumulate(sizes))
+    kept = sum(total <= room - _size("…") for total in itertools.accumulate(sizes))
     return name[:kept] + "…"
 
 

@@ -20,11 +20,12 @@ from scroll_tactile.clients.report.channels import (
     health_section,
 )
 from scroll_tactile.clients.report.drawing import dated, shown
-from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts, bins_of, unknown_by
+from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts, bins_of, mistakes, unknown_by
 from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
 from scroll_tactile.errors import printable
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.readouts.estimation import Estimator, Heads
+from scroll_tactile.prediction.current import estimator_of
+from scroll_tactile.readouts.estimation import Heads
 from scroll_tactile.readouts.regression import RegressionHead
 
 __all__ = ["memory_page"]
@@ -74,7 +75,7 @@ def memory_page(
         ("alike", "Who is near whom", near),
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
-        *([("estimated", "What it measures", _estimated(facts, facts.estimator))] if facts.estimator else []),
+        *([("estimated", "What it measures", _estimated(facts))] if learner.memory.quantities else []),
         *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
         ("channels", "Channels", channel_section(sensor, facts.kept, found, ordered=bool(facts.journal))),
         ("when", "When it was taught", _when(facts)),
@@ -103,8 +104,9 @@ def _under(learner: TactileLearner) -> str:
 
 def _foot(learner: TactileLearner) -> str:
     return (
-        f"Made {datetime.now(UTC):%Y-%m-%d %H:%M UTC} by scroll-tactile {shown(__version__)}. Digest of the memory <code>{learner.digest()}</code>, "
-        f"fingerprint of the embedding <code>{shown(learner.embedding.fingerprint[:16])}</code>. A touch that is left "
+        f"Made {datetime.now(UTC):%Y-%m-%d %H:%M UTC} by scroll-tactile {shown(__version__)}. Digest of the memory "
+        f"<code>{learner.digest()}</code>, fingerprint of the embedding "
+        f"<code>{shown(learner.embedding.fingerprint[:16])}</code>. A touch that is left "
         "out is judged by statistics and kept touches without it, and by the calibration of all."
     )
 
@@ -128,7 +130,7 @@ def _mixes(facts: MemoryFacts) -> Card:
     wrong = round((1 - trust.right) * trust.count)
     if not wrong:
         return "good", heading, "nothing", f"All {trust.count} touches left out got their own name."
-    worst = facts.mistakes[0]
+    worst = mistakes(facts.held_out)[0]
     more = f"Left out one by one. Most often {worst.material}, called {worst.answer}: {worst.count} of {worst.tested}."
     return _state(trust.right), heading, f"{wrong} of {trust.count} touches", more
 
@@ -267,8 +269,9 @@ def _mixed_up(facts: MemoryFacts, order: list[str]) -> str:
             f" Of {len(facts.counts) - len(tested)} others no touch could be left out, or none is among those sampled;"
             " nothing is called by their names here."
         )
-    rows = [[m.material, m.answer, m.count, m.tested, f"{m.confidence:.0%}"] for m in facts.mistakes[:MOST_MISTAKES]]
-    rest = len(facts.mistakes) - len(rows)
+    wrong = mistakes(facts.held_out)
+    rows = [[m.material, m.answer, m.count, m.tested, f"{m.confidence:.0%}"] for m in wrong[:MOST_MISTAKES]]
+    rest = len(wrong) - len(rows)
     found = note("None was called by another name.")
     if rows:
         listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
@@ -368,7 +371,8 @@ def _soon(facts: MemoryFacts) -> str:
     return figure(
         drawing.over_time(measured.seconds, curves),
         f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, "
-        "the share that is decided by then, and the share that was decided and is wrong (another material, or unknown).",
+        "the share that is decided by then, and the share that was decided and is wrong (another material, or "
+        "unknown).",
     )
 
 
@@ -387,9 +391,9 @@ def _grown(touch: Growing) -> str:
     return figure(drawn, f"A touch of {touch.material}. At its end: {verdict}{unknown}.")
 
 
-def _estimated(facts: MemoryFacts, estimator: Estimator) -> str:
+def _estimated(facts: MemoryFacts) -> str:
     """Quantities of complete touches: what was said of them held out, and how many lie in their intervals."""
-    parts = []
+    estimator, parts = estimator_of(facts.memory), []
     for name, heads in sorted(estimator.heads(estimator.last).items()):
         parts.append(f"<h3>{shown(name)}</h3>")
         if isinstance(heads, str):

@@ -155,7 +155,6 @@ def test_trust_is_counted():
     assert unknown_by(touches) == [("b", 1, 1), ("a", 0, 19)]
     assert sum(found.count for found in bins_of(touches)) == 20
     assert interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert interval(0, 0) == (0.0, 1.0)
 
 
 def test_overconfidence_is_more_than_chance():

@@ -258,8 +258,8 @@ def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str
     few = _averaged(levels, COLUMNS)
     low, high = (np.quantile(few, share, axis=1, keepdims=True) for share in (0.01, 0.99))
     pixels = _thinned((few - low) / np.maximum(high - low, 1.0) * (LEVELS - 1), COLUMNS)
-    height = max(60, min(260, 9 * len(pixels)))
-    drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="height:{height}px">'
+    size = f"height:{max(60, min(260, 9 * len(pixels)))}px"
+    drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="{size}">'
     return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
 
 

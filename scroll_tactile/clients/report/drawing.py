@@ -254,17 +254,18 @@ def tree(names: Sequence[str], joins: FloatArray) -> tuple[str, list[str]]:
     return drawing.svg(), [names[i] for i in order]
 
 
-def confusions(names: Sequence[str], counts: npt.NDArray[np.int64]) -> str:
-    """Counts of (truth, answer), (C, C): the diagonal in one colour, mistakes in another."""
+def confusions(names: Sequence[str], counts: Mapping[tuple[str, str], int]) -> str:
+    """Counts of (truth, answer), where there are any: right answers in one colour, mistakes in another."""
     left = LEFT + 14
     side = min(22.0, (RIGHT - left) / len(names))
     drawing = Drawing(side * len(names) + 22, "Counts of the material that was touched by the answer that was given")
     for i, name in enumerate(names):
-        y, total = side * i + 16, int(counts[i].sum())
+        own = [counts.get((name, answer), 0) for answer in names]
+        y, total = side * i + 16, sum(own)
         drawing.name(y + side / 2 + 4, name)
         drawing.text(left - 3, y + side / 2 + 3, i + 1, "tiny", "end")
         drawing.text(left + side * (i + 0.5), 11, i + 1, "tiny", "middle")
-        for j, count in enumerate(counts[i].tolist()):
+        for j, count in enumerate(own):
             x, share, kind = left + side * j, 0.25 + 0.75 * count / max(total, 1), "fill" if i == j else "wrong"
             if count:
                 drawing.box(x, y, side - 1, side - 1, kind, share, f"{name} called {names[j]}: {count} of {total}")

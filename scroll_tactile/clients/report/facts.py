@@ -100,9 +100,7 @@ def mistakes(held_out: Sequence[HeldOutTouch]) -> list[Mistake]:
 
 
 def interval(right: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a share (Wilson 1927)."""
-    if not count:
-        return 0.0, 1.0
+    """The 95 % interval of a share of one touch or more (Wilson 1927)."""
     z, share = 1.96, right / count
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))

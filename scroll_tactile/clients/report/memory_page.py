@@ -281,10 +281,7 @@ def _mixed_up(facts: MemoryFacts, order: list[str]) -> str:
         return note(words) + found
     names = [name for name in order or facts.counts if name in tested]
     names += sorted(tested - set(names))
-    counts = np.zeros((len(names), len(names)), np.int64)
-    for touch in facts.held_out:
-        if touch.answer in names:
-            counts[names.index(touch.material), names.index(touch.answer)] += 1
+    counts = Counter((touch.material, touch.answer) for touch in facts.held_out)
     drawn = figure(
         drawing.confusions(names, counts),
         "Rows: what was touched; columns, by number: what it was called. Right answers lie on the diagonal, and "

@@ -131,8 +131,17 @@ def fleet(
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
     options, chosen = how.of(sources), sensor_for(destination, sensor, how.preset)
     with nullcontext() if scheduler is None else _connected(scheduler) as client, progress_bar() as progress:
-        running: dict[str, Any] = {"workers": workers, "client": client, "patience": patience, "progress": progress}
-        done = learn(destination, sources, options, sensor=chosen, add=add, **running)
+        done = learn(
+            destination,
+            sources,
+            options,
+            sensor=chosen,
+            add=add,
+            workers=workers,
+            client=client,
+            patience=patience,
+            progress=progress,
+        )
     _report_fleet(done, as_json)
     if done.refused:
         raise typer.Exit(1)

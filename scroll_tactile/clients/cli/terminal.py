@@ -36,41 +36,6 @@ if TYPE_CHECKING:
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.sensors import Sensor
 
-__all__ = [
-    "AsCsv",
-    "AsJson",
-    "Axis",
-    "Columns",
-    "Commands",
-    "MemoryFolder",
-    "Named",
-    "Noted",
-    "Reading",
-    "Risk",
-    "Scene",
-    "SensorName",
-    "Sources",
-    "StreamFile",
-    "confusion_text",
-    "console",
-    "counted",
-    "estimate_text",
-    "materials_of",
-    "opened",
-    "opened_for_upkeep",
-    "percent",
-    "progress_bar",
-    "say",
-    "say_csv",
-    "say_json",
-    "say_refused",
-    "sensor_for",
-    "shown",
-    "verdict",
-    "version",
-    "with_options",
-]
-
 MOST_REFUSED = 20
 
 Mode = Literal["write", "read"]

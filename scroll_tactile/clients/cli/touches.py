@@ -151,11 +151,11 @@ def predict(
     from scroll_tactile.clients.learning.learning import answers
     from scroll_tactile.clients.learning.sources import SourceOptions, find_sources
 
-    candidates, options = materials_of(scene), SourceOptions(**vars(how))
+    options = SourceOptions(**vars(how))
     found, refused = find_sources(sources)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
-        answered = answers(learner, found, options, scene=candidates, of=of)
+        answered = answers(learner, found, options, scene=materials_of(scene), of=of)
         if alone:
             several = [*refused, *answered]
             if len(several) == 1:

@@ -182,7 +182,7 @@ def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
 def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
     """The channels by kept touches, and what the memory's health says became of them."""
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
-    changed = {}
+    changed: dict[int, str] = {}
     if health is not None and health.kind in CHANGED:
         changed = dict.fromkeys(health.channels, f"{CHANGED[health.kind]} since observation {health.since}")
     return channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False, changed=changed)

@@ -4,10 +4,6 @@ import csv
 import io
 import json
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import h5py
@@ -148,43 +144,6 @@ class TestLearn:
             assert said in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "wrong.csv")
         assert "cannot be read" in refused("learn", memory, tmp_path / "t.csv", "--labels", tmp_path / "no.csv")
 
-    def test_ctrl_c_ends_it_and_it_goes_on(self, memory: Path, tmp_path: Path) -> None:
-        for i in range(60):
-            touch(tmp_path / "many", "silk", i)
-        words = [sys.executable, "-c", SLOWLY, "learn", memory, tmp_path / "many", "--label", "silk"]
-        process = subprocess.Popen(list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        try:
-            until = time.monotonic() + 100
-            while not _observed(memory) and process.poll() is None and time.monotonic() < until:
-                time.sleep(0.1)
-            process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=100)
-        finally:
-            process.kill()
-        assert (process.returncode, b"Interrupted." in errors, b"Traceback" in errors) == (130, True, False)
-        before = _observed(memory)
-        assert 0 < before < 60
-        found = json.loads(run("learn", memory, tmp_path / "many", "--label", "silk", "--json").stdout)
-        assert (found["touches"], found["skipped"], found["observations"]) == (60 - before, before, 60)
-
-
-SLOWLY = """
-import time
-from scroll_tactile.clients.cli import main
-from scroll_tactile.clients.learning import learning
-learning.BATCH_TOUCHES, whole = 8, learning.source_touches
-def source_touches(*options):
-    time.sleep(0.1)
-    return whole(*options)
-learning.source_touches = source_touches
-main()
-"""
-
-
-def _observed(memory: Path) -> int:
-    with TactileLearner.open(memory, mode="read") as learner:
-        return sum(learner.materials.values())
-
 
 class TestPredict:
     def test_many_have_a_line_each(self, learned: Path, data: Path, tmp_path: Path) -> None:
@@ -203,10 +162,6 @@ class TestPredict:
         assert [(row["answer"], float(row["probability"])) for row in rows] == [
             (answer["material"], answer["probability"]) for answer in answers
         ]
-
-    def test_csv_of_an_empty_memory_has_empty_cells(self, memory: Path, data: Path) -> None:
-        (row,) = csv.DictReader(io.StringIO(run("predict", memory, data / "silk" / "0.npy", "--csv").stdout))
-        assert (row["answer"], row["known"], row["novelty"]) == ("", "False", "")
 
     def test_a_table_with_numbers_for_a_header_is_read_as_pandas_meant_it(self, learned: Path, tmp_path: Path) -> None:
         readings = SCENE.touch("wool", 7).readings
@@ -287,9 +242,6 @@ class TestList:
         assert "this touch was learned already, as observation 1" in again.stdout
         other = run("observe", memory, "wool", words[-1]).stdout
         assert "is there as silk, too: relabel or retract one of them" in other and "observed 1 time" in other
-
-    def test_an_empty_memory_lists_nothing(self, memory: Path) -> None:
-        assert run("memory", "list", memory).stdout == ""
 
 
 @pytest.mark.parametrize("command", ["learn", "evaluate", "fleet"])

@@ -2,7 +2,6 @@
 
 import io
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -94,16 +93,11 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     assert "it is not there" in refused("live", memory / "memory", memory / "nothing.npy")
     np.save(memory / "narrow.npy", np.zeros((5, 3)))
     assert "(T, 60)" in refused("live", memory / "memory", memory / "narrow.npy")
-    monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,x\n"))
-    with pytest.raises(touches.InputError, match="line 2"):
-        list(touches._rows(touches.Path("-"), False, touches.Reading()))
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"1,2\n\xff\xfe,1\n"), encoding="utf-8"))
-    with pytest.raises(touches.InputError, match=r"line 2.*xff"):
-        list(touches._rows(touches.Path("-"), False, touches.Reading()))
-    monkeypatch.setattr(touches, "LONGEST_LINE", 8)
-    monkeypatch.setattr(sys, "stdin", io.StringIO("1,2\n3,456789\n"))
-    with pytest.raises(touches.InputError, match="a line a reading, of less than 8 characters"):
-        list(touches._rows(touches.Path("-"), False, touches.Reading()))
+    monkeypatch.setattr(touches, "LONGEST_LINE", 400)
+    row = b",".join([b"1"] * 60) + b"\n"
+    for line, said in ((b"3,x\n", "line 2"), (b"\xff\xfe,1\n", "xff"), (b"1" * 401, "of less than 400 characters")):
+        done = CliRunner().invoke(APP, ["live", str(memory / "memory"), "-"], input=row + line)
+        assert done.exit_code == 1 and said in done.stderr
 
 
 @pytest.mark.parametrize("option", ["--topic", "--field", "--preset", "--clock"])
@@ -113,19 +107,15 @@ def test_lines_have_no_topics_fields_or_clocks(memory, option):
 
 
 def test_a_revised_decision_is_called_one(tmp_path):
+    random = np.random.default_rng(1)
+    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as made:
+        for _ in range(6):
+            for material in "abc":
+                made.observe(material, slide(material, 50, random))
     random = np.random.default_rng(3)
-    _kept(tmp_path / "m")
     np.save(tmp_path / "t.npy", np.concatenate([slide("a", 20, random), slide("b", 30, random)]))
     words = ("live", tmp_path / "m", tmp_path / "t.npy", "--touch", "--risk", "0.3")
     shown = run(*words).stdout
     assert "revised: it was decided as a with" in shown and "1 revised" in shown
     ended = json.loads(run(*words, "--json").stdout.splitlines()[-2])
     assert (ended["event"], ended["material"], ended["revised"]) == ("ended", "b", True)
-
-
-def _kept(folder):
-    random = np.random.default_rng(1)
-    with TactileLearner.open(folder, sensor=PAD, embedding=SMALL) as made:
-        for _ in range(6):
-            for material in "abc":
-                made.observe(material, slide(material, 50, random))

@@ -138,11 +138,6 @@ def test_an_error_says_which_argument_is_wrong_also_when_it_comes_from_another_p
     assert (type(came), str(came), came.argument) == (raised.type, str(raised.value), argument)
 
 
-def test_a_file_of_such_a_name_is_an_error_as_any_other(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert r"topic='\x'.npy" in refused("observe", "m", "oak", r"a topic='\x'.npy", "--sensor", "biotac")
-
-
 def test_topics_and_fields_that_there_are_become_options_to_copy(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for key in ("tip", "pad"):

@@ -250,11 +250,3 @@ class TestFirstTouches:
         before = sorted(tmp_path.iterdir())
         assert refused("observe", tmp_path / "m", name, tmp_path / "t.npy", "--sensor", tmp_path / "pad.json")
         assert sorted(tmp_path.iterdir()) == before
-
-    def test_of_a_camera_that_is_not_pressed(self, tmp_path):
-        eye = {"name": "eye", "channels": 24 * 32 * 3, "rate": 25, "low": 0, "high": 255, "unit": "counts"}
-        eye |= {"duration": 0.2, "layout": [24, 32, 3], "camera": True}
-        (tmp_path / "eye.json").write_text(json.dumps(eye))
-        np.save(tmp_path / "t.npy", np.full((5, 24, 32, 3), 100.0))
-        assert refused("observe", tmp_path / "m", "felt", tmp_path / "t.npy", "--sensor", tmp_path / "eye.json")
-        assert not (tmp_path / "m").exists()

@@ -172,6 +172,12 @@ def test_what_cannot_be_exported_is_refused(tmp_path, exports):
             judge.answer(levels)
 
 
+def test_windows_that_a_chip_cannot_weigh_exactly_are_refused():
+    fast = Sensor(name="fast", channels=1, rate=62_000.0, low=0.0, high=1.0, unit="1", duration=1.0)
+    with pytest.raises(InputError, match=r"at most 46340 readings, .*; fast has 46500"):
+        TactileLearner(sensor=fast, embedding=Kernels(dimension=64)).exported()
+
+
 def test_too_many_materials_are_refused():
     learner = TactileLearner(sensor=SHORT, embedding=Kernels(dimension=64))
     rng = np.random.default_rng(0)

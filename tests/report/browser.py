@@ -94,10 +94,6 @@ class Browser:
         """The page as PDF."""
         return base64.b64decode(self.ask("Page.printToPDF")["data"])
 
-    def picture(self):
-        """The whole page as PNG."""
-        return base64.b64decode(self.ask("Page.captureScreenshot", captureBeyondViewport=True)["data"])
-
     def close(self):
         self._process.kill()
         self._process.wait()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import traceback
 import warnings
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -133,12 +134,10 @@ def _require_directory() -> None:
 
 
 def _report_fault(error: Exception) -> int:
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    where = "" if trace is None else f" in {os.path.basename(trace.tb_frame.f_code.co_filename)}:{trace.tb_lineno}"  # noqa: PTH119
+    *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+    where = f"{os.path.basename(frame.f_code.co_filename)}:{line}"  # noqa: PTH119
     _show(
-        f"Error: a fault of scroll-tactile, {type(error).__name__}{where}: {str(error)!a:.300}. Please report it; "
+        f"Error: a fault of scroll-tactile, {type(error).__name__} in {where}: {str(error)!a:.300}. Please report it; "
         "PYTHONDEVMODE=1 shows where it came from"
     )
     return 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -94,10 +94,10 @@ def _report_learned(done: Learned, held: int, as_json: bool) -> None:
         return
     of = f" of {counted(len(done.learned), 'material')}" if count else ""
     say(
-        f"[bold]learned:[/] {counted(count, 'touch')}{of} from {counted(done.files, 'file')}; the memory has {held} now"
+        f"[bold]learned:[/] {counted(count, 'touch')}{of} from {counted(done.files, 'file')}; the memory has {held} "
+        "now",
+        *(f"  {touches:>6}  {shown(name)}" for name, touches in sorted(done.learned.items())),
     )
-    for name, touches in sorted(done.learned.items()):
-        say(f"  {touches:>6}  {shown(name)}")
     if done.skipped:
         say(f"[bold]skipped:[/] {counted(done.skipped, 'touch')} that it had already")
     say_refused(done.refused)
@@ -130,11 +130,18 @@ def fleet(
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
     options, chosen = how.of(sources), sensor_for(destination, sensor, how.preset)
-    with ExitStack() as stack:
-        client = None if scheduler is None else stack.enter_context(_connected(scheduler))
-        progress = stack.enter_context(progress_bar())
-        running: dict[str, Any] = {"workers": workers, "client": client, "patience": patience, "progress": progress}
-        done = learn(destination, sources, options, sensor=chosen, add=add, **running)
+    with nullcontext() if scheduler is None else _connected(scheduler) as client, progress_bar() as progress:
+        done = learn(
+            destination,
+            sources,
+            options,
+            sensor=chosen,
+            add=add,
+            workers=workers,
+            client=client,
+            patience=patience,
+            progress=progress,
+        )
     _report_fleet(done, as_json)
     if done.refused:
         raise typer.Exit(1)
@@ -255,9 +262,11 @@ def _report_evaluated(done: Evaluation, with_learned: bool) -> None:
         say(f"[bold]touches without a label on {shown(str(done.of))}:[/] {done.unlabelled}, left out")
     say(f"[bold]touches:[/] {found['touches']} of {len(set(answers.truth))} {names} that it learned")
     if found["touches"]:
-        say(f"[bold]accuracy:[/] {percent(found['accuracy'])}")
-        say(f"[bold]calibration error:[/] {found['calibration_error']:.3f}")
-        say(f"[bold]called unknown:[/] {found['called_unknown']}")
+        say(
+            f"[bold]accuracy:[/] {percent(found['accuracy'])}",
+            f"[bold]calibration error:[/] {found['calibration_error']:.3f}",
+            f"[bold]called unknown:[/] {found['called_unknown']}",
+        )
     if found["never_learned"]:
         say(
             f"[bold]touches of {names} that it never learned:[/] {found['never_learned']}, of which it calls "
@@ -320,28 +329,24 @@ def demo(
 def _report_demo(task: Demo, outcome: Outcome, learned: list[str], plug: Unplugged) -> None:
     half, middle, answers, short = outcome.half, max(1, len(learned) // 2), outcome.answers, outcome.short
     first, others = learned[:middle], learned[middle:]
-    say(f"[bold]learned[/] {len(first)} materials, {task.touches} touches of each: {', '.join(first)}")
     answer = "never felt this" if half.known is False else f"known, as {half.nearest}"
-    say(
-        f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{answer}[/] "
-        f"(nearest is {half.nearest}, novelty {half.novelty:.1f})"
-    )
-    say(f"  of {half.tested} touches of materials that it had never felt it called {half.unknown} unknown")
-    say(f"[bold]then learned[/] {len(others)} more, {task.touches} touches of each: {', '.join(others)}")
-    say(f"[bold]learned from {task.touches} touches:[/] {half.material}: {verdict(answers.predictions[outcome.first])}")
-    say(f"  of {len(answers.truth)} touches held out, of all materials, it names {percent(answers.accuracy)} right")
-    say(
-        f"[bold]forgets nothing:[/] the first {len(first)} were named {percent(half.right)} right before the others "
-        f"came, and {percent(outcome.still_right)} after"
-    )
-    say(f"[bold]answers from 0.3 s on:[/] 0.3 s of {short.truth[0]}: {verdict(short.predictions[0])}")
-    say(f"  of 0.3 s of a touch of every material it names {percent(short.accuracy)} right")
     bits = "the very bits of a memory that nothing interrupted" if plug.same else "[bold red]not as it was[/]"
     say(
+        f"[bold]learned[/] {len(first)} materials, {task.touches} touches of each: {', '.join(first)}",
+        f"[bold]unknown is called unknown:[/] {half.material}, before it was learned: [bold yellow]{answer}[/] "
+        f"(nearest is {half.nearest}, novelty {half.novelty:.1f})",
+        f"  of {half.tested} touches of materials that it had never felt it called {half.unknown} unknown",
+        f"[bold]then learned[/] {len(others)} more, {task.touches} touches of each: {', '.join(others)}",
+        f"[bold]learned from {task.touches} touches:[/] {half.material}: {verdict(answers.predictions[outcome.first])}",
+        f"  of {len(answers.truth)} touches held out, of all materials, it names {percent(answers.accuracy)} right",
+        f"[bold]forgets nothing:[/] the first {len(first)} were named {percent(half.right)} right before the others "
+        f"came, and {percent(outcome.still_right)} after",
+        f"[bold]answers from 0.3 s on:[/] 0.3 s of {short.truth[0]}: {verdict(short.predictions[0])}",
+        f"  of 0.3 s of a touch of every material it names {percent(short.accuracy)} right",
         f"[bold]survives the power plug:[/] a process was killed when it had reported that {plug.acknowledged} touches "
-        f"were learned; its memory has {plug.found}, {bits}"
+        f"were learned; its memory has {plug.found}, {bits}",
+        f"[bold]observed now:[/] {outcome.observed} touches; [bold]digest:[/] {outcome.digest}",
     )
-    say(f"[bold]observed now:[/] {outcome.observed} touches; [bold]digest:[/] {outcome.digest}")
     if task.folder is not None:
         say(f"kept: try  scroll-tactile inspect {shown(task.folder / 'memory')}")
 
@@ -364,13 +369,12 @@ def report(
     from scroll_tactile.clients.report.page import require_page, save
 
     require_page(page)
-    chosen = {**vars(how), "rate": rate}
+    chosen, whose = {**vars(how), "rate": rate}, {"sensor": sensor, "labels": labels}
     is_memory = False
     with suppress(NotAStoreError):  # of what holds no store, and may be a recording
         is_memory = source.is_dir() and holds_store(source)
     if is_memory:
-        every = {**chosen, "sensor": sensor, "labels": labels}
-        if given := [f"--{name}" for name, value in every.items() if value is not None]:
+        if given := [f"--{name}" for name, value in {**chosen, **whose}.items() if value is not None]:
             raise InputError(f"{', '.join(given)}: only of a recording; {source} is a memory")
         from scroll_tactile.clients.report.memory_page import memory_page
 
@@ -381,9 +385,12 @@ def report(
         from scroll_tactile.recordings import read_intervals
         from scroll_tactile.sensors import read_sensor
 
-        cut = None if labels is None else read_intervals(labels)
-        whose = None if sensor is None else read_sensor(sensor)
-        came_by = {name: str(word) for name, word in (("sensor", sensor), ("labels", labels)) if word is not None}
-        html = recording_page(source, sensor=whose, intervals=cut, given=came_by, **chosen)
+        html = recording_page(
+            source,
+            sensor=None if sensor is None else read_sensor(sensor),
+            intervals=None if labels is None else read_intervals(labels),
+            given={name: str(word) for name, word in whose.items() if word is not None},
+            **chosen,
+        )
     save(html, page)
     say(f"written: {shown(page)}, {len(html.encode()) / 1e6:.1f} MB; open it with any browser")

@@ -36,41 +36,6 @@ if TYPE_CHECKING:
     from scroll_tactile.learner import TactileLearner
     from scroll_tactile.sensors import Sensor
 
-__all__ = [
-    "AsCsv",
-    "AsJson",
-    "Axis",
-    "Columns",
-    "Commands",
-    "MemoryFolder",
-    "Named",
-    "Noted",
-    "Reading",
-    "Risk",
-    "Scene",
-    "SensorName",
-    "Sources",
-    "StreamFile",
-    "confusion_text",
-    "console",
-    "counted",
-    "estimate_text",
-    "materials_of",
-    "opened",
-    "opened_for_upkeep",
-    "percent",
-    "progress_bar",
-    "say",
-    "say_csv",
-    "say_json",
-    "say_refused",
-    "sensor_for",
-    "shown",
-    "verdict",
-    "version",
-    "with_options",
-]
-
 MOST_REFUSED = 20
 
 Mode = Literal["write", "read"]
@@ -220,9 +185,9 @@ def console(*, error: bool = False) -> Console:
     return Console(stderr=error, highlight=False, soft_wrap=not error and not sys.stdout.isatty())
 
 
-def say(text: str) -> None:
-    """Print a line in rich's markup."""
-    console().print(text)
+def say(*lines: str) -> None:
+    """Print lines in rich's markup."""
+    console().print(*lines, sep="\n")
 
 
 def say_json(found: Mapping[str, Any]) -> None:
@@ -233,8 +198,7 @@ def say_json(found: Mapping[str, Any]) -> None:
 def say_csv(*cells: object) -> None:
     """Print a line of CSV; what is None has an empty cell."""
     line = io.StringIO()
-    written = [plain_cell(cell) if isinstance(cell, str) else "" if cell is None else cell for cell in cells]
-    csv.writer(line, lineterminator="").writerow(written)
+    csv.writer(line, lineterminator="").writerow(plain_cell(cell) if isinstance(cell, str) else cell for cell in cells)
     typer.echo(line.getvalue())
 
 
@@ -411,23 +375,18 @@ def estimate_text(estimate: Estimate) -> str:
     """An estimate in words."""
     if estimate.value is None:
         return f"[yellow]no number[/]: {shown(estimate.missing)}"
-    ends = f"{estimate.low:.4g} to {estimate.high:.4g}"
     whose = "a learned material" if estimate.known else "a new material"
     more = f"; {shown(estimate.missing)}" if estimate.missing else f" with {percent(1 - estimate.risk)}, of {whose}"
     doubt = "" if estimate.inside else ", [yellow]unlike what was learned[/]"
-    return f"[bold]{estimate.value:.4g}[/] {shown(estimate.unit)} ({ends}{more}){doubt}"
+    value = f"[bold]{estimate.value:.4g}[/] {shown(estimate.unit)}"
+    return f"{value} ({estimate.low:.4g} to {estimate.high:.4g}{more}){doubt}"
 
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """A bar on the standard error; yields its update: (what is being done, steps done, steps in all)."""
-    columns = (
-        TextColumn("{task.description}", markup=False),  # names of files, which may have brackets
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    named = TextColumn("{task.description}", markup=False)  # names of files, which may have brackets
+    columns = named, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
     screen = console(error=True)
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("starting", total=None)

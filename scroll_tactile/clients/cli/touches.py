@@ -61,7 +61,7 @@ __all__ = ["ANSWER", "answer_row", "compose", "describe", "inspect", "live", "ob
 NEAR = 0.85  # likeness of two names, of which one is taken for a slip of the other
 WORDS = {"yes": True, "no": False, "unknown": None}
 
-SHOWN = 5  # materials of a touch under way
+SHOWN = 5  # likeliest materials of a touch
 BAR = 30  # characters of a probability of one
 LONGEST_LINE = 2**24  # characters of a reading, of a camera, too
 IRREGULAR = ("lost", "repeated", "late", "surplus", "untimed", "gaps", "steps_back", "relearned", "truncated")
@@ -112,13 +112,13 @@ def observe(
         receipt = learner.observe(material, stream, values=values, labels=labels, source=source)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
+    done = f"{receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}"
     if receipt.repeated:
-        say(f"{shown(material)}: this touch was learned already, as observation {receipt.sequence}")
-    else:
-        say(f"{shown(material)}: {receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}")
+        done = f"this touch was learned already, as observation {receipt.sequence}"
+    say(f"{shown(material)}: {done}")
     if others:
         say(f"this very touch is there as {', '.join(map(shown, others))}, too: relabel or retract one of them")
-    say(f"it has now been observed {count} time{'s' * (count > 1)}")
+    say(f"it has now been observed {counted(count, 'time')}")
 
 
 def _noted(option: str, given: Sequence[str] | None) -> dict[str, str]:
@@ -151,11 +151,11 @@ def predict(
     from scroll_tactile.clients.learning.learning import answers
     from scroll_tactile.clients.learning.sources import SourceOptions, find_sources
 
-    candidates, options = materials_of(scene), SourceOptions(**vars(how))
+    options = SourceOptions(**vars(how))
     found, refused = find_sources(sources)
     alone = len(sources) == 1 and len(found) + len(refused) == 1 and not as_csv
     with opened(memory, mode="read") as learner:
-        answered = answers(learner, found, options, scene=candidates, of=of)
+        answered = answers(learner, found, options, scene=materials_of(scene), of=of)
         if alone:
             several = [*refused, *answered]
             if len(several) == 1:
@@ -194,13 +194,11 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
 
     if isinstance(found, Refused):
         raise InputError(found.why, argument=found.argument)
-    prediction = found.prediction
     if as_json:
         say_json(_answer(found))
         return
-    say(f"{verdict(prediction)}, from {prediction.seconds:g} s of touch")
-    for name, probability in prediction.ranking[:5]:
-        say(f"  {percent(probability):>8}  {shown(name)}")
+    ranked = [f"  {percent(probability):>8}  {shown(name)}" for name, probability in found.prediction.ranking[:SHOWN]]
+    say(f"{verdict(found.prediction)}, from {found.prediction.seconds:g} s of touch", *ranked)
     _say_estimates(found.estimates)
 
 
@@ -241,15 +239,15 @@ def inspect(memory: MemoryFolder, as_json: AsJson = False) -> None:
     for name, count in materials.items():
         table.add_row(shown(name), str(count))
     console().print(table)
-    say(f"[bold]observations:[/] {sum(materials.values())} of {counted(len(materials), 'material')}")
-    say(f"[bold]kept touches:[/] {kept}")
-    say(f"[bold]sensor:[/] {shown(sensor.name)}, {counted(sensor.channels, 'channel')} at {sensor.rate:g} Hz")
+    fingerprint = embedding.fingerprint[:12]
     say(
-        f"[bold]embedding:[/] {shown(embedding.name)}, {embedding.dimension} features, "
-        f"fingerprint {embedding.fingerprint[:12]}"
+        f"[bold]observations:[/] {sum(materials.values())} of {counted(len(materials), 'material')}",
+        f"[bold]kept touches:[/] {kept}",
+        f"[bold]sensor:[/] {shown(sensor.name)}, {counted(sensor.channels, 'channel')} at {sensor.rate:g} Hz",
+        f"[bold]embedding:[/] {shown(embedding.name)}, {embedding.dimension} features, fingerprint {fingerprint}",
+        f"[bold]digest:[/] {digest}",
+        f"[bold]on disk:[/] {size / 2**20:.1f} MB",
     )
-    say(f"[bold]digest:[/] {digest}")
-    say(f"[bold]on disk:[/] {size / 2**20:.1f} MB")
 
 
 def describe(
@@ -463,7 +461,6 @@ def _answer_of(touch: LiveTouch | LiveState, seconds: float, **more: Any) -> dic
 
 def _line(event: str, at: float, more: Mapping[str, Any]) -> None:
     say_json({"event": event, "at": round(at, 6), **more})
-    sys.stdout.flush()
 
 
 def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
@@ -476,11 +473,10 @@ def _summed_up(report: LiveReport, as_json: bool, *, whole: bool) -> None:
             f"[yellow]no touch was found:[/] {why} the sensor at rest. If it begins in a touch, or is one from end to "
             "end, take --touch"
         )
-    if as_json:
-        return
-    say(
-        f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
-        f"{report.revised} revised"
-    )
-    if irregular := [f"{name.replace('_', ' ')}: {met[name]}" for name in IRREGULAR if name in met]:
-        say(", ".join(irregular))
+    if not as_json:
+        irregular = ", ".join(f"{name.replace('_', ' ')}: {met[name]}" for name in IRREGULAR if name in met)
+        say(
+            f"[bold]readings:[/] {report.readings}; [bold]touches:[/] {report.touches}, {report.undecided} undecided, "
+            f"{report.revised} revised",
+            *([irregular] if irregular else []),
+        )

@@ -83,17 +83,18 @@ def check(folder: MemoryFolder, as_json: AsJson = False) -> None:
         for problem in problems:
             colour = {"lost": "red", "spare": "yellow"}.get(problem.kind, "dim")
             say(f"[{colour}]{problem.kind}:[/] {shown(problem.what)}")
-        say("[green]sound:[/] every checksum holds" if not damaged else f"[red]{len(damaged)} damaged[/]")
         if damaged:
             say(
+                f"[red]{len(damaged)} damaged[/]",
                 "it is not to be used as it is. To trust it again, put back a copy from before; or copy the folder, "
                 f"then: scroll-tactile memory repair {shown(folder)} (it keeps the rows up to the first that is "
-                "lost, and names the others), and check it again"
+                "lost, and names the others), and check it again",
             )
         else:
             say(
+                "[green]sound:[/] every checksum holds",
                 "it can be opened and merged without harm. Nobody signed it: of a memory from elsewhere the rows count "
-                "for as much as you trust who gave it to you"
+                "for as much as you trust who gave it to you",
             )
     if damaged:
         raise typer.Exit(1)
@@ -120,8 +121,7 @@ def health(
     elif found.since is None:
         say(f"{'[green]well:[/]' if found.grew else '[yellow]too few:[/]'} {shown(in_words(found))}")
     else:
-        say(f"[red]changed:[/] {shown(in_words(found))}")
-        say(shown(advice(found)))
+        say(f"[red]changed:[/] {shown(in_words(found))}", shown(advice(found)))
     if found.since is not None:
         raise typer.Exit(1)
 
@@ -323,9 +323,9 @@ def merge(
         digest, count = learner.digest(), sum(learner.materials.values())
     say(
         f"{counted(done.observations, 'observation')} came in, {counted(done.shared, 'stream')} observed by both; "
-        f"{count} are there now"
+        f"{count} are there now",
+        f"[bold]digest:[/] {digest}",
     )
-    say(f"[bold]digest:[/] {digest}")
 
 
 @memory.command()
@@ -358,8 +358,10 @@ def adapt(
     if as_json:
         say_json(vars(done))
     else:
-        say((f"[green]adapted:[/] by row {done.sequence}; " if done.kept else "[yellow]not adapted:[/] ") + done.why)
-        say(f"the touches lie {done.before:.2f} from what was learned, corrected {done.after:.2f}; 1 is usual")
+        say(
+            (f"[green]adapted:[/] by row {done.sequence}; " if done.kept else "[yellow]not adapted:[/] ") + done.why,
+            f"the touches lie {done.before:.2f} from what was learned, corrected {done.after:.2f}; 1 is usual",
+        )
     say_refused(refused)
     if refused or not done.kept:
         raise typer.Exit(1)

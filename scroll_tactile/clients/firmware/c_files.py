@@ -73,10 +73,11 @@ def touches_to_check(judge: ExportedJudge, touches: Iterable[LevelRows]) -> byte
     Of each: int32 readings; int16 levels (readings, n); int32 material, known, probability, readings judged; int64
     novelty; int64 scores (M).
     """
-    parts = []
-    for levels in touches:
-        parts += [struct.pack("<i", len(levels)), levels.astype("<i2").tobytes(), _packed(judge, judge.answer(levels))]
-    return b"".join(parts)
+    checked = [(levels, judge.answer(levels)) for levels in touches]
+    return b"".join(
+        struct.pack("<i", len(levels)) + levels.astype("<i2").tobytes() + _packed(judge, answer)
+        for levels, answer in checked
+    )
 
 
 def _packed(judge: ExportedJudge, answer: ExportedAnswer) -> bytes:

@@ -163,15 +163,11 @@ class ExportedJudge:
             z, distance = scale.settled(*sums)
             novelty += stage.distance_weights[i] * distance >> stage.distance_shifts[i]
             scores += stage.weights[i] * (z - scale.halves)
-        return self._answered(stage, scores, novelty, steps)
-
-    def _answered(self, stage: ExportedStage, scores: Integers, novelty: int, steps: int) -> ExportedAnswer:
-        best = int(scores.argmax())
-        behind = (scores[best] - scores) >> 18
+        behind = (scores.max() - scores) >> 18
         total = int(CHANCES[behind[behind < MOST_CHANCES]].sum(dtype=np.int64))
         probability = 65535 * int(CHANCES[0]) // total / 65535
-        known = False if novelty > 0 else True if stage.detects else None
-        return ExportedAnswer(self.materials[best], known, probability, tuple(scores.tolist()), novelty, steps)
+        known, best = False if novelty > 0 else True if stage.detects else None, self.materials[scores.argmax()]
+        return ExportedAnswer(best, known, probability, tuple(scores.tolist()), novelty, steps)
 
     def _sums(self, levels: npt.NDArray[np.float32], among: Sequence[ExportedScale]) -> list[tuple[Integers, int]]:
         """For each scale the weighed sums of its features over its windows, (M,), and how many windows these are."""
@@ -190,13 +186,10 @@ class ExportedJudge:
     @property
     def ram_bytes(self) -> int:
         """Bytes of the touch and what it is judged in; see `tactile_touch` in native/judge.h. The stack takes 2 kB."""
-        most = max((self._triangles(scale) for scale in self.scales), default=0)
         channels = self.sensor.channels
+        made = [self.embedding.triangles(channels, one.scale.width) for one in self.scales]
+        most = max((len(each.phases) for each in made if each is not None), default=0)
         return 2 * channels * self.capacity + 16 * self.capacity + 4 * most + 16 * channels + FIXED_BYTES
-
-    def _triangles(self, scale: ExportedScale) -> int:
-        made = self.embedding.triangles(self.sensor.channels, scale.scale.width)
-        return 0 if made is None else len(made.phases)
 
 
 def _angled(counts: npt.NDArray[np.integer], places: int) -> Integers:

@@ -43,6 +43,7 @@ FACTOR_BITS = 30
 MOST_SHIFT = 62
 MOST_THRESHOLD = 2**61
 MOST_SCALES = 2  # as judge.h has it
+MOST_WIDTH = 46_340  # readings: the sums of a wider window's squares are no exact float64, and overflow in judge.c
 LEAST_BITS = -SCORE_BITS  # of a score: at 2⁸ logits a unit, materials lie so far apart that nothing can be told
 
 
@@ -76,6 +77,9 @@ def _require_exportable(recipe: Recipe, names: Sequence[str]) -> None:
             f"only memories of the default embedding, Kernels, can be exported as C; this one's is "
             f"{recipe.embedding!r} for {recipe.sensor.name}. Carry it over with reembed(Kernels())"
         )
+    if max(recipe.plan.widths) > MOST_WIDTH:
+        came = f"{recipe.sensor.name} has {max(recipe.plan.widths)}"
+        raise InputError(f"expected windows of at most {MOST_WIDTH} readings, which a chip weighs exactly; {came}")
     if not 0 < len(names) <= MOST_MATERIALS:
         raise InputError(
             f"expected a scene of 1 to {MOST_MATERIALS} materials; came {len(names)}. Name those that can be there"
@@ -99,17 +103,12 @@ def _calibrations(memory: Memory, readouts: Sequence[Readout]) -> list[tuple[int
     stages = [[*scales, *plan.views] for scales in judging]  # a sampled touch's rows are numbered so
     held_out = [held_out_scores(readout, sample, stages, "lda") for readout in readouts]
     found = []
-    begins = [_least(plan.widths[0]), *plan.milestones()[1:]]
+    begins = [max(SHORTEST, math.ceil(ENOUGH * plan.widths[0])), *plan.milestones()[1:]]
     for number, (least, scales) in enumerate(zip(begins, judging, strict=True)):
         if len(scales) <= len(readouts):
             scores = StageScores(number, sample, held_out[: len(scales)])
             found.append((least, calibrate_stage(scores, readouts[: len(scales)], "lda")))
     return found
-
-
-def _least(width: int) -> int:
-    """The readings from which a touch has a window of the shortest width that needs no mirror image."""
-    return max(SHORTEST, math.ceil(ENOUGH * width))
 
 
 class _Quantised:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.clients.report.drawing import as_counted, brief, clipped_name, evidence, png, shown
-from scroll_tactile.clients.report.page import Card, figure, name_of, note, table
+from scroll_tactile.clients.report.page import Card, State, figure, name_of, note, table
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
@@ -34,9 +35,11 @@ LONGEST = 160  # columns of a picture
 HIGHEST = 64  # rows
 FRAME = (60, 80)  # of a camera's picture
 COLUMNS = 400  # touches beside each other in the picture of all
-CHANGED = {kind: kind for kind in ("dead", "noisier", "slower")}
-CHANGED |= dict.fromkeys(("gain", "gains", "all gains"), "another gain")
-CHANGED |= dict.fromkeys(("offset", "all offsets"), "another offset")
+CHANGED = {
+    **{kind: kind for kind in ("dead", "noisier", "slower")},
+    **dict.fromkeys(("gain", "gains", "all gains"), "another gain"),
+    **dict.fromkeys(("offset", "all offsets"), "another offset"),
+}
 
 
 @dataclass(frozen=True)
@@ -44,10 +47,8 @@ class ChannelSummary:
     """One channel, its levels as shares of its range.
 
     number: from 0. middle: the median; low, high: where 5 and 95 % of the readings lie. still: share of the touches in
-    which it never changes, and of the last ones. bottom, top: share of its readings at either end of the range. signed:
-    whether zero lies inside the range, so that its bottom is an end, too. missing: share that was not read. drift: of a
-    recording, from its first part to its last, and its standard error; None where it cannot be measured. change: what
-    the memory's health says became of it; "" where nothing did.
+    which it never changes. bottom, top: share of its readings at either end of the range. drift: of a recording, from
+    its first part to its last, and its standard error; None where it cannot be measured. faults: in words.
     """
 
     number: int
@@ -55,37 +56,23 @@ class ChannelSummary:
     low: float
     high: float
     still: float
-    still_lately: float
     bottom: float
     top: float
-    signed: bool
-    missing: float
     drift: tuple[float, float] | None
-    change: str = ""
-
-    @property
-    def faults(self) -> list[str]:
-        """What is wrong with it, in words."""
-        found = []
-        if self.change:
-            found.append(self.change)
-        elif self.still >= DEAD:
-            found.append("dead")
-        elif self.still_lately >= DEAD and self.still_lately - self.still > STEADY / 2:
-            found.append("died lately")
-        elif max(self.top, self.bottom if self.signed else 0.0) >= SATURATED:
-            found.append("saturated")
-        if self.drift is not None and not found and abs(self.drift[0]) >= max(DRIFTING, CERTAIN * self.drift[1]):
-            found.append("drifting")
-        if self.missing >= SATURATED:
-            found.append("missing readings")
-        return found
+    faults: list[str]
 
 
-def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *, ordered: bool) -> list[ChannelSummary]:
+def channels_of(
+    touches: Sequence[LevelArray],
+    signed: npt.NDArray[np.bool_],
+    *,
+    ordered: bool,
+    changed: Mapping[int, str] = MappingProxyType({}),
+) -> list[ChannelSummary]:
     """The channels of some touches, or of the parts of one recording, levels (C, T) each.
 
-    signed: whether zero lies inside the range of each, (C,). ordered: whether they follow each other, as parts do.
+    signed: whether zero lies inside the range of each, (C,), so that its bottom is an end, too. ordered: whether they
+    follow each other, as parts do. changed: channel → what the memory's health says became of it.
     """
     count, found = len(touches[0]), []
     still = np.array([_still(levels) for levels in touches])
@@ -94,61 +81,51 @@ def channels_of(touches: Sequence[LevelArray], signed: npt.NDArray[np.bool_], *,
         placed = np.arange(count)[:, None] * 256 + levels
         counts += np.bincount(placed.ravel(), minlength=counts.size).reshape(counts.shape)
     drifts = drift(np.array([_mean(levels) for levels in touches]) / (LEVELS - 1)) if ordered else [None] * count
-    lately = (still[-LATELY:] if ordered else still).mean(axis=0)
+    always, lately = still.mean(axis=0), (still[-LATELY:] if ordered else still).mean(axis=0)
     for i, own in enumerate(counts):
         read = max(int(own[:MISSING].sum()), 1)
         reached = np.cumsum(own[:MISSING]) / read
-        low, middle, high = (float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.05, 0.5, 0.95))
-        channel = ChannelSummary(
-            number=i,
-            middle=middle,
-            low=low,
-            high=high,
-            still=float(still[:, i].mean()),
-            still_lately=float(lately[i]),
-            bottom=float(own[0]) / read,
-            top=float(own[LEVELS - 1]) / read,
-            signed=bool(signed[i]),
-            missing=float(own[MISSING]) / max(int(own.sum()), 1),
-            drift=drifts[i],
-        )
-        found.append(channel)
+        places = [float(np.searchsorted(reached, share)) / (LEVELS - 1) for share in (0.5, 0.05, 0.95)]
+        bottom, top = float(own[0]) / read, float(own[LEVELS - 1]) / read
+        fault, moved = changed.get(i, ""), drifts[i]
+        if not fault and always[i] >= DEAD:
+            fault = "dead"
+        elif not fault and lately[i] >= DEAD and lately[i] - always[i] > STEADY / 2:
+            fault = "died lately"
+        elif not fault and max(top, bottom if signed[i] else 0.0) >= SATURATED:
+            fault = "saturated"
+        elif not fault and moved is not None and abs(moved[0]) >= max(DRIFTING, CERTAIN * moved[1]):
+            fault = "drifting"
+        missing = "missing readings" if own[MISSING] >= SATURATED * max(own.sum(), 1) else ""
+        faults = [each for each in (fault, missing) if each]
+        found.append(ChannelSummary(i, *places, float(always[i]), bottom, top, moved, faults))
     return found
 
 
 def _still(levels: LevelArray) -> npt.NDArray[np.bool_]:
     """Which channels never change in a touch, (C,)."""
-    read = levels != MISSING
-    high, low = np.where(read, levels, 0).max(axis=1), np.where(read, levels, LEVELS).min(axis=1)
-    return np.asarray(high <= low)
+    read = np.ma.masked_equal(levels, MISSING)
+    return np.asarray((read.max(axis=1) <= read.min(axis=1)).filled(True))
 
 
 def _mean(levels: LevelArray) -> FloatArray:
     """The mean level of each channel, (C,); NaN where nothing was read."""
-    read = levels != MISSING
-    sums = np.where(read, levels, 0).sum(axis=1, dtype=np.int64)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(sums / read.sum(axis=1))
+    return np.asarray(np.ma.masked_equal(levels, MISSING).mean(axis=1).filled(np.nan))
 
 
-def drift(means: FloatArray) -> list[tuple[float, float] | None]:
+def drift(means: FloatArray) -> Sequence[tuple[float, float] | None]:
     """How far each channel's level moves from the first part of a recording to the last, and its standard error.
 
-    means: (parts, C), in order: the slope over the place in that order.
+    means: (parts, C), in order: the slope over the place in that order. None where a part was not read, or of few.
     """
-    count = len(means)
-    found: list[tuple[float, float] | None] = [None] * means.shape[1]
-    if count < LATELY:
-        return found
-    place = np.linspace(-0.5, 0.5, count)
-    spread = float(place @ place)
-    for i, level in enumerate(means.T):
-        if np.isfinite(level).all():
-            rest = level - level.mean()
-            slope = float(place @ rest) / spread
-            left = rest - slope * place
-            found[i] = slope, float(np.sqrt(max(left @ left, 0.0) / (count - 2) / spread))
-    return found
+    if (count := len(means)) < LATELY:
+        return [None] * means.shape[1]
+    place = np.linspace(-0.5, 0.5, count)[:, None]
+    rest, spread = means - means.mean(axis=0), float((place**2).sum())
+    slopes = (place * rest).sum(axis=0) / spread
+    errors = np.sqrt(((rest - slopes * place) ** 2).sum(axis=0) / (count - 2) / spread)
+    both = zip(slopes.tolist(), errors.tolist(), strict=True)
+    return [(slope, error) if math.isfinite(slope) else None for slope, error in both]
 
 
 def health_cards(found: Health | None) -> list[Card]:
@@ -167,12 +144,12 @@ def health_section(found: Health) -> str:
     if not found.grew:
         return note("No two touches of a material are alike enough in length and level to be compared.")
     alarm = -math.log10(found.bound)
-    caption = (
-        f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
-        f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on."
-    )
     told = note(f"{in_words(found)}. {advice(found)}") if found.since is not None else ""
-    return told + figure(evidence(found.grew, alarm), caption)
+    return told + figure(
+        evidence(found.grew, alarm),
+        f"Evidence that touches of the same material read otherwise than before, as a power of ten. At {alarm:g} it is "
+        f"an alarm: where nothing changes it gets there in {found.bound:.0%} of memories, however long they go on.",
+    )
 
 
 def channel_card(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> Card:
@@ -193,23 +170,22 @@ def card_of(found: Sequence[ChannelSummary], by: str) -> Card:
             wrong.setdefault(fault, []).append(str(channel.number))
     if not wrong:
         return "good", "Channels", f"all {len(found)} alive", f"None is dead, saturated or changed, by {by}."
-    worst = any(fault.startswith(("dead", "died")) for fault in wrong)
+    state: State = "bad" if any(fault.startswith(("dead", "died")) for fault in wrong) else "look"
     answer = "; ".join(f"{len(own)} {fault}" for fault, own in sorted(wrong.items()))
     more = ". ".join(
         f"{fault.capitalize()}: {', '.join(own[:8])}{f' and {len(own) - 8} more' if len(own) > 8 else ''}"
         for fault, own in sorted(wrong.items())
     )
-    return "bad" if worst else "look", "Channels", answer, f"{more} (of {len(found)}, by {by})."
+    return state, "Channels", answer, f"{more} (of {len(found)}, by {by})."
 
 
 def _channels(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None) -> list[ChannelSummary]:
     """The channels by kept touches, and what the memory's health says became of them."""
     low, high = (np.broadcast_to(limit, (sensor.channels,)) for limit in sensor.limits)
-    found = channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False)
-    if health is None or health.since is None or health.kind not in CHANGED:
-        return found
-    what = f"{CHANGED[health.kind]} since observation {health.since}"
-    return [replace(own, change=what) if own.number in health.channels else own for own in found]
+    changed: dict[int, str] = {}
+    if health is not None and health.kind in CHANGED:
+        changed = dict.fromkeys(health.channels, f"{CHANGED[health.kind]} since observation {health.since}")
+    return channels_of([touch.levels for touch in kept], (low < 0) & (high > 0), ordered=False, changed=changed)
 
 
 def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | None, *, ordered: bool) -> str:
@@ -222,11 +198,12 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | 
             "made with kept_touches=0."
         )
     found = _channels(sensor, kept, health)
-    means = np.nan_to_num(np.stack([_mean(touch.levels) for touch in kept], axis=1))
-    order = "in the order of observation" if ordered else "by material"
-    caption = (
-        f"Each row is a channel, 0 at the top; each column a touch, {order}. Dark is the least mean level that "
-        "the channel had, yellow the most. A dead channel is a stripe of one colour."
+    head = level_picture(
+        np.nan_to_num(np.stack([_mean(touch.levels) for touch in kept], axis=1)),
+        f"mean level of each channel in each of {len(kept)} touches",
+        f"Each row is a channel, 0 at the top; each column a touch, "
+        f"{'in the order of observation' if ordered else 'by material'}. Dark is the least mean level that "
+        "the channel had, yellow the most. A dead channel is a stripe of one colour.",
     )
     words = (
         f"Dead: never changes in {DEAD:.0%} of the touches (or no touch ever reached it). Saturated: {SATURATED:.0%} "
@@ -234,7 +211,6 @@ def channel_section(sensor: Sensor, kept: Sequence[KeptTouch], health: Health | 
     )
     unit = sensor.unit if isinstance(sensor.unit, str) else "its unit"
     low, high = (np.broadcast_to(limit, (sensor.channels,)).astype(np.float64) for limit in sensor.limits)
-    head = level_picture(means, f"mean level of each channel in each of {len(kept)} touches", caption)
     return head + note(words) + state_rows(found, low, high, unit)
 
 
@@ -243,21 +219,21 @@ def state_rows(
 ) -> str:
     """The table of channels, whose range is from low to high, (C,) each; those with a fault come first."""
     drifts = any(channel.drift for channel in found)
-    shown_channels = [channel for channel in found if channel.faults or len(found) <= MOST_ROWS]
-    rows = []
-    for channel in sorted(shown_channels, key=lambda channel: not channel.faults)[:MOST_ROWS]:
+    rows, listed = [], [channel for channel in found if channel.faults or len(found) <= MOST_ROWS]
+    for channel in sorted(listed, key=lambda channel: not channel.faults)[:MOST_ROWS]:
         bottom, top = float(low[channel.number]), float(high[channel.number])
         median, least, most = (
             brief(bottom * (1 - share) + top * share) for share in (channel.middle, channel.low, channel.high)
         )
         moved = None if channel.drift is None else f"{100 * channel.drift[0]:+.1f} ± {100 * channel.drift[1]:.1f}%"
-        state = ", ".join(channel.faults) or "fine"
-        ends = f"{channel.still:.0%}", f"{channel.bottom:.1%}", f"{channel.top:.1%}"
-        rows.append([channel.number, state, median, f"{least} to {most}", *ends, *([moved] if drifts else [])])
-    header = ["channel", "state", f"median ({unit})" if unit else "median", "90% lie in", "never changes", "at bottom"]
+        state, ends = ", ".join(channel.faults) or "fine", (f"{channel.bottom:.1%}", f"{channel.top:.1%}")
+        row = [channel.number, state, median, f"{least} to {most}", f"{channel.still:.0%}", *ends, moved]
+        rows.append(row if drifts else row[:-1])
+    median = f"median ({unit})" if unit else "median"
+    header = ["channel", "state", median, "90% lie in", "never changes", "at bottom", "at top", "drift"]
     left = len(found) - len(rows)
     more = note(f"{left} more channels have no row, those without a fault first.") if left else ""
-    return table([*header, "at top", *(["drift"] if drifts else [])], rows, "channels") + more
+    return table(header if drifts else header[:-1], rows, "channels") + more
 
 
 def _averaged(levels: npt.NDArray[np.number], columns: int) -> npt.NDArray[np.float64]:
@@ -282,8 +258,8 @@ def level_picture(levels: npt.NDArray[np.number], alternative: str, caption: str
     few = _averaged(levels, COLUMNS)
     low, high = (np.quantile(few, share, axis=1, keepdims=True) for share in (0.01, 0.99))
     pixels = _thinned((few - low) / np.maximum(high - low, 1.0) * (LEVELS - 1), COLUMNS)
-    height = max(60, min(260, 9 * len(pixels)))
-    drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="height:{height}px">'
+    size = f"height:{max(60, min(260, 9 * len(pixels)))}px"
+    drawn = f'<img src="{png(pixels)}" alt="{shown(alternative)}" style="{size}">'
     return f'<figure class="wide">{drawn}<figcaption>{shown(caption)}</figcaption></figure>'
 
 
@@ -302,13 +278,11 @@ def exemplar_pictures(sensor: Sensor, kept: Sequence[KeptTouch], exemplars: Mapp
                 found[touch.material] = png(_thinned(_touch(touch.levels), LONGEST))
     if not found:
         return note("Not shown: no readings are kept, neither as exemplars nor to match with.")
-    names = {*exemplars, *(touch.material for touch in kept)}
-    what = (
-        "The middle frame of one touch of each material."
-        if sensor.camera
-        else "One touch of each material: rows are channels, from least (dark) to most each; time runs to the right."
-    )
-    more = f" {len(names) - len(found)} more are not shown." if len(names) > len(found) else ""
+    what = "One touch of each material: rows are channels, from least (dark) to most each; time runs to the right."
+    if sensor.camera:
+        what = "The middle frame of one touch of each material."
+    left = len({*exemplars, *(touch.material for touch in kept)}) - len(found)
+    more = f" {left} more are not shown." if left else ""
     items = "".join(
         f'<figure><img src="{data}" alt="a touch of {shown(name)}">'
         f"<figcaption>{name_of(clipped_name(name, 260))}</figcaption></figure>"

@@ -50,8 +50,7 @@ def clipped_name(name: str, room: float = LEFT - 8) -> str:
     sizes = [_size(letter) for letter in name]
     if sum(sizes) <= room:
         return name
-    reach = room - _size("…")
-    kept = sum(total <= reach for total in itertools.accumulate(sizes))
+    kept = sum(total <= room - _size("…") for total in itertools.accumulate(sizes))
     return name[:kept] + "…"
 
 
@@ -214,11 +213,11 @@ def timeline(rows: Sequence[tuple[str, Sequence[float], Sequence[float]]], begin
     return drawing.svg()
 
 
-def histogram(counts: Sequence[int], low: float, high: float, label: str, what: str) -> str:
-    """How often numbers fall into equal steps from low to high. label: of the numbers; what: is counted."""
+def histogram(counts: Sequence[int], high: float, label: str, what: str) -> str:
+    """How often numbers fall into equal steps from 0 to high. label: of the numbers; what: is counted."""
     drawing = Drawing(158, f"How many {what}, by {label}")
-    axis, up = drawing.plot((low, high), (0, max(counts, default=1)), 46, 122, 8, "{:g}")
-    wide = (axis.end - axis.begin) / max(len(counts), 1)
+    axis, up = drawing.plot((0, high), (0, max(counts)), 46, 122, 8, "{:g}")
+    wide = (axis.end - axis.begin) / len(counts)
     for i, count in enumerate(counts):
         if count:
             top = min(up(count), 121.0)
@@ -255,25 +254,25 @@ def tree(names: Sequence[str], joins: FloatArray) -> tuple[str, list[str]]:
     return drawing.svg(), [names[i] for i in order]
 
 
-def confusions(names: Sequence[str], counts: npt.NDArray[np.int64]) -> str:
-    """Counts of (truth, answer), (C, C): the diagonal in one colour, mistakes in another."""
+def confusions(names: Sequence[str], counts: Mapping[tuple[str, str], int]) -> str:
+    """Counts of (truth, answer), where there are any: right answers in one colour, mistakes in another."""
     left = LEFT + 14
     side = min(22.0, (RIGHT - left) / len(names))
     drawing = Drawing(side * len(names) + 22, "Counts of the material that was touched by the answer that was given")
     for i, name in enumerate(names):
-        y, total = side * i + 16, int(counts[i].sum())
+        own = [counts.get((name, answer), 0) for answer in names]
+        y, total = side * i + 16, sum(own)
         drawing.name(y + side / 2 + 4, name)
         drawing.text(left - 3, y + side / 2 + 3, i + 1, "tiny", "end")
         drawing.text(left + side * (i + 0.5), 11, i + 1, "tiny", "middle")
-        for j, count in enumerate(counts[i].tolist()):
-            if not count:
-                drawing.box(left + side * j, y, side - 1, side - 1, "none")
-                continue
-            share, kind = 0.25 + 0.75 * count / total, "fill" if i == j else "wrong"
-            title = f"{name} called {names[j]}: {count} of {total}"
-            drawing.box(left + side * j, y, side - 1, side - 1, kind, share, title)
-            strong = "tiny strong" if share > 0.6 else "tiny"
-            drawing.text(left + side * (j + 0.5) - 0.5, y + side / 2 + 3, count, strong, "middle")
+        for j, count in enumerate(own):
+            x, share, kind = left + side * j, 0.25 + 0.75 * count / max(total, 1), "fill" if i == j else "wrong"
+            if count:
+                drawing.box(x, y, side - 1, side - 1, kind, share, f"{name} called {names[j]}: {count} of {total}")
+                strong = "tiny strong" if share > 0.6 else "tiny"
+                drawing.text(x + side / 2 - 0.5, y + side / 2 + 3, count, strong, "middle")
+            else:
+                drawing.box(x, y, side - 1, side - 1, "none")
     return drawing.svg()
 
 
@@ -315,9 +314,8 @@ def against_truth(truth: Sequence[float], said: Sequence[float], half: float, na
     drawing = Drawing(300, "The number that was said, by the true one")
     axis, up = drawing.plot((low, high), (low, high), 46, 262, 8, "{:g}")
     reach = min(half, high - low)
-    for off, kind in ((0.0, "ideal"), (reach, "grid")):
-        drawing.line([(axis(low), up(low + off)), (axis(high - off), up(high))], kind)
-    drawing.line([(axis(low + reach), up(low)), (axis(high), up(high - reach))], "grid")
+    for above, below, kind in ((0.0, 0.0, "ideal"), (reach, 0.0, "grid"), (0.0, reach, "grid")):
+        drawing.line([(axis(low + below), up(low + above)), (axis(high - above), up(high - below))], kind)
     for true, value, name in zip(truth, said, names, strict=True):
         kind = "point" if abs(true - value) <= half else "wrong"
         drawing.dot(axis(true), up(value), 2.5, kind, f"{name}: {value:.4g} said, {true:.4g} true")
@@ -399,19 +397,18 @@ def trace(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
 
     Of pictures it is their mean. spans: begin and end of touches, in readings.
     """
-    pictures = recording.readings.ndim > 2
-    readings = np.asarray(recording.readings, dtype=None if pictures else np.float64).reshape(len(recording), -1)
-    readings = readings.mean(axis=1, dtype=np.float64)[:, None] if pictures else readings
-    readings = np.where(np.isfinite(readings), readings, np.nan)
-    chosen = _moving(readings)
-    at, unit = counted_from(recording)
+    pictures, readings = recording.readings.ndim > 2, recording.readings.reshape(len(recording), -1)
+    readings = readings.mean(axis=1, dtype=np.float64)[:, None] if pictures else readings.astype(np.float64)
+    readings[~np.isfinite(readings)] = np.nan
+    chosen, (at, unit) = _moving(readings), counted_from(recording)
     gaps = recording.report.gaps if unit == "s" else ()
     axis, bottom = Axis(float(at[0]), float(at[-1]), LEFT, RIGHT), TRACE * max(len(chosen), 1) + 14
     drawing = Drawing(bottom + 36, "The channels over time")
     bands = [(at[begin], at[end - 1], "fill", 0.15, f"touch, readings {begin} to {end}") for begin, end in spans]
-    for gap in gaps:
-        title = f"a gap of {gap.seconds:.3g} s before reading {gap.index}"
-        bands.append((at[gap.index - 1], at[gap.index], "wrong", 0.35, title))
+    bands += [
+        (at[gap.index - 1], at[gap.index], "wrong", 0.35, f"a gap of {gap.seconds:.3g} s before reading {gap.index}")
+        for gap in gaps
+    ]
     for begin, end, kind, share, title in bands:
         drawing.box(axis(begin), 10, max(axis(end) - axis(begin), 1.0), bottom - 10, kind, share, title)
     for place, channel in enumerate(chosen):
@@ -446,12 +443,11 @@ def _draw(drawing: Drawing, values: FloatArray, at: FloatArray, gaps: Sequence[i
     up, step = Axis(0.0, 1.0, top + TRACE - 6, top), max(1, 2 * len(values) // PIECES)
     read = np.isfinite(shares)
     starts = {0, *gaps, *(np.flatnonzero(np.diff(read.astype(np.int8))) + 1).tolist()}
-    for begin, end in itertools.pairwise([*sorted(start for start in starts if start < len(values)), len(values)]):
-        if not read[begin]:
-            continue
+    for begin, end in itertools.pairwise([*sorted(starts), len(values)]):
         points = []
-        for first in range(begin, end, step):
+        for first in range(begin, end, step) if read[begin] else ():
             own = shares[first : min(first + step, end)]
             points += [(axis(at[first + i]), up(own[i])) for i in sorted({int(own.argmin()), int(own.argmax())})]
-        drawing.line(points if len(points) > 1 else [*points, (points[0][0] + 0.5, points[0][1])], "own thin")
+        if points:
+            drawing.line(points if len(points) > 1 else [*points, (points[0][0] + 0.5, points[0][1])], "own thin")
     drawing.text(LEFT - 6, top + 21, f"{brief(low)} to {brief(high)}", "tiny", "end")

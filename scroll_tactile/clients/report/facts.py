@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -30,20 +30,18 @@ from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.current import estimator_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.readouts.calibration import FEWEST
-from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.results import Observation, Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["MOST_NEAR", "Growing", "MemoryFacts", "bins_of", "unknown_by"]
+__all__ = ["MOST_NEAR", "Growing", "MemoryFacts", "bins_of", "mistakes", "unknown_by"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,20 +62,17 @@ def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatA
     if model.fusion is None:
         return [], np.zeros((0, 0))
     scales = model.scales("complete", len(model.calibrations) - 1)
-    weights = np.full(len(scales), PRIOR / len(scales))
-    if model.kind == "lda":
-        weights = model.fusion.complete.calibration.weights
+    lda = model.kind == "lda"
+    weights = model.fusion.complete.calibration.weights if lda else np.full(len(scales), PRIOR / len(scales))
     names = [name for name in model.names if all(name in model.readouts[scale].places for scale in scales)]
     total = np.zeros((len(names), len(names)))
     with one_thread():
         for scale, weight in zip(scales, weights.tolist(), strict=True):
             readout = model.readouts[scale]
-            solved, _ = readout.linear(names, "lda")
             means = statistics.sums(scale, names) / statistics.counts(scale, names)[:, None] - readout.origin
-            products = means @ solved
-            products = (products + products.T) / 2
+            products = means @ readout.linear(names, "lda")[0]
             sizes = np.diagonal(products)
-            total += weight * np.maximum(sizes[:, None] + sizes - 2 * products, 0.0) / 2
+            total += weight * np.maximum(sizes[:, None] + sizes - (products + products.T), 0.0) / 2
     np.fill_diagonal(total, 0.0)
     return names, total
 
@@ -105,9 +100,7 @@ def mistakes(held_out: Sequence[HeldOutTouch]) -> list[Mistake]:
 
 
 def interval(right: int, count: int) -> tuple[float, float]:
-    """The 95 % interval of a share (Wilson 1927)."""
-    if not count:
-        return 0.0, 1.0
+    """The 95 % interval of a share of one touch or more (Wilson 1927)."""
     z, share = 1.96, right / count
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
@@ -141,13 +134,11 @@ class Trust:
 def trust_in(held_out: Sequence[HeldOutTouch]) -> Trust:
     """How far answers can be believed, by one or more touches left out."""
     confidence, right = _answered(held_out)
-    low, high = interval(int(right.sum()), len(held_out))
     draws = np.random.default_rng(0).random((200, len(held_out))) < confidence
     return Trust(
-        count=len(held_out),
-        right=float(right.mean()),
-        low=low,
-        high=high,
+        len(held_out),
+        float(right.mean()),
+        *interval(int(right.sum()), len(held_out)),
         confidence=float(confidence.mean()),
         error=_error(confidence, right),
         chance=float(np.mean([_error(confidence, drawn) for drawn in draws])),
@@ -184,9 +175,9 @@ def bins_of(held_out: Sequence[HeldOutTouch]) -> list[Bin]:
 
 def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
     """Material, its left-out touches that were called unknown, and all of them; the largest share first."""
+    unknown = Counter(touch.material for touch in held_out if not touch.known)
     tested = Counter(touch.material for touch in held_out)
-    unknown_touches = Counter(touch.material for touch in held_out if not touch.known)
-    found = [(name, unknown_touches[name], count) for name, count in tested.items()]
+    found = [(name, unknown[name], count) for name, count in tested.items()]
     return sorted(found, key=lambda row: (-row[1] / row[2], row[0]))
 
 
@@ -231,10 +222,9 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
     if model.fusion is None or len(model.fusion.trajectories.targets) < FEWEST:
         return None
     held_out, moments, rate = model.fusion.trajectories, model.fusion.moments[:-1], extractor.sensor.rate
-    done, wrong = np.zeros(len(held_out.targets), bool), np.zeros(len(held_out.targets), bool)
+    done, wrong = np.zeros((2, len(held_out.targets)), bool)
     right, decided, mistaken = [], [], []
     for i, moment in enumerate(moments):
-        threshold = moment.threshold(false_alarms)
         chances, novelty = held_out.chances[:, i], held_out.novelty[:, i]
         reached = np.isfinite(novelty)
         best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
@@ -245,7 +235,7 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
                 probability=chance,
                 ranking=((name, chance),),
                 novelty=float(novelty[touch]),
-                known=bool(novelty[touch] <= threshold),
+                known=bool(novelty[touch] <= moment.threshold(false_alarms)),
                 seconds=moment.steps / rate,
             )
             if rule.decided(prediction, moment.steps):
@@ -262,21 +252,17 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
     )
 
 
-def chosen(held_out: Sequence[HeldOutTouch], keys: Iterable[bytes], camera: bool) -> list[HeldOutTouch]:
+def chosen(held_out: Sequence[HeldOutTouch], keys: Container[bytes], camera: bool) -> list[HeldOutTouch]:
     """A few touches to look at: the two hardest, and others from hard to easy, of different materials if there are."""
-    known = set(keys)
     ranked = sorted(
-        (touch for touch in held_out if touch.key in known),
+        (touch for touch in held_out if touch.key in keys),
         key=lambda touch: (touch.probability[touch.names.index(touch.material)], touch.key),
     )
-    count, picked, materials = CAMERA_TOUCHES if camera else TOUCHES, list[HeldOutTouch](), set[str]()
-    wanted = [0, 1, *(round(i) for i in np.linspace(0.1, 0.95, count - 2) * (len(ranked) - 1))] if ranked else []
-    for place in wanted[:count]:
-        rest = [touch for touch in ranked[place:] if touch not in picked]
-        if rest:
-            fresh = next((touch for touch in rest if touch.material not in materials), rest[0])
-            picked.append(fresh)
-            materials.add(fresh.material)
+    count, picked = CAMERA_TOUCHES if camera else TOUCHES, list[HeldOutTouch]()
+    for place in [0, 1, *np.rint(np.linspace(0.1, 0.95, count - 2) * (len(ranked) - 1)).astype(int).tolist()]:
+        if rest := [touch for touch in ranked[place:] if touch not in picked]:
+            materials = {touch.material for touch in picked}
+            picked.append(next((touch for touch in rest if touch.material not in materials), rest[0]))
     return picked
 
 
@@ -291,11 +277,11 @@ def growing(
     first = 1 if sensor.camera and capabilities_of(extractor.embedding).rest is not None else 0  # the frame at rest
     for touch, readings in touches:
         stream, predictions, decided = extractor.stream(readings), list[Prediction](), None
-        parts = CAMERA_PARTS if sensor.camera else PARTS
-        moments = rule.moments if len(rule.moments) > 1 else [round(part * len(stream)) for part in parts]
-        least, most = max(fewest_readings(sensor), first + 1), len(stream)
+        parts = [round(part * len(stream)) for part in (CAMERA_PARTS if sensor.camera else PARTS)]
+        moments = [*(rule.moments if len(rule.moments) > 1 else parts), len(stream)]
+        least = max(fewest_readings(sensor), first + 1)
         with _without(model, touch) as other:
-            for count in sorted({min(max(least, moment), most) for moment in (*moments, most)}):
+            for count in sorted({min(max(least, moment), len(stream)) for moment in moments}):
                 prefix = stream.first(count / sensor.rate)
                 encoded = extractor.encode(prefix, other.longest, lambda steps: model.scales_for(names, steps))
                 predictions.append(answer(other, extractor, names, [(encoded, None)], false_alarms))
@@ -333,7 +319,7 @@ class MemoryFacts:
     """What a memory knows.
 
     risk: the share of wrong answers among those decided. of: an axis, whose labels it then knows in place of materials.
-    names: what touches are called by. missing: what the page lacks and why, filled as it is made. unread: whether the
+    missing: what the page lacks and why, filled as it is made. unread: whether the
     embedding is not at hand, and nothing was fitted to beginnings.
     """
 
@@ -347,10 +333,6 @@ class MemoryFacts:
         """Note that something is missing, and say so in its place."""
         self.missing.append(f"{what}: {why}")
         return note(f"Not shown: {why}")
-
-    def by(self, axis: str) -> MemoryFacts:
-        """What it knows by the labels on an axis; what is missing there is noted here."""
-        return MemoryFacts(self.learner, self.risk, axis, self.missing)
 
     @cached_property
     def memory(self) -> Memory:
@@ -398,11 +380,6 @@ class MemoryFacts:
         return trust_in(self.held_out) if self.held_out else None
 
     @cached_property
-    def mistakes(self) -> list[Mistake]:
-        """All confusions, the most frequent first."""
-        return mistakes(self.held_out)
-
-    @cached_property
     def near(self) -> tuple[list[str], npt.NDArray[np.float64]]:
         """Materials and their separations; none where there are too few, or too many."""
         if self.model is None or not 1 < len(self.counts) <= MOST_NEAR:
@@ -424,8 +401,7 @@ class MemoryFacts:
     @cached_property
     def extractor(self) -> FeatureExtractor:
         """What makes features of touches."""
-        learner = self.learner
-        return FeatureExtractor(learner.sensor, learner.embedding, learner.plan)
+        return FeatureExtractor(self.learner.sensor, self.learner.embedding, self.learner.plan)
 
     @cached_property
     def rule(self) -> DecisionRule | None:
@@ -433,11 +409,6 @@ class MemoryFacts:
         if self.model is None or not self.held_out or self.unread:
             return None
         return decision_rule(self.model, self.risk)
-
-    @cached_property
-    def estimator(self) -> Estimator | None:
-        """What estimates quantities; None where none was declared."""
-        return estimator_of(self.memory) if self.memory.quantities else None
 
     @cached_property
     def soon(self) -> Soon | None:
@@ -455,13 +426,12 @@ class MemoryFacts:
             return [], "the embedding is not at hand; see below."
         sensor, kept = self.learner.sensor, {touch.key: touch for touch in self.kept}
         held = {} if kept else {exemplar.key: exemplar for own in self.exemplars.values() for exemplar in own}
-        touches = chosen(self.held_out, kept or held, sensor.camera)
-        if not touches:
-            return [], "of no touch that could be left out the readings are kept."
         streams = [
             (own, stream_of(kept[own.key].levels, sensor) if kept else validate(held[own.key].readings, sensor))
-            for own in touches
+            for own in chosen(self.held_out, kept or held, sensor.camera)
         ]
+        if not streams:
+            return [], "of no touch that could be left out the readings are kept."
         try:
             return growing(self.model, self.extractor, self.rule, self.learner.settings.false_alarms, streams), ""
         except CANNOT_EMBED as error:

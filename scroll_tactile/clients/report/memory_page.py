@@ -20,10 +20,11 @@ from scroll_tactile.clients.report.channels import (
     health_section,
 )
 from scroll_tactile.clients.report.drawing import dated, shown
-from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts, bins_of, unknown_by
+from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts, bins_of, mistakes, unknown_by
 from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
 from scroll_tactile.errors import printable
 from scroll_tactile.learner import TactileLearner
+from scroll_tactile.prediction.current import estimator_of
 from scroll_tactile.readouts.estimation import Heads
 from scroll_tactile.readouts.regression import RegressionHead
 
@@ -58,7 +59,6 @@ def memory_page(
     Raises InputError for a risk that is no share; CapacityError; and StoreError where a memory on disk cannot be read.
     """
     facts, sensor = MemoryFacts(learner, risk), learner.sensor
-    title = name or ("A memory without a path" if learner.path is None else learner.path.name)
     show = progress or (lambda what, done, of: None)
     show("touches left out", 0, STEPS)
     near, order = _alike(facts)
@@ -75,26 +75,27 @@ def memory_page(
         ("alike", "Who is near whom", near),
         ("trust", "Whether to trust it", calibrated),
         ("growing", "How answers grow", grown),
-        *([("estimated", "What it measures", _estimated(facts))] if facts.estimator is not None else []),
+        *([("estimated", "What it measures", _estimated(facts))] if learner.memory.quantities else []),
         *([("health", "Whether its sensor is the one that learned", health_section(found))] if found else []),
         ("channels", "Channels", channel_section(sensor, facts.kept, found, ordered=bool(facts.journal))),
         ("when", "When it was taught", _when(facts)),
     ]
     for i, axis in enumerate(learner.axes):
-        by = facts.by(axis)
+        by = MemoryFacts(learner, risk, axis, facts.missing)
         sections.append((f"axis-{i}", f"By {axis}", _mixed_up(by, _alike(by)[1]) + _calibration(by)))
     first = [_knows(facts), _mixes(facts), _trusts(facts), _decides(facts), channel_card(sensor, facts.kept, found)]
     if facts.missing:
         reasons = "".join(f"<li>{shown(why)}</li>" for why in dict.fromkeys(facts.missing))
         sections.append(("missing", "What is missing, and why", f"<ul>{reasons}</ul>"))
     show("written", STEPS, STEPS)
+    title = name or ("A memory without a path" if learner.path is None else learner.path.name)
     return page(title, _under(learner), cards([*first, *health_cards(found)]), sections, _foot(learner))
 
 
 def _under(learner: TactileLearner) -> str:
     sensor, embedding = learner.sensor, learner.embedding
-    row = max(learner.memory.corrections, default=None)
-    through = "" if row is None else f" Its skin changed: touches are read through the adaptation in row {row}."
+    rows = learner.memory.corrections
+    through = f" Its skin changed: touches are read through the adaptation in row {max(rows)}." if rows else ""
     return (
         f"A tactile memory of sensor <b>{shown(sensor.name)}</b>, {sensor.channels} channels at {sensor.rate:g} Hz; "
         f"embedding {shown(embedding.name)}, {embedding.dimension} features.{through}"
@@ -102,10 +103,10 @@ def _under(learner: TactileLearner) -> str:
 
 
 def _foot(learner: TactileLearner) -> str:
-    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     return (
-        f"Made {now} by scroll-tactile {shown(__version__)}. Digest of the memory <code>{learner.digest()}</code>, "
-        f"fingerprint of the embedding <code>{shown(learner.embedding.fingerprint[:16])}</code>. A touch that is left "
+        f"Made {datetime.now(UTC):%Y-%m-%d %H:%M UTC} by scroll-tactile {shown(__version__)}. Digest of the memory "
+        f"<code>{learner.digest()}</code>, fingerprint of the embedding "
+        f"<code>{shown(learner.embedding.fingerprint[:16])}</code>. A touch that is left "
         "out is judged by statistics and kept touches without it, and by the calibration of all."
     )
 
@@ -129,7 +130,7 @@ def _mixes(facts: MemoryFacts) -> Card:
     wrong = round((1 - trust.right) * trust.count)
     if not wrong:
         return "good", heading, "nothing", f"All {trust.count} touches left out got their own name."
-    worst = facts.mistakes[0]
+    worst = mistakes(facts.held_out)[0]
     more = f"Left out one by one. Most often {worst.material}, called {worst.answer}: {worst.count} of {worst.tested}."
     return _state(trust.right), heading, f"{wrong} of {trust.count} touches", more
 
@@ -179,10 +180,7 @@ def _known(facts: MemoryFacts) -> str:
     nearest: dict[str, tuple[str, float]] = {}
     for first, second, apart in reversed(_pairs(facts)):
         nearest[first], nearest[second] = (second, apart), (first, apart)
-    began: dict[str, float] = {}
-    for row in facts.journal:
-        if row.state != "retracted":
-            began.setdefault(row.material, row.time)
+    began = {row.material: row.time for row in reversed(facts.journal) if row.state != "retracted"}
     tested = Counter(touch.material for touch in facts.held_out)
     right = Counter(touch.material for touch in facts.held_out if touch.answer == touch.material)
     rows = [
@@ -195,8 +193,9 @@ def _known(facts: MemoryFacts) -> str:
         ]
         for name, count in facts.counts.items()
     ]
-    header = ["material", "touches", "right, left out", "nearest", "separation", "first observed (UTC)"]
-    return table(header, rows, "materials")
+    return table(
+        ["material", "touches", "right, left out", "nearest", "separation", "first observed (UTC)"], rows, "materials"
+    )
 
 
 def _pairs(facts: MemoryFacts) -> list[tuple[str, str, float]]:
@@ -212,16 +211,15 @@ def _pairs(facts: MemoryFacts) -> list[tuple[str, str, float]]:
 
 def _when(facts: MemoryFacts) -> str:
     if not facts.journal:
-        alone = facts.learner.path is None
-        why = "this memory has no path, so that nobody noted when." if alone else "its journal names no touches."
-        return facts.lacks("Touches over time", why)
+        why = "this memory has no path, so that nobody noted when."
+        return facts.lacks("Touches over time", why if facts.learner.path is None else "its journal names no touches.")
     timed = [row for row in facts.journal if math.isfinite(row.time)]
     times = [row.time for row in timed] or [0.0]
     begin, end = min(times), max(times)
     if len(facts.counts) > ROWS:
         counts, _ = np.histogram(times, bins=BARS, range=(begin, end if end > begin else begin + 1))
         label = f"seconds since {dated(begin)} UTC"
-        drawn = drawing.histogram(counts.tolist(), 0, max(end - begin, 1.0), label, "touches")
+        drawn = drawing.histogram(counts.tolist(), max(end - begin, 1.0), label, "touches")
         return figure(drawn, f"How many touches were observed when; {len(times)} in all, the last {dated(end)} UTC.")
     rows: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in facts.counts}
     for row in timed:
@@ -236,8 +234,9 @@ def _alike(facts: MemoryFacts) -> tuple[str, list[str]]:
     """Who is near whom, and the order of materials that brings near ones together; empty where there are many."""
     names, separation = facts.near
     if len(names) < 2:
-        many = len(facts.counts) > MOST_NEAR
-        why = f"there are more than {MOST_NEAR} materials." if many else "it takes two materials, touched long enough."
+        why = "it takes two materials, touched long enough."
+        if len(facts.counts) > MOST_NEAR:
+            why = f"there are more than {MOST_NEAR} materials."
         return facts.lacks("Who is near whom", why), []
     pairs = table(["material", "feels like", "separation"], _pairs(facts)[:PAIRS], "nearest pairs")
     found = f"<div><h3>Nearest pairs</h3>{pairs}</div>"
@@ -251,8 +250,8 @@ def _alike(facts: MemoryFacts) -> tuple[str, list[str]]:
     from scipy.spatial.distance import squareform
 
     drawn, order = drawing.tree(names, np.asarray(linkage(squareform(separation, checks=False), "average")))
-    caption = f"Materials that join further to the left feel more alike (average linkage). {words}"
-    return side_by_side(figure(drawn, caption), found), order
+    words = f"Materials that join further to the left feel more alike (average linkage). {words}"
+    return side_by_side(figure(drawn, words), found), order
 
 
 def _mixed_up(facts: MemoryFacts, order: list[str]) -> str:
@@ -270,25 +269,25 @@ def _mixed_up(facts: MemoryFacts, order: list[str]) -> str:
             f" Of {len(facts.counts) - len(tested)} others no touch could be left out, or none is among those sampled;"
             " nothing is called by their names here."
         )
-    rows = [[m.material, m.answer, m.count, m.tested, f"{m.confidence:.0%}"] for m in facts.mistakes[:MOST_MISTAKES]]
-    rest = len(facts.mistakes) - len(rows)
-    listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
-    more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
-    found = f"<div><h3>Worst confusions</h3>{listed}{more}{_one_by_one(facts)}</div>"
-    found = found if rows else note("None was called by another name.")
+    wrong = mistakes(facts.held_out)
+    rows = [[m.material, m.answer, m.count, m.tested, f"{m.confidence:.0%}"] for m in wrong[:MOST_MISTAKES]]
+    rest = len(wrong) - len(rows)
+    found = note("None was called by another name.")
+    if rows:
+        listed = table(["touched", "called", "times", "of", "mean probability"], rows, "confusions")
+        more = note(f"{rest} more confusions, none more frequent, are left out.") if rest else ""
+        found = f"<div><h3>Worst confusions</h3>{listed}{more}{_one_by_one(facts)}</div>"
     if len(tested) > SQUARE:
         return note(words) + found
     names = [name for name in order or facts.counts if name in tested]
     names += sorted(tested - set(names))
-    counts = np.zeros((len(names), len(names)), np.int64)
-    for touch in facts.held_out:
-        if touch.answer in names:
-            counts[names.index(touch.material), names.index(touch.answer)] += 1
-    caption = (
+    counts = Counter((touch.material, touch.answer) for touch in facts.held_out)
+    drawn = figure(
+        drawing.confusions(names, counts),
         "Rows: what was touched; columns, by number: what it was called. Right answers lie on the diagonal, and "
-        f"{facts.names} that feel alike stand side by side."
+        f"{facts.names} that feel alike stand side by side.",
     )
-    return note(words) + side_by_side(figure(drawing.confusions(names, counts), caption), found)
+    return note(words) + side_by_side(drawn, found)
 
 
 def _one_by_one(facts: MemoryFacts) -> str:
@@ -324,17 +323,12 @@ def _calibration(facts: MemoryFacts) -> str:
     if trust is None:
         return facts.lacks("Whether to trust it", facts.nothing_left_out)
     verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
-    of = (
-        "Each touch was held out alone: others of the same sitting, sensor and hand stayed learned. Touches of "
-        "another day are harder: expect more wrong ones, and more called unknown. To measure these: scroll-tactile "
-        "evaluate."
-    )
-    caption = (
+    drawn = figure(
+        drawing.reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out]),
         "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
         f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is the mean of perfect answers. "
-        "Upright lines are 95% intervals."
+        "Upright lines are 95% intervals.",
     )
-    drawn = drawing.reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out])
     unknown_touches = unknown_by(facts.held_out)
     words = (
         f"Of its own touches, left out, {trust.unknown:.1%} would be called unknown; {alarms:.0%} are meant to be. A "
@@ -347,7 +341,11 @@ def _calibration(facts: MemoryFacts) -> str:
         rows = [[name, unknown, count] for name, unknown, count in unknown_touches if unknown]
         listed = table(["material", "called unknown", "of"], rows, "touches called unknown") if rows else ""
         beside = f"<div>{note(words)}{listed}</div>"
-    return note(of) + side_by_side(figure(drawn, caption), beside)
+    return note(
+        "Each touch was held out alone: others of the same sitting, sensor and hand stayed learned. Touches of "
+        "another day are harder: expect more wrong ones, and more called unknown. To measure these: scroll-tactile "
+        "evaluate."
+    ) + side_by_side(drawn, beside)
 
 
 def _growing_answers(facts: MemoryFacts) -> str:
@@ -355,12 +353,11 @@ def _growing_answers(facts: MemoryFacts) -> str:
     found, why = facts.growing
     if not found:
         return facts.lacks("How answers grow", why)
-    words = (
+    return note(
         "The probability of each material while a touch goes on, as if it had never been observed. Solid: its own "
         "material; dashed: the strongest other at any moment; upright: when it is decided, at a risk of "
         f"{facts.risk:.0%}. The first two are the hardest touches there are."
-    )
-    return note(words) + side_by_side(_soon(facts), *(_grown(touch) for touch in found))
+    ) + side_by_side(_soon(facts), *(_grown(touch) for touch in found))
 
 
 def _soon(facts: MemoryFacts) -> str:
@@ -368,17 +365,18 @@ def _soon(facts: MemoryFacts) -> str:
     if measured is None:
         return facts.lacks("How soon answers come", "too few touches are kept to measure it.")
     curves = {"right": measured.right, "decided": measured.decided, "decided and wrong": measured.wrong}
-    caption = (
+    return figure(
+        drawing.over_time(measured.seconds, curves),
         f"Of {measured.count} touches left out, after each time: the share whose likeliest material is the true one, "
-        "the share that is decided by then, and the share that was decided and is wrong (another material, or unknown)."
+        "the share that is decided by then, and the share that was decided and is wrong (another material, or "
+        "unknown).",
     )
-    return figure(drawing.over_time(measured.seconds, curves), caption)
 
 
 def _grown(touch: Growing) -> str:
-    names = sorted({touch.material, *(name for at in touch.predictions for name, _ in at.ranking[:3])})
+    names = {touch.material, *(name for at in touch.predictions for name, _ in at.ranking[:3])}
     chances = [dict(prediction.ranking) for prediction in touch.predictions]
-    curves = {name: [of[name] for of in chances] for name in names}
+    curves = {name: [of[name] for of in chances] for name in sorted(names)}
     end, decided = touch.predictions[-1], None
     verdict = "right" if end.material == touch.material else f"wrong, {end.material}"
     unknown = ", and called unknown" if end.known is False else ""
@@ -392,17 +390,18 @@ def _grown(touch: Growing) -> str:
 
 def _estimated(facts: MemoryFacts) -> str:
     """Quantities of complete touches: what was said of them held out, and how many lie in their intervals."""
-    estimator = facts.estimator
-    assert estimator is not None
-    parts = []
+    estimator, parts = estimator_of(facts.memory), []
     for name, heads in sorted(estimator.heads(estimator.last).items()):
         parts.append(f"<h3>{shown(name)}</h3>")
         if isinstance(heads, str):
             parts.append(facts.lacks(f"How {name} is estimated", f"{heads}."))
             continue
         unit = estimator.quantities[name].unit
-        parts.append(_against_truth(heads.known, heads, facts.risk, unit, "each touch held out"))
-        parts.append(_against_truth(heads.new, heads, facts.risk, unit, "each material held out, as if it were new"))
+        for head, of in (
+            (heads.known, "each touch held out"),
+            (heads.new, "each material held out, as if it were new"),
+        ):
+            parts.append(_against_truth(head, heads, facts.risk, unit, of))
     return "".join(parts)
 
 
@@ -413,13 +412,11 @@ def _against_truth(head: RegressionHead, heads: Heads, risk: float, unit: str, o
         held: Sequence[bool] = (off[np.array(heads.materials) == name] <= half).tolist()
         rows.append((name, sum(held) / len(held), f"{sum(held)} of {len(held)} touches"))
     width = "unbounded: there are too few touches" if math.isinf(half) else f"{2 * half:.3g} {unit} wide"
-    caption = (
-        f"{len(off)} sampled touches, {of}: off by {off.mean():.3g} {unit} on average. Intervals that "
-        f"are to hold {1 - risk:.0%} are {width}."
-    )
     said = (heads.targets - head.residuals).tolist()
-    drawn = drawing.against_truth(heads.targets.tolist(), said, half, heads.materials, unit)
-    covered = drawing.shares(rows[:ROWS], 1 - risk, "held by their interval")
-    return side_by_side(
-        figure(drawn, caption), figure(covered, "By material. A material far below is unlike the others.")
+    drawn = figure(
+        drawing.against_truth(heads.targets.tolist(), said, half, heads.materials, unit),
+        f"{len(off)} sampled touches, {of}: off by {off.mean():.3g} {unit} on average. Intervals that "
+        f"are to hold {1 - risk:.0%} are {width}.",
     )
+    covered = drawing.shares(rows[:ROWS], 1 - risk, "held by their interval")
+    return side_by_side(drawn, figure(covered, "By material. A material far below is unlike the others."))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -193,15 +192,9 @@ def save(html: str, path: str | os.PathLike[str]) -> None:
     """
     target = require_page(path)
     try:
-        number, draft = tempfile.mkstemp(suffix=".html", dir=target.parent)
-        try:
-            with os.fdopen(number, "w", encoding="utf-8") as file:
-                file.write(html)
-            Path(draft).chmod(0o644)
-            Path(draft).replace(target)
-        except BaseException:
-            with suppress(OSError):
-                Path(draft).unlink()
-            raise
+        with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+            draft = Path(folder) / target.name
+            draft.write_text(html, encoding="utf-8")
+            draft.replace(target)
     except OSError as error:
         raise InputError(f"{target} cannot be written: {error.strerror}") from error

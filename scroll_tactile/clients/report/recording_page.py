@@ -91,24 +91,21 @@ def cut_of(recording: Recording, intervals: Sequence[Interval] | None, sensor: S
             return Cutting((), by, False, f"Not cut: {error}")
         named = all(touch.material is not None for touch in found)
         return Cutting(found, by, named, "" if named else "its episodes, of which some have no name")
-    why = ""
-    if sensor is not None and sensor.camera:
-        why = "these are pictures."
-    elif len(recording) > MOST_READINGS:
-        why = f"it has more than {MOST_READINGS} readings."
-    elif not np.isfinite(recording.readings).all():
-        why = "readings are missing."
-    elif sensor is None:
-        why = "it has no clock (give --rate), or its numbers are no sensor's."
+    reasons = {
+        "these are pictures.": sensor is not None and sensor.camera,
+        f"it has more than {MOST_READINGS} readings.": len(recording) > MOST_READINGS,
+        "readings are missing.": not np.isfinite(recording.readings).all(),
+        "it has no clock (give --rate), or its numbers are no sensor's.": sensor is None,
+    }
+    why = next((why for why, holds in reasons.items() if holds), "")
     if sensor is None or why:
         why = f"Not cut: the file has no episodes or labels, and contacts are not looked for: {why}"
         return Cutting((), "contact", False, why)
     spans = contact_spans(sensor, None, recording.readings, [gap.index for gap in recording.report.gaps])
-    if not spans:
-        why = "None were found by contact: for that it begins at rest, for two seconds or more. It may be one touch."
-        return Cutting((), "contact", False, why)
-    proposed = "proposed by contact, as learn --cut contact takes them"
-    return Cutting(touches(recording, lambda _: spans), "contact", False, proposed)
+    why = "None were found by contact: for that it begins at rest, for two seconds or more. It may be one touch."
+    if spans:
+        why = "proposed by contact, as learn --cut contact takes them"
+    return Cutting(touches(recording, lambda _: spans) if spans else (), "contact", False, why)
 
 
 def learning(
@@ -126,7 +123,13 @@ def learning(
     else:
         words += ["--sensor", name or "sensor.json"]
         missing += [] if name else ["sensor.json, its name, channels, rate, low, high, unit and duration"]
-    words += _where(recording, whose, chosen)
+    usual = None if whose.preset is None else PRESETS[whose.preset]
+    field = chosen.get("field") if recording.topic is None else recording.field
+    if recording.topic is not None and (usual is None or recording.topic != usual.topic):
+        words += ["--topic", recording.topic]
+    if field and (usual is None or recording.topic is None or field != usual.field):
+        words += ["--field", field]
+    words += [word for name in ("clock", "columns") if chosen.get(name) for word in (f"--{name}", str(chosen[name]))]
     if cut.by == "labels":
         words += ["--labels", given.get("labels") or "labels.csv"]
         missing += [] if given.get("labels") else ["labels.csv, the table of its touches"]
@@ -138,20 +141,6 @@ def learning(
         return ""
     put_in = note(f" Put in: {'; '.join(missing)}.") if missing else ""
     return f"<h3>To learn it</h3>{lines([shlex.join(words)])}{put_in}"
-
-
-def _where(recording: Recording, whose: Whose, chosen: Mapping[str, Any]) -> list[str]:
-    """The options that say where its readings are, but for what the preset says."""
-    usual = None if whose.preset is None else PRESETS[whose.preset]
-    field = chosen.get("field") if recording.topic is None else recording.field
-    words = []
-    if recording.topic is not None and (usual is None or recording.topic != usual.topic):
-        words += ["--topic", recording.topic]
-    if field and (usual is None or recording.topic is None or field != usual.field):
-        words += ["--field", field]
-    for name in ("clock", "columns"):
-        words += [f"--{name}", str(chosen[name])] if chosen.get(name) else []
-    return words
 
 
 def recording_page(
@@ -179,34 +168,35 @@ def recording_page(
     whose = whose_readings(contents, recording, sensor, chosen.get("preset"))
     seen = _Seen.of(recording, whose.sensor)
     cut = cut_of(recording, intervals, whose.sensor or (None if seen is None else seen.sensor(recording)))
-    spans = [(touch.begin, touch.end) for touch in cut.touches]
     words = learning(recording, fspath(path), whose, cut, chosen, given or {})
     sections = [
-        ("signal", "Signal", side_by_side(_signal(recording, spans), f"<div>{_touches(recording, cut)}{words}</div>")),
+        ("signal", "Signal", side_by_side(_signal(recording, cut), f"<div>{_touches(recording, cut)}{words}</div>")),
         ("channels", "Channels", _channels(seen, whose)),
         ("time", "Time", _time(recording)),
         ("holds", "What the file has", _holds(contents)),
     ]
     where = f"topic <code>{shown(recording.topic)}</code>, " if recording.topic else ""
-    under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {_shape(recording)}.{why}"
+    shape = recording.readings.shape[1:]
+    holds = f"{shape[0]} channels" if len(shape) == 1 else f"pictures of {' × '.join(map(str, shape))}"
+    under = f"A recording. Shown: {where}field <code>{shown(recording.field)}</code>, {holds}.{why}"
     summary = cards([_length(recording), _clock(recording), _losses(recording), _state(recording, seen, whose)])
-    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    foot = f"Made {now} by scroll-tactile {shown(__version__)} of <code>{shown(recording.source)}</code>."
+    made = f"Made {datetime.now(UTC):%Y-%m-%d %H:%M UTC} by scroll-tactile {shown(__version__)}"
+    foot = f"{made} of <code>{shown(recording.source)}</code>."
     return page(PurePosixPath(recording.source).name, under, summary, sections, foot)
 
 
-def _signal(recording: Recording, spans: Sequence[tuple[int, int]]) -> str:
-    channels = 1 if recording.readings.ndim > 2 else int(np.prod(recording.readings.shape[1:]))
-    which = f"The {MOST_TRACES} of {channels} channels that move most" if channels > MOST_TRACES else "All channels"
-    of = "The mean of each picture" if recording.readings.ndim > 2 else which
-    words = f"{of}, each from its least to its most."
-    if spans:
-        words += " Blue bands are touches."
-    if recording.report.gaps:
-        words += " Red bands are gaps, in which nothing was read."
-    if counted_from(recording)[1] != "s":
-        words += " Across: the number of the reading, for it has no clock that goes on."
-    return figure(trace(recording, spans), words)
+def _signal(recording: Recording, cut: Cutting) -> str:
+    channels = int(np.prod(recording.readings.shape[1:]))
+    of = f"The {MOST_TRACES} of {channels} channels that move most" if channels > MOST_TRACES else "All channels"
+    parts = {
+        "The mean of each picture" if recording.readings.ndim > 2 else of: True,
+        ", each from its least to its most.": True,
+        " Blue bands are touches.": cut.touches,
+        " Red bands are gaps, in which nothing was read.": recording.report.gaps,
+        " Across: the number of the reading, for it has no clock that goes on.": counted_from(recording)[1] != "s",
+    }
+    drawn = trace(recording, [(touch.begin, touch.end) for touch in cut.touches])
+    return figure(drawn, "".join(part for part, holds in parts.items() if holds))
 
 
 def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Recording, dict[str, Any], str]:
@@ -220,11 +210,6 @@ def _read(contents: Contents, path: str, chosen: dict[str, Any]) -> tuple[Record
     chosen = chosen | {"topic": first.topic, "field": first.field}
     why = f" It is the first of {len(contents.entries)} below; --topic and --field choose another."
     return read(path, **chosen), chosen, why
-
-
-def _shape(recording: Recording) -> str:
-    shape = recording.readings.shape[1:]
-    return f"{shape[0]} channels" if len(shape) == 1 else f"pictures of {' × '.join(map(str, shape))}"
 
 
 def _steps(recording: Recording) -> FloatArray:
@@ -247,10 +232,10 @@ def _clock(recording: Recording) -> Card:
         return "none", "How steady", "no clock", "Its readings have no times: give --clock or --rate."
     share = (report.jitter or 0.0) * report.rate
     state: State = "bad" if report.backward else "look" if report.gaps or share > 0.2 else "good"
-    gaps = "no gaps"
-    if report.gaps:
-        longest = max(gap.seconds for gap in report.gaps)
-        gaps = f"{len(report.gaps)} gap{'s' * (len(report.gaps) > 1)}, the longest {longest:.3g} s"
+    longest = max((gap.seconds for gap in report.gaps), default=0.0)
+    gaps = (
+        f"{len(report.gaps)} gap{'s' * (len(report.gaps) > 1)}, the longest {longest:.3g} s" if longest else "no gaps"
+    )
     back = f"; time goes back {report.backward} times" if report.backward else ""
     answer = f"{report.rate:.4g} Hz ± {max(1e3 * (report.jitter or 0), 0.001):.2g} ms"
     return state, "How steady", answer, f"By the clock {report.clock!r}: {gaps}{back}."
@@ -258,13 +243,12 @@ def _clock(recording: Recording) -> Card:
 
 def _losses(recording: Recording) -> Card:
     report = recording.report
-    counted = "By the counter in its messages."
-    if report.lost is None:
-        counted = "No counter shows whether readings were lost."
-    if report.lost is None and not report.repeated and not report.unset:
-        return "none", "What was lost", "not counted", counted
+    none = report.lost is None
+    counted = "No counter shows whether readings were lost." if none else "By the counter in its messages."
     parts = {"lost": report.lost or 0, "repeated": report.repeated, "without a stamp": report.unset}
     bad = sum(parts.values())
+    if none and not bad:
+        return "none", "What was lost", "not counted", counted
     answer = ", ".join(f"{count} {what}" for what, count in parts.items() if count) or "none lost"
     return "look" if bad > LOST * len(recording) else "good", "What was lost", answer, counted
 
@@ -285,14 +269,11 @@ class _Seen(NamedTuple):
             return None
         readings = np.asarray(recording.readings, dtype=np.float64)
         readings = np.where(np.isfinite(readings), readings, np.nan)
-        if sensor is not None:
-            low, high = (np.broadcast_to(limit, readings.shape[1:]).astype(np.float64) for limit in sensor.limits)
-        else:
-            low, high = _range(readings)
+        limits = _range(readings) if sensor is None else sensor.limits
+        low, high = (np.broadcast_to(limit, readings.shape[1:]).astype(np.float64) for limit in limits)
         shares = (readings / 2 - low / 2) / np.maximum(high / 2 - low / 2, np.finfo(np.float64).tiny)
         levels = np.rint(np.clip(np.nan_to_num(shares), 0, 1) * (LEVELS - 1)).astype(np.uint8)
-        levels[np.isnan(readings)] = MISSING
-        levels = np.ascontiguousarray(levels.T)
+        levels = np.ascontiguousarray(np.where(np.isnan(readings), np.uint8(MISSING), levels).T)
         parts = np.array_split(levels, max(1, min(STRETCHES, len(readings) // 2)), axis=1)
         signed = (low < 0) & (high > 0) & (sensor is not None)
         return cls(levels, low, high, channels_of(parts, signed, ordered=True))
@@ -329,22 +310,22 @@ def _state(recording: Recording, seen: _Seen | None, whose: Whose) -> Card:
 def _channels(seen: _Seen | None, whose: Whose) -> str:
     if seen is None:
         return note("Not shown: these are pictures, or too few readings.")
-    caption = (
+    drawn = level_picture(
+        seen.levels,
+        "level of each channel over time",
         "Each row is a channel, 0 at the top; time runs to the right. Dark is the least mean level that the channel "
-        "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right."
+        "had, yellow the most: a dead channel is a stripe of one colour, a drifting one changes from left to right.",
     )
-    words = (
-        f"Dead: it never changes in {DEAD:.0%} of {STRETCHES} equal stretches of the recording. Drifting: its level "
-        f"moves by {DRIFTING:.0%} of the range from begin to end. "
-    )
+    saturated = f"Saturated: {SATURATED:.0%} of the readings lie at the end of the range, {whose.how}."
     if whose.sensor is None:
-        words += (
+        saturated = (
             "The range of a channel is taken as what was seen of it and a tenth more, so that none can be called "
             "saturated: --sensor or --preset gives the true one."
         )
-    else:
-        words += f"Saturated: {SATURATED:.0%} of the readings lie at the end of the range, {whose.how}."
-    drawn = level_picture(seen.levels, "level of each channel over time", caption)
+    words = (
+        f"Dead: it never changes in {DEAD:.0%} of {STRETCHES} equal stretches of the recording. Drifting: its level "
+        f"moves by {DRIFTING:.0%} of the range from begin to end. {saturated}"
+    )
     return drawn + note(words) + state_rows(seen.channels, seen.low, seen.high, "")
 
 
@@ -354,22 +335,20 @@ def _time(recording: Recording) -> str:
         return note("Not shown: its readings have no times. Give --clock, or --rate to count them.")
     longest = float(np.quantile(steps, 0.999)) * 1e3
     regular = steps[(steps >= 0) & (steps * 1e3 <= max(longest, 1e-9))] * 1e3
-    high = float(regular.max()) * 1.1 if len(regular) and regular.max() > 0 else 1.0
+    high = float(regular.max(initial=0.0)) * 1.1 or 1.0
     counts, _ = np.histogram(regular, bins=60, range=(0, high))
-    drawn = histogram(counts.tolist(), 0, high, "ms from a reading to the next", "readings")
-    caption = (
-        "How long it takes from one reading to the next: one narrow peak is a steady clock, two are lost readings."
+    drawn = figure(
+        histogram(counts.tolist(), high, "ms from a reading to the next", "readings"),
+        "How long it takes from one reading to the next: one narrow peak is a steady clock, two are lost readings.",
     )
-    longest_first = sorted(recording.report.gaps, key=lambda gap: -gap.seconds)
-    begin = float(recording.times[0])
+    longest_first, begin = sorted(recording.report.gaps, key=lambda gap: -gap.seconds), float(recording.times[0])
     rows = [[gap.index, f"{recording.times[gap.index - 1] - begin:.3f}", gap.seconds] for gap in longest_first]
-    gaps = table(["before reading", "after (s)", "lasts (s)"], rows[:MOST_ROWS], "gaps") if rows else ""
+    gaps = note("There are no gaps.")
+    if rows:
+        gaps = f"<h3>Gaps</h3>{table(['before reading', 'after (s)', 'lasts (s)'], rows[:MOST_ROWS], 'gaps')}"
     more = note(f"{len(rows) - MOST_ROWS} shorter gaps are left out.") if len(rows) > MOST_ROWS else ""
-    first = note(f"It begins {dated(float(recording.times[0]))} UTC.") if recording.times[0] > FIRST_DATE else ""
-    notes = "".join(note(text) for text in recording.report.notes)
-    return (
-        figure(drawn, caption) + first + (f"<h3>Gaps</h3>{gaps}{more}" if rows else note("There are no gaps.")) + notes
-    )
+    first = note(f"It begins {dated(begin)} UTC.") if begin > FIRST_DATE else ""
+    return drawn + first + gaps + more + "".join(map(note, recording.report.notes))
 
 
 def _touches(recording: Recording, cut: Cutting) -> str:
@@ -381,13 +360,13 @@ def _touches(recording: Recording, cut: Cutting) -> str:
     for touch in cut.touches:
         begins, lasts = float(at[touch.begin]), float(at[touch.end - 1] - at[touch.begin])
         times = [begins, lasts] if unit == "s" else [None, None]
-        name = [touch.material or "no name"] if cut.named else []
-        rows.append([*name, touch.begin, touch.end - touch.begin, *times])
-    header = [*(["material"] if cut.named else []), "from reading", "readings", "begins (s)", "lasts (s)"]
-    names = len({str(touch.material or "no name") for touch in cut.touches})
-    listed = table(header, rows[:MOST_TOUCHES], "touches")
-    counted = f"{len(rows)} touches of {names} names" if cut.named else f"{len(rows)} touches, {cut.why}"
-    return f"<h3>Touches</h3>{note(f'{counted}.')}{listed}"
+        rows.append([touch.material, touch.begin, touch.end - touch.begin, *times])
+    header, counted = ["material", "from reading", "readings", "begins (s)", "lasts (s)"], f"{len(rows)} touches"
+    own = slice(None) if cut.named else slice(1, None)
+    listed = table(header[own], [row[own] for row in rows[:MOST_TOUCHES]], "touches")
+    names = len({touch.material for touch in cut.touches})
+    counted += f" of {names} names." if cut.named else f", {cut.why}."
+    return f"<h3>Touches</h3>{note(counted)}{listed}"
 
 
 def _holds(contents: Contents) -> str:

@@ -18,15 +18,13 @@ from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, lerobot, ros
 from numcodecs import Blosc
 
 from scroll_tactile.errors import FieldError, MissingLibraryError, RecordingError
-from scroll_tactile.recordings import bounds, describe, find, iterate, read
-from scroll_tactile.recordings.arrays import zarrfile
-from scroll_tactile.recordings.ros import decoding
+from scroll_tactile.recordings import bounds, decoding, describe, find, iterate, read, zarrfile
 
 # How they are refused, where that says more than that they are.
 SAID = {
     "R1 pickled ends": r"meta/episode_ends cannot be read: .*its data type is '\|O'; expected numbers",
     "R1 pickle that compresses": "it is compressed by 'pickle'; expected one of blosc",
-    "R2 copied from behind the frame": "a Blosc frame .* of 77840 bytes .* stands in 20 bytes",
+    "R2 copied from behind the frame": "a Blosc frame of 20 bytes claims to be another, or not to hold 77824",
     "R2 a chunk that is a link": "is a link; a Zarr group is made of files and folders",
     "R3 external storage": "lie in other files",
     "R3 virtual": r"lie in other data sets \(it is virtual\)",
@@ -98,17 +96,6 @@ class TestZarr:
             np.testing.assert_array_equal(
                 read(tmp_path / "a.zarr", field=f"a{i}").readings, values.reshape(531, 12).astype(float)
             )
-
-    @pytest.mark.parametrize("name", ["lz4", "lz4hc", "zstd"])
-    @pytest.mark.parametrize("shuffle", [Blosc.NOSHUFFLE, Blosc.SHUFFLE, Blosc.BITSHUFFLE])
-    def test_frames_of_blosc_are_read_without_it(self, name, shuffle):
-        rng = np.random.default_rng(shuffle)
-        for size in (1, 16, 1000, 4095, 70_001, 300_000):
-            for values in (rng.integers(0, 4, size, np.uint16), rng.standard_normal(size)):
-                for level in (1, 5):
-                    frame = bytes(Blosc(name, level, shuffle).encode(values))
-                    raw = zarrfile._decompressed("blosc", frame, values.nbytes)
-                    assert bytes(raw) == values.tobytes()
 
     def test_a_frame_of_zstd_need_not_say_its_size(self):
         from backports import zstd

@@ -16,8 +16,8 @@ from faults.recording_attacks import ATTACKS
 from made import lerobot
 
 from scroll_tactile.recordings import describe
-from scroll_tactile.recordings.arrays.parquetpages import require_bounded_pages
 from scroll_tactile.recordings.bounds import SPARE, Budget
+from scroll_tactile.recordings.lerobot import require_bounded_pages
 
 CHILD = """
 import json, sys

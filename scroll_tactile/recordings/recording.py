@@ -166,13 +166,11 @@ def resampled(recording: Recording, rate: float) -> Recording:
             f"{recording.source} has annotations, one a reading: take resample=, or annotate=, not both",
             argument="resample annotate",
         )
-    whole = [Episode(0, len(recording))] if len(recording) else []
     parts, times, episodes = [], [], []
     borders = sorted({0, len(recording), *(e.begin for e in recording.episodes), *(e.end for e in recording.episodes)})
     starts = {}
-    pieces = itertools.pairwise(borders) if recording.episodes else ((e.begin, e.end) for e in whole)
     done = 0
-    for begin, end in pieces:
+    for begin, end in itertools.pairwise(borders):
         grid, values = _line(recording.times[begin:end], recording.readings[begin:end], rate)
         parts.append(values)
         times.append(grid)
@@ -212,8 +210,8 @@ def _line(
 
 def require_columns(columns: str) -> list[re.Match[str]]:
     """The parts of a text that names columns. Raises FieldError for one that does not."""
-    parts = [_PART.fullmatch(part.strip()) for part in columns.split(",")]
-    found = [part for part in parts if part is not None]
+    parts = columns.split(",")
+    found = [match for part in parts if (match := _PART.fullmatch(part.strip()))]
     if len(found) < len(parts):
         raise FieldError(
             f"expected columns such as 25:44 or 0,3,5:9, counted from 0; came {columns!r:.80}", argument="columns"

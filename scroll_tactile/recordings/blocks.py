@@ -178,8 +178,6 @@ def guarded(path: str) -> Iterator[None]:
         if len(text) > _MESSAGE:  # names and definitions in a file may have any length
             error.args = (f"{text[:_MESSAGE]} …",)
         raise
-    except GeneratorExit:
-        raise
     except MemoryError as error:
         raise RecordingError(f"{path} claims to hold more than fits into memory, and may be damaged") from error
     except Exception as error:

@@ -169,10 +169,10 @@ def _empty_lists(message: Any) -> int:
     return sum(_empty_lists(getattr(message, name)) for name in fields_of(message))
 
 
-# Definitions in IDL are made plain for rosbags' parser, which is slow by more than their length. It tries what stands in
-# a parenthesis eighty times, and in two within each other 6400 times; it tries a sequence twice, and one within three
-# others 16 times; it goes through a constant's text 64 times; and it works out whatever numbers a definition has it make.
-# What ROS 2 makes of a .msg has parentheses and shifts in annotations and comments alone, which say nothing about bytes.
+# Definitions in IDL are made plain for rosbags' parser, which is slow by more than their length. It tries what stands
+# in a parenthesis eighty times, and in two within each other 6400 times; it tries a sequence twice, and one within
+# three others 16 times; it goes through a constant's text 64 times; and it works out whatever numbers a definition has
+# it make. What ROS 2 makes of a .msg has parentheses and shifts in annotations and comments alone.
 _SEPARATOR, _HEADER = "=" * 80 + "\n", re.compile(r"\AIDL: .*\n")
 _TOKEN = re.compile(r'("[^"\\]*(?:\\"?[^"\\]*)*")|/\*.*?(?:\*/|\Z)|//[^\n]*', re.DOTALL)  # a text, or else a comment
 _ANNOTATION = re.compile(r"@\s*[A-Za-z:][\w:]*(?:\s*\([^()]*\))?")

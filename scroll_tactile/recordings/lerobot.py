@@ -75,10 +75,9 @@ class LeRobot(Source):
     def contents(self) -> Contents:
         """The columns that hold numbers, touch first."""
         fps, count = self.info.get("fps"), self.info.get("total_frames")
-        if isinstance(fps, bool) or not isinstance(fps, int | float):
-            fps = None
+        rate = fps if type(fps) in (int, float) else None
         entries = [
-            Entry(None, name, tuple(about["shape"]), count, fps, about["dtype"])
+            Entry(None, name, tuple(about["shape"]), count, rate, about["dtype"])
             for name, about in self.features.items()
             if name not in _BOOKKEEPING and about["dtype"] not in ("video", "image", "string")
         ]
@@ -169,7 +168,7 @@ class LeRobot(Source):
         require_inside(self.path, path)
         self.budget.add(stored_bytes(path))
         require_bounded_pages(path, columns, self.budget)
-        limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": LONGEST_LIST}
+        limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": _LONGEST_LIST}
         try:
             return self.parquet.ParquetFile(path, pre_buffer=False, read_dictionary=texts, **limits)
         except KeyError as error:
@@ -192,8 +191,7 @@ class LeRobot(Source):
         rows = rows_of(8 * len(numbers)) if text is None else 1
         for batch in file.iter_batches(batch_size=rows, columns=columns):
             self.budget.work(_TABLE_ROW * batch.num_rows)
-            if text is not None:
-                self.budget.take(batch.nbytes)
+            self.budget.take(batch.nbytes)
             for name, values in batch.to_pydict().items():
                 table[name] += values
         return table
@@ -234,14 +232,10 @@ class LeRobot(Source):
         while hasattr(array.type, "value_type"):
             if array.null_count:
                 raise RecordingError(f"column {name!r} of {self.address} has rows without a value")
-            inner = array.flatten()
-            if len(array) and len(inner) % len(array) == 0 and hasattr(array, "offsets"):
-                lengths = np.diff(array.offsets.to_numpy())
-                if len(lengths) and (lengths != lengths[0]).any():
-                    self._ragged(name)
-            elif len(array) and len(inner) % len(array):
-                self._ragged(name)
-            array = inner
+            lengths = np.diff(array.offsets.to_numpy()) if hasattr(array, "offsets") else np.empty(0)
+            if (lengths != lengths[:1]).any():
+                raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
+            array = array.flatten()
         return np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).reshape(count, -1)
 
     def _require_numbers(self, kind: Any, name: str, *, texts: bool = False) -> None:
@@ -261,9 +255,6 @@ class LeRobot(Source):
         if not (self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)):
             raise FieldError(f"column {name!r} of {self.address} holds {kind}; expected numbers")
 
-    def _ragged(self, name: str) -> None:
-        raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
-
     def _files(self) -> list[Path]:
         """The parquet files that the episodes are in; raises RecordingError where one is missing."""
         listed: dict[tuple[int, int], None] = {}
@@ -277,9 +268,8 @@ class LeRobot(Source):
             raise RecordingError(f"{self.address} names its data {pattern!r:.100}; expected chunk_index and file_index")
         files = [self.path / pattern.format(chunk_index=chunk, file_index=file) for chunk, file in sorted(listed)]
         files = files or sorted((self.path / "data").glob("**/*.parquet"))
-        root = self.path.resolve()
-        if not all(file.resolve().is_relative_to(root) for file in files):
-            raise RecordingError(f"{self.address} names data outside its folder: {pattern!r:.100}")
+        for file in files:
+            require_inside(self.path, file)
         absent = [str(file.relative_to(self.path)) for file in files if not file.is_file()]
         if absent or not files:
             raise RecordingError(
@@ -303,14 +293,12 @@ class LeRobot(Source):
 
 # What the pages of a parquet file claim to hold, looked at before pyarrow is: it allocates whatever they claim.
 #
-# The file ends with a footer that says where the pages of each column are, and each page begins with a header that says
-# what it becomes. Both are structures in Thrift's compact protocol (apache/parquet-format: parquet.thrift has the numbers
-# of their fields). They are read here as the code that Thrift generates reads them, and refused where that code and this
-# could read different things: a column that only pyarrow sees would be bounded by nobody.
+# The file ends with a footer that says where the pages of each column are, and each page begins with a header that
+# says what it becomes. Both are structures in Thrift's compact protocol (apache/parquet-format: parquet.thrift has the
+# numbers of their fields). They are read here as the code that Thrift generates reads them, and refused where that code
+# and this could read different things: a column that only pyarrow sees would be bounded by nobody.
 
-LONGEST_LIST = 1 << 16
-"""The most row groups, columns or other elements that a list in a footer may have: pyarrow makes 1 KB of each."""
-
+_LONGEST_LIST = 1 << 16  # row groups, columns or other elements in a footer: pyarrow makes 1 KB of each
 _I16, _I32, _I64, _BINARY, _LIST, _SET, _STRUCT = 4, 5, 6, 8, 9, 10, 12
 _BITS = {_I16: 16, _I32: 32, _I64: 64}
 _DEEPEST = 32  # structures, lists or groups of columns within each other
@@ -438,7 +426,7 @@ class _Thrift:
     def _list(self, lists: Any, depth: int) -> list[Any]:
         head = self._byte()
         count, kind = self._number() if head >> 4 == 15 else head >> 4, head & 15
-        if count > LONGEST_LIST or (
+        if count > _LONGEST_LIST or (
             count and lists is not None and kind != (_STRUCT if isinstance(lists, dict) else lists)
         ):
             raise ValueError(f"a list of {count} values of kind {kind}")

@@ -24,6 +24,7 @@ __all__ = ["describe", "find", "iterate", "read"]
 _DEEPEST = 64  # folders within each other in which recordings are looked for
 
 _Address = str | PathLike[str]
+_Times = npt.NDArray[np.float64]
 
 
 def read(
@@ -68,8 +69,9 @@ def read(
     `bounds`); MissingLibraryError where it needs a library that is not installed; ChannelCountError where a preset is
     of another sensor; InputError for a clock that is not there.
     """
-    more: dict[str, Any] = {"definitions": definitions or {}, "annotate": tuple(annotate)}
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, **more)
+    request = Request(
+        topic, field, clock, rate, labels, header, delimiter, decimal, None, definitions or {}, tuple(annotate)
+    )
     address = fspath(path)
     with local(address) as place, guarded(address):
         source = _open(place, address, request, preset)
@@ -104,19 +106,15 @@ def iterate(
     with local(address) as place:
         with guarded(address):
             source = _open(place, address, request, preset)
-            blocks = _timed(source, request)
-            name = request.clock
-        first = True
+            blocks, name = _timed(source, request), request.clock
         while True:
             with guarded(address):
                 block = next(blocks, None)
                 if block is None:
                     return
-                name = _clock(block, name) if first else name
+                name = _clock(block, name)
                 recording = _recording(block, source, name, columns)
-            if first:
                 _require(recording, preset)
-            first = False
             yield recording
 
 
@@ -282,9 +280,7 @@ def _require(recording: Recording, name: str | None) -> None:
         )
 
 
-# Blocks as readings with times: which clock to believe, the episodes, and the report of gaps and lost readings.
-
-_Times = npt.NDArray[np.float64]
+# From blocks to readings with times: which clock to believe, the episodes, the report of gaps and lost readings.
 
 
 def choose(clocks: dict[str, _Times], requested: str | None) -> str | None:
@@ -315,30 +311,25 @@ def _is_running(name: str, times: _Times) -> bool:
 def assemble(
     block: Block, clock: str | None, source: Source
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], tuple[Episode, ...], Report]:
-    """Readings, times by this clock, episodes and the report, from one block."""
-    order = _order(block)
-    readings = block.readings if order is None else block.readings[order]
-    clocks = {name: times if order is None else times[order] for name, times in block.clocks.items()}
-    counters = {name: counts if order is None else counts[order] for name, counts in block.counters.items()}
-    numbers = block.episodes if order is None or block.episodes is None else block.episodes[order]
-    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(numbers, source.names)
+    """Readings, times by this clock, episodes and the report, from one block.
+
+    Messages are sorted by the time they were logged, as all players do.
+    """
+    readings, clocks, counters = block.readings, block.clocks, block.counters
+    if "log" in clocks and (np.diff(clocks["log"]) < 0).any():
+        order = np.argsort(clocks["log"], kind="stable")
+        readings = readings[order]
+        clocks = {name: times[order] for name, times in clocks.items()}
+        counters = {name: counts[order] for name, counts in counters.items()}
+    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source.names)
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
-    borders = np.array(begins, np.int64)
     times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
-    return readings, times, episodes, _report(times, clock, counters, borders, unset)
-
-
-def _order(block: Block) -> npt.NDArray[np.int64] | None:
-    """How to sort readings by the time they were logged, as all players do; None where they are."""
-    logged = block.clocks.get("log")
-    if logged is None or not (np.diff(logged) < 0).any():
-        return None
-    return np.argsort(logged, kind="stable")
+    return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
 
 
 def _numbered(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
-    if numbers is None or not len(numbers):
+    if numbers is None:
         return ()
     borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
     return tuple(Episode(begin, end, names.get(int(numbers[begin]))) for begin, end in itertools.pairwise(borders))
@@ -364,7 +355,7 @@ def _report(
     unset: int,
 ) -> Report:
     inside = np.ones(max(len(times) - 1, 0), bool)
-    inside[borders[borders > 0] - 1] = False
+    inside[borders - 1] = False
     found = _lost(counters, borders)
     report = Report(len(times), clock, lost=None if found is None else found[0], unset=unset)
     repeated = 0 if found is None else found[1]

@@ -215,26 +215,20 @@ def _files(path: Path) -> tuple[list[Path], bool]:
     """The files of a recording in their order, and whether its messages are compressed one by one."""
     if not path.is_dir():
         return [path], False
-    there = _parts(path)
-    listed = path / "metadata.yaml"
-    if not listed.exists():
-        for file in there:
-            require_inside(path, file)
-        return there, False
-    about = _listing(path, listed)
-    names = [str(name) for name in about["relative_file_paths"]]
-    if any("\\" in name or Path(name).name in ("", "..") for name in names):
-        raise RecordingError(f"{listed} lists what are no names of files: {names!r:.200}")
-    files = [path / Path(name).name for name in names]
-    absent = [file.name for file in files if not file.exists()]
-    if absent:
+    there = files = _parts(path)
+    listed, compressed = path / "metadata.yaml", False
+    if listed.exists():
+        about = _listing(path, listed)
+        compressed = str(about.get("compression_mode", "")).lower() == "message"
+        files = [path / Path(str(name)).name for name in about["relative_file_paths"]]
+    if absent := [file.name for file in files if not file.exists()]:
         raise RecordingError(
             f"{listed} lists {', '.join(absent)}, which are not there: copy them, or read the parts that are there, "
             f"{', '.join(p.name for p in there) or 'none'}, one by one"
         )
     for file in files:
         require_inside(path, file)
-    return files, str(about.get("compression_mode", "")).lower() == "message"
+    return files, compressed
 
 
 def _listing(path: Path, listed: Path) -> Any:

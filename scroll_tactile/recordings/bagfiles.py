@@ -391,23 +391,18 @@ def scan_db3(path: Path, scan: Scan, *, compressed: bool = False) -> Iterator[Me
         marks = ",".join("?" * len(wanted))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
         try:
-            for number, log, data in base.execute(query, wanted):
-                if not isinstance(data, bytes) or not isinstance(log, int):
+            for number, log, stored in base.execute(query, wanted):
+                if not isinstance(stored, bytes) or not isinstance(log, int):
                     scan.damaged += 1
                     continue
                 budget.work()
+                most = budget.room() + 1
+                data = _zstd().ZstdDecompressor().decompress(stored, max_length=most) if compressed else stored
                 budget.take(len(data))
-                yield Message(channels[number], log, None, None, 0, _inflated(data, budget) if compressed else data)
+                yield Message(channels[number], log, None, None, 0, data)
         except sqlite3.DatabaseError as error:
             budget.work(0)
             scan.cut_off = str(error)
-
-
-def _inflated(data: bytes, budget: Budget) -> bytes:
-    """A message that was compressed by itself, as far as it is there."""
-    result: bytes = _zstd().ZstdDecompressor().decompress(data, max_length=budget.room() + 1)
-    budget.take(len(result))
-    return result
 
 
 def _bound(base: Any, budget: Budget) -> None:

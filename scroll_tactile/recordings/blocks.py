@@ -163,8 +163,7 @@ def floats(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         raise FieldError(f"expected numbers; came values of type {array.dtype}")
     if array.ndim == 4 and array.dtype == np.uint8 and array.shape[3] == 3:
         return array
-    exact = np.can_cast(array.dtype, np.float32, "safe")
-    kind = np.float32 if exact else np.float64
+    kind = np.float32 if np.can_cast(array.dtype, np.float32, "safe") else np.float64
     return array.reshape(len(array), -1).astype(kind, copy=False) if array.ndim != 2 else array.astype(kind, copy=False)
 
 

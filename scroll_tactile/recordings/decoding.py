@@ -50,8 +50,6 @@ class MessageTypes:
         budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)
         try:
             return reader.read(data)
-        except RecordingError:
-            raise
         except Exception as error:
             raise RecordingError(
                 f"a message of topic {channel.topic!r} does not fit its type {channel.type}, and may be damaged: "

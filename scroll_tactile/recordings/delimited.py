@@ -144,9 +144,12 @@ class Delimited(Source):
 
     def _fast(self, lines: list[str]) -> npt.NDArray[np.float64] | None:
         """All numbers at once, by numpy's parser; None where a row needs a closer look."""
-        if self.label is not None or self.delimiter == '"' or len(self.delimiter) != 1:
-            return None
-        if self.delimiter != " " and any(line.count(self.delimiter) != self.width - 1 for line in lines):
+        if (
+            self.label is not None
+            or self.delimiter == '"'
+            or len(self.delimiter) != 1
+            or (self.delimiter != " " and any(line.count(self.delimiter) != self.width - 1 for line in lines))
+        ):
             return None
         if self.request.decimal == ",":
             lines = [line.replace(",", ".") for line in lines]
@@ -226,17 +229,15 @@ class Delimited(Source):
         clock = self.request.clock
         if clock is not None:
             return self._column(clock)
-        if not self.header and not self.comment:
-            return None
-        return next((i for i, name in enumerate(self.columns) if _TIME.fullmatch(name)), None)
+        names = self.columns if self.header or self.comment else []
+        return next((i for i, name in enumerate(names) if _TIME.fullmatch(name)), None)
 
     def _index_column(self, data: list[list[str]]) -> int | None:
         """The first column, where it has no name and counts the rows from 0 or 1."""
         if not self.header or self.columns[0].lower() not in ("", "index", "unnamed: 0") or not data:
             return None
         cells = [cells[0].strip() for cells in data]
-        counts = any(cells == [str(i + first) for i in range(len(cells))] for first in (0, 1))
-        return 0 if counts else None
+        return 0 if any(cells == [str(i + first) for i in range(len(cells))] for first in (0, 1)) else None
 
     def _column(self, name: str) -> int:
         if name in self.columns:

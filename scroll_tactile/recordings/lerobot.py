@@ -153,8 +153,8 @@ class LeRobot(Source):
         if heading.unit is not None:
             return rows[:, 0].astype(np.float64)
         # Of whole numbers some of which are missing pyarrow makes floats.
-        names = ["" if math.isnan(number) else str(number) for number in rows[:, 0].tolist()]
-        return np.array([name.removesuffix(".0") for name in names], object)
+        numbers = rows[:, 0].tolist()
+        return np.array(["" if math.isnan(number) else str(number).removesuffix(".0") for number in numbers], object)
 
     def _opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
@@ -287,8 +287,7 @@ class LeRobot(Source):
             # pandas writes an index without a name under one of its own
             name = next((name for name in file.schema_arrow.names if name != "task_index"), None)
             table = self._table(file, ["task_index"], name)
-        indices, texts = table["task_index"], table.get(name or "", [])
-        return {int(i): str(text) for i, text in zip(indices, texts, strict=False)}
+        return {int(i): str(text) for i, text in zip(table["task_index"], table.get(name or "", []), strict=False)}
 
 
 # What the pages of a parquet file claim to hold, looked at before pyarrow is: it allocates whatever they claim.
@@ -421,7 +420,11 @@ class _Thrift:
             return self._list(lists[0] if isinstance(lists, list) else None, depth + 1)
         if kind not in (1, 2, 3, 7, _BINARY):
             raise ValueError(f"a value of kind {kind}")
-        return self._bytes(self._number() if kind == _BINARY else 8 if kind == 7 else 1)
+        count = self._number() if kind == _BINARY else 8 if kind == 7 else 1
+        self.at += count
+        if self.at > len(self.data):
+            raise IndexError(f"{count} bytes of a value, more than there are")
+        return self.data[self.at - count : self.at]
 
     def _list(self, lists: Any, depth: int) -> list[Any]:
         head = self._byte()
@@ -435,12 +438,6 @@ class _Thrift:
     def _byte(self) -> int:
         self.at += 1
         return self.data[self.at - 1]
-
-    def _bytes(self, count: int) -> bytes:
-        self.at += count
-        if self.at > len(self.data):
-            raise IndexError(f"{count} bytes of a value, more than there are")
-        return self.data[self.at - count : self.at]
 
     def _number(self) -> int:
         value = shift = 0

@@ -295,9 +295,8 @@ def choose(clocks: dict[str, _Times], requested: str | None) -> str | None:
             )
         return requested
     for name, times in clocks.items():
-        if name not in {"device", "header"}:
-            return name
-        if len(times) and np.isfinite(times).all() and _is_running(name, times):
+        seen = len(times) and np.isfinite(times).all()
+        if name not in {"device", "header"} or (seen and _is_running(name, times)):
             return name
     return None
 
@@ -356,9 +355,8 @@ def _report(
 ) -> Report:
     inside = np.ones(max(len(times) - 1, 0), bool)
     inside[borders - 1] = False
-    found = _lost(counters, borders)
-    report = Report(len(times), clock, lost=None if found is None else found[0], unset=unset)
-    repeated = 0 if found is None else found[1]
+    missing, repeated = _lost(counters, borders)
+    report = Report(len(times), clock, lost=missing, unset=unset)
     steps = np.diff(times)
     if not (np.isfinite(steps) & inside).any():
         return replace(report, repeated=repeated)
@@ -377,7 +375,7 @@ def _report(
     )
 
 
-def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int, int] | None:
+def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
     """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
     single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
     for name in ("message", "sequence"):
@@ -387,7 +385,7 @@ def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.in
             continue  # it counts all topics, so that nobody knows whose messages are lost
         found = [lost(part) for part in np.split(counters[name], borders)]
         return sum(missing for missing, _ in found), sum(repeated for _, repeated in found)
-    return None
+    return None, 0
 
 
 def lost(counts: npt.NDArray[np.int64]) -> tuple[int, int]:

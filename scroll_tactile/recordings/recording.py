@@ -166,24 +166,17 @@ def resampled(recording: Recording, rate: float) -> Recording:
             f"{recording.source} has annotations, one a reading: take resample=, or annotate=, not both",
             argument="resample annotate",
         )
-    parts, times, episodes = [], [], []
     borders = sorted({0, len(recording), *(e.begin for e in recording.episodes), *(e.end for e in recording.episodes)})
-    starts = {}
-    done = 0
-    for begin, end in itertools.pairwise(borders):
-        grid, values = _line(recording.times[begin:end], recording.readings[begin:end], rate)
-        parts.append(values)
-        times.append(grid)
-        starts[begin] = done, done + len(grid)
-        done += len(grid)
-    for episode in recording.episodes:
-        inside = [span for begin, span in starts.items() if episode.begin <= begin < episode.end]
-        episodes.append(Episode(inside[0][0], inside[-1][1], episode.name))
-    readings = np.concatenate(parts) if parts else recording.readings
+    spans = itertools.pairwise(borders)
+    lines = [_line(recording.times[begin:end], recording.readings[begin:end], rate) for begin, end in spans]
+    lengths = itertools.accumulate((len(grid) for grid, _ in lines), initial=0)
+    begins = dict(zip(borders, lengths, strict=True))
+    episodes = tuple(Episode(begins[e.begin], begins[e.end], e.name) for e in recording.episodes)
+    readings = np.concatenate([values for _, values in lines]) if lines else recording.readings
     note = f"resampled to {rate:g} Hz, linear in time, from {len(recording)} readings"
     report = replace(recording.report, readings=len(readings), resampled=note)
-    all_times = np.concatenate(times) if times else recording.times
-    return replace(recording, readings=readings, times=all_times, episodes=tuple(episodes), report=report)
+    times = np.concatenate([grid for grid, _ in lines]) if lines else recording.times
+    return replace(recording, readings=readings, times=times, episodes=episodes, report=report)
 
 
 def _line(

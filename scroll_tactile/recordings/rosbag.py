@@ -425,12 +425,10 @@ def _first(decoded: Any, texts: list[str], counts: bool = False) -> tuple[str, F
         if name.lower() not in names[before]:
             continue
         path = FieldPath(text)
-        try:
+        with suppress(FieldError):
             value = _stamp(path, decoded)
-        except FieldError:
-            continue
-        if not counts or isinstance(value, int):
-            return text, path
+            if not counts or isinstance(value, int):
+                return text, path
     return None
 
 

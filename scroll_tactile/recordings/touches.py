@@ -174,8 +174,7 @@ def _same(file: str, source: str) -> bool:
     """Whether a file in a table is this one: its path ends alike, part by part; a suffix may be left out."""
     given, place = PurePosixPath(file.replace("\\", "/")), _place(source)
     parts = [part for part in given.parts if part not in (".", "..")]
-    ending = place.parts[-len(parts) :]
-    alike = tuple(parts[:-1]) == ending[:-1] and bool(parts)
+    alike = bool(parts) and tuple(parts[:-1]) == place.parts[-len(parts) : -1]
     return alike and parts[-1] in (place.name, place.stem)
 
 

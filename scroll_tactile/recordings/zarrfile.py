@@ -49,9 +49,8 @@ _WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
 def is_zarr(path: Path) -> bool:
     """Whether this is a Zarr group, as a folder or a zip of one."""
-    if path.is_dir():
-        return any((path / name).exists() for name in _DESCRIPTIONS)
-    return path.name.lower().endswith(".zarr.zip")
+    there = (path / name for name in _DESCRIPTIONS)
+    return any(file.exists() for file in there) if path.is_dir() else path.name.lower().endswith(".zarr.zip")
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,21 +345,13 @@ class _Files(ABC):
 
 
 class _Folder(_Files):
-    def __init__(self, path: Path, budget: Budget) -> None:
-        super().__init__(path, budget)
-        self._folders: set[str] = set()
-
     def inside(self, key: str) -> list[str]:
         with os.scandir(self.path / key) as entries:
             return sorted(entry.name for entry in entries if entry.is_dir(follow_symlinks=False))
 
     def find(self, key: str) -> bool:
-        for folder in itertools.accumulate(key.split("/")[:-1], "{}/{}".format):
-            if folder not in self._folders:
-                if not self._is(folder, stat.S_ISDIR):
-                    return False
-                self._folders.add(folder)
-        return self._is(key, stat.S_ISREG)
+        folders = itertools.accumulate(key.split("/")[:-1], "{}/{}".format)
+        return all(self._is(folder, stat.S_ISDIR) for folder in folders) and self._is(key, stat.S_ISREG)
 
     def _is(self, key: str, kind: Any) -> bool:
         try:

@@ -163,8 +163,7 @@ def floats(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         raise FieldError(f"expected numbers; came values of type {array.dtype}")
     if array.ndim == 4 and array.dtype == np.uint8 and array.shape[3] == 3:
         return array
-    exact = np.can_cast(array.dtype, np.float32, "safe")
-    kind = np.float32 if exact else np.float64
+    kind = np.float32 if np.can_cast(array.dtype, np.float32, "safe") else np.float64
     return array.reshape(len(array), -1).astype(kind, copy=False) if array.ndim != 2 else array.astype(kind, copy=False)
 
 
@@ -177,8 +176,6 @@ def guarded(path: str) -> Iterator[None]:
         text = str(error)
         if len(text) > _MESSAGE:  # names and definitions in a file may have any length
             error.args = (f"{text[:_MESSAGE]} …",)
-        raise
-    except GeneratorExit:
         raise
     except MemoryError as error:
         raise RecordingError(f"{path} claims to hold more than fits into memory, and may be damaged") from error

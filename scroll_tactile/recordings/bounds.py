@@ -84,9 +84,7 @@ class Budget:
 
 def stored_bytes(path: Path) -> int:
     """The bytes that a file has on the disk, holes left out; raises RecordingError for what is no file."""
-    about = path.stat()
-    _require_regular(about, path)
-    return on_disk(about)
+    return on_disk(require_file(path))
 
 
 def on_disk(about: os.stat_result) -> int:
@@ -94,9 +92,14 @@ def on_disk(about: os.stat_result) -> int:
     return min(about.st_size, 512 * getattr(about, "st_blocks", 0) or about.st_size)
 
 
-def require_file(path: Path) -> None:
+def require_file(path: Path) -> os.stat_result:
     """Raises RecordingError for what is no file: opening a FIFO or a device waits for ever, or changes something."""
-    _require_regular(path.stat(), path)
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        kinds = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "folder": stat.S_ISDIR}
+        kind = next((kind for kind, of in kinds.items() if of(about.st_mode)), "device")
+        raise RecordingError(f"{path} is a {kind}; expected a file. It was passed over")
+    return about
 
 
 def require_inside(folder: Path, path: Path) -> None:
@@ -114,10 +117,3 @@ def read_text(folder: Path, path: Path, most: int) -> str:
     if len(data) > most:
         raise RecordingError(f"{path} has more than {most} bytes; expected less of what describes a recording")
     return data.decode()
-
-
-def _require_regular(about: os.stat_result, path: Path) -> None:
-    if not stat.S_ISREG(about.st_mode):
-        kinds = {"FIFO": stat.S_ISFIFO, "socket": stat.S_ISSOCK, "folder": stat.S_ISDIR}
-        kind = next((kind for kind, of in kinds.items() if of(about.st_mode)), "device")
-        raise RecordingError(f"{path} is a {kind}; expected a file. It was passed over")

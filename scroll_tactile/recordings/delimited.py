@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import fnmatch
+import itertools
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -77,8 +78,11 @@ class Delimited(Source):
             raise RecordingError(
                 f"expected a decimal point or comma, decimal='.' or ','; came {request.decimal!r}", argument="decimal"
             )
+        self.comment = ""
         with self._text() as file:
-            self.comment, lines = self._first_lines(file)
+            lines = list(itertools.islice(self._lines(file), _SEEN))
+        if not lines:
+            raise RecordingError(f"expected readings in {address}, one row each; there are none")
         self.delimiter = request.delimiter or _delimiter([line for _, line in lines], request.decimal)
         rows = [(number, self._cells(line, number)) for number, line in lines]
         self.width = len(rows[0][1])
@@ -109,19 +113,10 @@ class Delimited(Source):
         most = rows_of(8 * self.width)
         episode, label = 0, None
         with self._text() as file:
-            skipped = not self.header
-            batch: list[tuple[int, str]] = []
-            for number, line in self._lines(file):
-                if not skipped:
-                    skipped = True
-                    continue
-                batch.append((number, line))
-                if len(batch) == most:
-                    block, episode, label = self._block(batch, episode, label)
-                    yield block
-                    batch = []
-            if batch:
-                yield self._block(batch, episode, label)[0]
+            lines = itertools.islice(self._lines(file), int(self.header), None)
+            while batch := list(itertools.islice(lines, most)):
+                block, episode, label = self._block(batch, episode, label)
+                yield block
 
     def _block(self, batch: list[tuple[int, str]], episode: int, label: str | None) -> tuple[Block, int, str | None]:
         table = self._fast([line for _, line in batch])
@@ -149,9 +144,12 @@ class Delimited(Source):
 
     def _fast(self, lines: list[str]) -> npt.NDArray[np.float64] | None:
         """All numbers at once, by numpy's parser; None where a row needs a closer look."""
-        if self.label is not None or self.delimiter == '"' or len(self.delimiter) != 1:
-            return None
-        if self.delimiter != " " and any(line.count(self.delimiter) != self.width - 1 for line in lines):
+        if (
+            self.label is not None
+            or self.delimiter == '"'
+            or len(self.delimiter) != 1
+            or (self.delimiter != " " and any(line.count(self.delimiter) != self.width - 1 for line in lines))
+        ):
             return None
         if self.request.decimal == ",":
             lines = [line.replace(",", ".") for line in lines]
@@ -203,9 +201,8 @@ class Delimited(Source):
     def _in_seconds(self, times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """By the unit in the column's name, or as milli-, micro- or nanoseconds since 1970 by their size."""
         match = _TIME.fullmatch(self.columns[self.time or 0])
-        unit = match.group(1).lower() if match and match.group(1) else None
-        if unit is not None:
-            return times / _UNITS.get(unit, 1.0)
+        if match and match[1]:
+            return times / _UNITS.get(match[1].lower(), 1.0)
         largest = float(np.nanmax(np.abs(times), initial=0.0))
         return times / next((factor for size, factor in ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3)) if largest > size), 1.0)
 
@@ -214,39 +211,33 @@ class Delimited(Source):
             return self.request.header
         first = rows[0][1]
         text = [cell for cell in first if not is_number(cell) and not is_missing(cell)]
-        decimal = self.request.decimal == "." and [cell for cell in text if is_number(cell.replace(",", "."))]
-        if decimal:
-            self.columns = [str(i) for i in range(self.width)]
-            self._value(decimal[0], rows[0][0], first.index(decimal[0]))
+        odd = [cell for cell in text if self.request.decimal == "." and is_number(cell.replace(",", "."))]
         numbers = [cell.strip() for cell in first if is_number(cell)]
         counted = numbers == [str(i) for i in range(len(numbers))]
-        if text:
-            if numbers and not counted and len(text) < len(numbers):
-                self.columns = [str(i) for i in range(self.width)]
-                self._value(text[0], rows[0][0], first.index(text[0]))
-            return True
-        if not numbers or not counted:
-            return False
+        if not odd and not counted and len(text) < len(numbers):
+            odd = text
+        if odd:
+            self.columns = [str(i) for i in range(self.width)]
+            self._value(odd[0], rows[0][0], first.index(odd[0]))  # says what is wrong with it
+        if text or not numbers or not counted:
+            return bool(text)
         # One or two cells may be a reading of 0 and 1: there the rows below have to look otherwise.
         below = rows[1][1] if len(rows) > 1 else []
-        return len(numbers) >= 3 or "" in (first[0].strip(),) or any("." in cell for cell in below)
+        return len(numbers) >= 3 or not first[0].strip() or any("." in cell for cell in below)
 
     def _time_column(self) -> int | None:
         clock = self.request.clock
         if clock is not None:
             return self._column(clock)
-        if not self.header and not self.comment:
-            return None
-        found = [i for i, name in enumerate(self.columns) if _TIME.fullmatch(name)]
-        return found[0] if found else None
+        names = self.columns if self.header or self.comment else []
+        return next((i for i, name in enumerate(names) if _TIME.fullmatch(name)), None)
 
     def _index_column(self, data: list[list[str]]) -> int | None:
         """The first column, where it has no name and counts the rows from 0 or 1."""
         if not self.header or self.columns[0].lower() not in ("", "index", "unnamed: 0") or not data:
             return None
         cells = [cells[0].strip() for cells in data]
-        counts = any(cells == [str(i + first) for i in range(len(cells))] for first in (0, 1))
-        return 0 if counts else None
+        return 0 if any(cells == [str(i + first) for i in range(len(cells))] for first in (0, 1)) else None
 
     def _column(self, name: str) -> int:
         if name in self.columns:
@@ -256,8 +247,7 @@ class Delimited(Source):
         raise FieldError(f"{self.address} has no column {name!r}{nearest(name, self.columns)}")
 
     def _chosen(self) -> list[int]:
-        left_out = (self.time, self.index, self.label)
-        rest = [i for i in range(self.width) if i not in left_out]
+        rest = [i for i in range(self.width) if i not in (self.time, self.index, self.label)]
         if self.request.field is None:
             if not rest:
                 raise RecordingError(f"{self.address} has no column of numbers besides its times, index and labels")
@@ -266,11 +256,10 @@ class Delimited(Source):
         for part in self.request.field.split(","):
             name = part.strip()
             first, mark, last = name.partition(":")
-            if name in self.columns:
+            if mark and name not in self.columns:
+                chosen.extend(range(self._column(first.strip()), self._column(last.strip()) + 1))
+            elif name in self.columns:
                 chosen.append(self._column(name))
-            elif mark:
-                low, high = self._column(first.strip()), self._column(last.strip())
-                chosen.extend(range(low, high + 1))
             else:
                 matching = [i for i in rest if fnmatch.fnmatchcase(self.columns[i], name)]
                 chosen.extend(matching or [self._column(name)])
@@ -303,17 +292,6 @@ class Delimited(Source):
                 self.comment = line.lstrip("#").strip()
             elif line.strip():
                 yield number, line
-
-    def _first_lines(self, file: TextIO) -> tuple[str, list[tuple[int, str]]]:
-        self.comment = ""
-        lines: list[Any] = []
-        for line in self._lines(file):
-            lines.append(line)
-            if len(lines) == _SEEN:
-                break
-        if not lines:
-            raise RecordingError(f"expected readings in {self.address}, one row each; there are none")
-        return self.comment, lines
 
 
 def _delimiter(lines: list[str], decimal: str) -> str:

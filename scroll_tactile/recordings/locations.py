@@ -14,7 +14,7 @@ from scroll_tactile.libraries import missing
 
 __all__ = ["file_system", "is_remote", "local"]
 
-_MOST_FILES, _DEEPEST = 1_000_000, 16  # of a folder: chunks of a replay buffer are files
+_DEEPEST = 16  # folders within each other
 
 
 def is_remote(address: str) -> bool:
@@ -71,7 +71,7 @@ def _copied(address: str, folder: Path) -> Path:
         if about.get("type", "file") != "file":
             raise RecordingError(f"{address} is of type {about['type']!r:.40}; expected a file or a folder")
         _require_room(about.get("size") or 0, folder, address)
-        files.get_file(path, str(target), callback=_meter(folder, address))
+        files.get_file(path, str(target))
     except RecordingError:
         raise
     except FileNotFoundError as error:
@@ -84,8 +84,6 @@ def _copied(address: str, folder: Path) -> Path:
 def _copied_folder(files: Any, root: str, target: Path, address: str) -> Path:
     """The files of a folder below `target`. Whoever may write there names them: no name of theirs leads out of it."""
     there = files.find(root, maxdepth=_DEEPEST, detail=True)
-    if len(there) > _MOST_FILES:
-        raise RecordingError(f"{address} has {len(there)} files; expected at most {_MOST_FILES}")
     places: dict[str, Path] = {}
     for name in there:
         inside = str(name).removeprefix(f"{root}/")
@@ -93,16 +91,10 @@ def _copied_folder(files: Any, root: str, target: Path, address: str) -> Path:
             raise RecordingError(f"{address} lists {name!r:.200}, which does not lie in it")
         if inside and not inside.endswith("/"):  # as some programs mark a folder
             places[name] = target.joinpath(*(_named(part, address) for part in inside.split("/")))
-    sizes = [there[name].get("size") for name in places]
-    _require_room(sum(size or 0 for size in sizes), target.parent, address)
+    _require_room(sum(there[name].get("size") or 0 for name in places), target.parent, address)
     for place in places.values():
         place.parent.mkdir(parents=True, exist_ok=True)
-    if all(size is not None for size in sizes):
-        files.get(list(places), [str(place) for place in places.values()])  # many at once, where it can
-        return target
-    meter = _meter(target.parent, address)
-    for name, place in places.items():
-        files.get_file(name, str(place), callback=meter)
+    files.get(list(places), [str(place) for place in places.values()])  # many at once, where it can
     return target
 
 
@@ -122,17 +114,3 @@ def _require_room(size: int, folder: Path, address: str) -> None:
             f"{address} holds {size} bytes, and {free} are free where it would be copied to, {folder.parent}: set "
             "TMPDIR to a folder with more room, or fetch it in parts"
         )
-
-
-def _meter(folder: Path, address: str) -> Any:
-    """What stops a copy where there is no room left, of what does not say how long it is."""
-    import fsspec
-
-    most = shutil.disk_usage(folder).free
-
-    class Meter(fsspec.Callback):  # type: ignore[misc]  # it ships no types
-        def call(self, *_: Any, **__: Any) -> None:
-            if self.value > most:
-                raise RecordingError(f"{address} holds more than the {most} bytes that are free in {folder.parent}")
-
-    return Meter()

@@ -8,6 +8,7 @@ sensor sends in use, a `Sensor` of one's own with the range seen resolves more.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 from scroll_tactile.errors import FieldError, InputError
@@ -105,10 +106,8 @@ def fields_for(kind: str, message: object) -> list[tuple[str, tuple[int, ...]]]:
     texts = [preset.field for preset in PRESETS.values() if _short(kind) in preset.types]
     found = {}
     for text in (*texts, *_ALSO.get(_short(kind), ())):
-        try:
+        with suppress(FieldError):
             found[text] = FieldPath(text).reading(message).shape
-        except FieldError:
-            continue
     return list(found.items())
 
 

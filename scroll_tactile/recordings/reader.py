@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike, fspath
@@ -9,20 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from scroll_tactile.errors import ChannelCountError, InputError, RecordingError
 from scroll_tactile.recordings import presets
-from scroll_tactile.recordings.assembly import assemble, choose
 from scroll_tactile.recordings.blocks import Block, Contents, Request, Source, guarded
 from scroll_tactile.recordings.bounds import require_file
 from scroll_tactile.recordings.locations import local
-from scroll_tactile.recordings.recording import Recording, only_columns, resampled
+from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report, longest_step, only_columns, resampled
 
 __all__ = ["describe", "find", "iterate", "read"]
 
 _DEEPEST = 64  # folders within each other in which recordings are looked for
 
 _Address = str | PathLike[str]
+_Times = npt.NDArray[np.float64]
 
 
 def read(
@@ -67,8 +69,9 @@ def read(
     `bounds`); MissingLibraryError where it needs a library that is not installed; ChannelCountError where a preset is
     of another sensor; InputError for a clock that is not there.
     """
-    more: dict[str, Any] = {"definitions": definitions or {}, "annotate": tuple(annotate)}
-    request = Request(topic, field, clock, rate, labels, header, delimiter, decimal, **more)
+    request = Request(
+        topic, field, clock, rate, labels, header, delimiter, decimal, None, definitions or {}, tuple(annotate)
+    )
     address = fspath(path)
     with local(address) as place, guarded(address):
         source = _open(place, address, request, preset)
@@ -103,19 +106,15 @@ def iterate(
     with local(address) as place:
         with guarded(address):
             source = _open(place, address, request, preset)
-            blocks = _timed(source, request)
-            name = request.clock
-        first = True
+            blocks, name = _timed(source, request), request.clock
         while True:
             with guarded(address):
                 block = next(blocks, None)
                 if block is None:
                     return
-                name = _clock(block, name) if first else name
+                name = _clock(block, name)
                 recording = _recording(block, source, name, columns)
-            if first:
                 _require(recording, preset)
-            first = False
             yield recording
 
 
@@ -144,7 +143,7 @@ def find(path: _Address) -> list[Path]:
 
 
 def _found(place: Path, depth: int) -> list[Path]:
-    from scroll_tactile.recordings.ros import rosbag
+    from scroll_tactile.recordings import rosbag
 
     bags_alone = place.is_dir() and not (place / "metadata.yaml").exists() and rosbag.is_rosbag(place)
     if _kind(place) is not None and not bags_alone:
@@ -193,9 +192,7 @@ def _open(path: Path, address: str, request: Request, preset: str | None = None)
 
 
 def _kind(path: Path) -> type[Source] | None:
-    from scroll_tactile.recordings import delimited
-    from scroll_tactile.recordings.arrays import arraystores, lerobot, zarrfile
-    from scroll_tactile.recordings.ros import rosbag
+    from scroll_tactile.recordings import arraystores, delimited, lerobot, rosbag, zarrfile
 
     if rosbag.is_rosbag(path):
         return rosbag.RosBag
@@ -281,3 +278,128 @@ def _require(recording: Recording, name: str | None) -> None:
             + f". {recording.cure(sensor)}",
             argument="columns",
         )
+
+
+# From blocks to readings with times: which clock to believe, the episodes, the report of gaps and lost readings.
+
+
+def choose(clocks: dict[str, _Times], requested: str | None) -> str | None:
+    """The name of the clock to use: the one requested, or the first that runs; None where there is none.
+
+    Raises InputError for a clock that the recording does not have.
+    """
+    if requested is not None:
+        if requested not in clocks:
+            raise InputError(
+                f"expected a clock of this recording, {', '.join(clocks) or 'it has none'}; came {requested!r}"
+            )
+        return requested
+    for name, times in clocks.items():
+        seen = len(times) and np.isfinite(times).all()
+        if name not in {"device", "header"} or (seen and _is_running(name, times)):
+            return name
+    return None
+
+
+def _is_running(name: str, times: _Times) -> bool:
+    if len(times) == 1 or name == "header":
+        return bool((times != 0).all())  # a header that nobody filled in is zero
+    return bool(np.ptp(times) > 0)  # a device's clock may begin at zero
+
+
+def assemble(
+    block: Block, clock: str | None, source: Source
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.float64], tuple[Episode, ...], Report]:
+    """Readings, times by this clock, episodes and the report, from one block.
+
+    Messages are sorted by the time they were logged, as all players do.
+    """
+    readings, clocks, counters = block.readings, block.clocks, block.counters
+    if "log" in clocks and (np.diff(clocks["log"]) < 0).any():
+        order = np.argsort(clocks["log"], kind="stable")
+        readings = readings[order]
+        clocks = {name: times[order] for name, times in clocks.items()}
+        counters = {name: counts[order] for name, counts in counters.items()}
+    episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source.names)
+    begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
+    times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
+    unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
+    return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
+
+
+def _numbered(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
+    if numbers is None:
+        return ()
+    borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
+    return tuple(Episode(begin, end, names.get(int(numbers[begin]))) for begin, end in itertools.pairwise(borders))
+
+
+def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> tuple[Episode, ...]:
+    """A label holds from its message to the next; an empty one ends it, and the same again goes on with it."""
+    kept: list[tuple[float, str]] = []
+    for seconds, text in sorted(marks, key=lambda mark: mark[0]):
+        if not kept or kept[-1][1] != text.strip():
+            kept.append((seconds, text.strip()))
+    begins = np.searchsorted(logged, [seconds for seconds, _ in kept])
+    ends = [*begins[1:].tolist(), len(logged)]
+    spans = zip(begins.tolist(), ends, kept, strict=True)
+    return tuple(Episode(begin, end, text) for begin, end, (_, text) in spans if text and end > begin)
+
+
+def _report(
+    times: npt.NDArray[np.float64],
+    clock: str | None,
+    counters: dict[str, npt.NDArray[np.int64]],
+    borders: npt.NDArray[np.int64],
+    unset: int,
+) -> Report:
+    inside = np.ones(max(len(times) - 1, 0), bool)
+    inside[borders - 1] = False
+    missing, repeated = _lost(counters, borders)
+    report = Report(len(times), clock, lost=missing, unset=unset)
+    steps = np.diff(times)
+    if not (np.isfinite(steps) & inside).any():
+        return replace(report, repeated=repeated)
+    steps[~inside] = np.nan
+    forward = steps[steps > 0]
+    middle = float(np.median(forward)) if len(forward) else 0.0
+    longest = longest_step(middle)
+    regular = forward[forward <= min(longest, 2 * middle)]
+    return replace(
+        report,
+        rate=1 / middle if middle > 0 else None,
+        jitter=float(regular.std()) if len(regular) else None,
+        gaps=tuple(Gap(int(i) + 1, float(steps[i])) for i in np.flatnonzero(steps > longest)),
+        repeated=repeated or int(np.count_nonzero(steps == 0)),
+        backward=int(np.count_nonzero(steps < 0)),
+    )
+
+
+def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
+    """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
+    single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
+    for name in ("message", "sequence"):
+        if name not in counters or len(counters[name]) < 2 or 2 * single[name] < len(counters[name]) - 1:
+            continue  # what seldom goes on by one is no counter
+        if name == "sequence" and single["all"] > single[name]:
+            continue  # it counts all topics, so that nobody knows whose messages are lost
+        found = [lost(part) for part in np.split(counters[name], borders)]
+        return sum(missing for missing, _ in found), sum(repeated for _, repeated in found)
+    return None, 0
+
+
+def lost(counts: npt.NDArray[np.int64]) -> tuple[int, int]:
+    """How many readings a counter says were lost, and how many came again.
+
+    A counter of 8, 16 or 32 bits wraps; one that goes back anywhere else has begun anew.
+    """
+    steps = np.diff(counts)
+    for bits in (8, 16, 32):
+        wraps = (
+            (steps < 0)
+            & (counts[:-1] >= 2**bits - 2**bits // 8)
+            & (counts[:-1] < 2**bits)
+            & (counts[1:] < 2**bits // 8)
+        )
+        steps[wraps] += 2**bits
+    return int((steps[steps > 1] - 1).sum()), int(np.count_nonzero(steps == 0))

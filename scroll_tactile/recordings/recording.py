@@ -166,26 +166,17 @@ def resampled(recording: Recording, rate: float) -> Recording:
             f"{recording.source} has annotations, one a reading: take resample=, or annotate=, not both",
             argument="resample annotate",
         )
-    whole = [Episode(0, len(recording))] if len(recording) else []
-    parts, times, episodes = [], [], []
     borders = sorted({0, len(recording), *(e.begin for e in recording.episodes), *(e.end for e in recording.episodes)})
-    starts = {}
-    pieces = itertools.pairwise(borders) if recording.episodes else ((e.begin, e.end) for e in whole)
-    done = 0
-    for begin, end in pieces:
-        grid, values = _line(recording.times[begin:end], recording.readings[begin:end], rate)
-        parts.append(values)
-        times.append(grid)
-        starts[begin] = done, done + len(grid)
-        done += len(grid)
-    for episode in recording.episodes:
-        inside = [span for begin, span in starts.items() if episode.begin <= begin < episode.end]
-        episodes.append(Episode(inside[0][0], inside[-1][1], episode.name))
-    readings = np.concatenate(parts) if parts else recording.readings
+    spans = itertools.pairwise(borders)
+    lines = [_line(recording.times[begin:end], recording.readings[begin:end], rate) for begin, end in spans]
+    lengths = itertools.accumulate((len(grid) for grid, _ in lines), initial=0)
+    begins = dict(zip(borders, lengths, strict=True))
+    episodes = tuple(Episode(begins[e.begin], begins[e.end], e.name) for e in recording.episodes)
+    readings = np.concatenate([values for _, values in lines]) if lines else recording.readings
     note = f"resampled to {rate:g} Hz, linear in time, from {len(recording)} readings"
     report = replace(recording.report, readings=len(readings), resampled=note)
-    all_times = np.concatenate(times) if times else recording.times
-    return replace(recording, readings=readings, times=all_times, episodes=tuple(episodes), report=report)
+    times = np.concatenate([grid for grid, _ in lines]) if lines else recording.times
+    return replace(recording, readings=readings, times=times, episodes=episodes, report=report)
 
 
 def _line(
@@ -212,8 +203,8 @@ def _line(
 
 def require_columns(columns: str) -> list[re.Match[str]]:
     """The parts of a text that names columns. Raises FieldError for one that does not."""
-    parts = [_PART.fullmatch(part.strip()) for part in columns.split(",")]
-    found = [part for part in parts if part is not None]
+    parts = columns.split(",")
+    found = [match for part in parts if (match := _PART.fullmatch(part.strip()))]
     if len(found) < len(parts):
         raise FieldError(
             f"expected columns such as 25:44 or 0,3,5:9, counted from 0; came {columns!r:.80}", argument="columns"

@@ -87,9 +87,11 @@ def touches(recording: Recording, cut: Cut = "whole", label: Label = None) -> tu
             raise InputError(f"expected cut 'whole', 'episodes', intervals or a function; came {cut!r}")
         if cut == "episodes" and not recording.episodes:
             raise InputError(f"{recording.source} has no episodes: cut it by intervals=, or not", argument="intervals")
-        spans = recording.episodes if cut == "episodes" else (Episode(0, len(recording), _only(recording)),)
+        names = {episode.name for episode in recording.episodes}
+        whole = Episode(0, len(recording), names.pop() if len(names) == 1 else None)
+        spans = recording.episodes if cut == "episodes" else (whole,)
     elif callable(cut):
-        spans = tuple(Episode(begin, end, _during(recording, begin, end)) for begin, end in cut(recording))
+        spans = tuple(Episode(begin, end, _during(recording, (begin + end) // 2)) for begin, end in cut(recording))
         for span in spans:
             if not 0 <= span.begin < span.end <= len(recording):
                 raise InputError(f"a cut gave readings {span.begin} to {span.end} of {len(recording)}")
@@ -127,22 +129,15 @@ def _label(recording: Recording, span: Episode, label: Label) -> str | None:
     return name.strip()
 
 
+def _during(recording: Recording, middle: int) -> str | None:
+    """The name of the episode in which the middle of a span lies."""
+    return next((e.name for e in recording.episodes if e.begin <= middle < e.end), None)
+
+
 def _place(source: str) -> PurePosixPath:
     if "://" in source:
         return PurePosixPath(source.partition("://")[2])
     return PurePosixPath(Path(source).resolve().as_posix())
-
-
-def _only(recording: Recording) -> str | None:
-    """The name of all episodes, where they have the same."""
-    names = {episode.name for episode in recording.episodes}
-    return names.pop() if len(names) == 1 else None
-
-
-def _during(recording: Recording, begin: int, end: int) -> str | None:
-    """The name of the episode in which the middle of a span lies."""
-    middle = (begin + end) // 2
-    return next((e.name for e in recording.episodes if e.begin <= middle < e.end), None)
 
 
 def _of_intervals(recording: Recording, mine: Sequence[Interval], intervals: Sequence[Interval]) -> tuple[Episode, ...]:
@@ -179,8 +174,7 @@ def _same(file: str, source: str) -> bool:
     """Whether a file in a table is this one: its path ends alike, part by part; a suffix may be left out."""
     given, place = PurePosixPath(file.replace("\\", "/")), _place(source)
     parts = [part for part in given.parts if part not in (".", "..")]
-    ending = place.parts[-len(parts) :]
-    alike = tuple(parts[:-1]) == ending[:-1] and bool(parts)
+    alike = bool(parts) and tuple(parts[:-1]) == place.parts[-len(parts) : -1]
     return alike and parts[-1] in (place.name, place.stem)
 
 

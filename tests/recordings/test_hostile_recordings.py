@@ -4,7 +4,6 @@ import os
 import shutil
 import sys
 import tracemalloc
-import zlib
 
 import bags
 import fsspec
@@ -12,21 +11,18 @@ import h5py
 import numpy as np
 import pytest
 import zarr
-from faults.parquet_attacks import PARQUETS
 from faults.recording_attacks import ATTACKS, RAN, SECRET
 from made import CODECS, FORMATS, SKIN, TIP, buffer, hdf5, lerobot, ros
 from numcodecs import Blosc
 
 from scroll_tactile.errors import FieldError, MissingLibraryError, RecordingError
-from scroll_tactile.recordings import bounds, describe, find, iterate, read
-from scroll_tactile.recordings.arrays import zarrfile
-from scroll_tactile.recordings.ros import decoding
+from scroll_tactile.recordings import bounds, decoding, describe, find, iterate, read, zarrfile
 
 # How they are refused, where that says more than that they are.
 SAID = {
     "R1 pickled ends": r"meta/episode_ends cannot be read: .*its data type is '\|O'; expected numbers",
     "R1 pickle that compresses": "it is compressed by 'pickle'; expected one of blosc",
-    "R2 copied from behind the frame": "a Blosc frame .* of 77840 bytes .* stands in 20 bytes",
+    "R2 copied from behind the frame": "a Blosc frame of 20 bytes claims to be another, or not to hold 77824",
     "R2 a chunk that is a link": "is a link; a Zarr group is made of files and folders",
     "R3 external storage": "lie in other files",
     "R3 virtual": r"lie in other data sets \(it is virtual\)",
@@ -54,12 +50,16 @@ SAID = {
     "R7 yaml: aliases": "has aliases, which no recorder writes",
     "R7 bag: a part elsewhere": "leads out of its recording",
     "R7 lerobot: names by width": "expected chunk_index and file_index",
+    "R7 lerobot: a page behind its column": "ends at 4072, its column at 92",
+    "R7 lerobot: a page of too few": "a column of 1 values has 0 in its pages",
+    "R7 lerobot: many row groups": "a list of 1000000 values of kind 12",
+    "R7 lerobot: texts for numbers": "holds string; expected numbers",
 }
 ENDLESS = ("R7 mcap: equal messages", "R7 mcap: equal messages of nobody")
 
 
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning", "ignore::UserWarning")
-@pytest.mark.parametrize("name", [name for name in ATTACKS if name.removeprefix("R7 lerobot: ") not in PARQUETS])
+@pytest.mark.parametrize("name", ATTACKS)
 def test_what_was_made_to_harm_is_refused(tmp_path, monkeypatch, name):
     if name in ENDLESS:  # `faults/recorded.py` has them with the bound as it is
         monkeypatch.setattr(bounds, "SPARE_STEPS", 1 << 16)
@@ -98,17 +98,6 @@ class TestZarr:
             np.testing.assert_array_equal(
                 read(tmp_path / "a.zarr", field=f"a{i}").readings, values.reshape(531, 12).astype(float)
             )
-
-    @pytest.mark.parametrize("name", ["lz4", "lz4hc", "zstd"])
-    @pytest.mark.parametrize("shuffle", [Blosc.NOSHUFFLE, Blosc.SHUFFLE, Blosc.BITSHUFFLE])
-    def test_frames_of_blosc_are_read_without_it(self, name, shuffle):
-        rng = np.random.default_rng(shuffle)
-        for size in (1, 16, 1000, 4095, 70_001, 300_000):
-            for values in (rng.integers(0, 4, size, np.uint16), rng.standard_normal(size)):
-                for level in (1, 5):
-                    frame = bytes(Blosc(name, level, shuffle).encode(values))
-                    raw = zarrfile._decompressed("blosc", frame, values.nbytes)
-                    assert bytes(raw) == values.tobytes()
 
     def test_a_frame_of_zstd_need_not_say_its_size(self):
         from backports import zstd
@@ -262,15 +251,6 @@ class TestBounds:
         with pytest.raises(RecordingError, match="steps of work"):
             budget.work()
 
-    def test_holes_are_no_bytes_on_the_disk(self, tmp_path):
-        path = tmp_path / "a.npy"
-        np.save(path, TIP)
-        whole = path.stat().st_size
-        assert bounds.stored_bytes(path) == whole
-        with path.open("r+b") as file:
-            file.truncate(1 << 30)
-        assert bounds.stored_bytes(path) < 1 << 20
-
     def test_a_long_recording_of_a_sensor_at_rest_is_read(self, tmp_path, monkeypatch):
         """19 channels of zeros at 100 Hz, compressed, beyond what any file may cost; and 10^6 rows in one chunk."""
         monkeypatch.setattr(bounds, "SPARE_STEPS", 1 << 16)
@@ -313,19 +293,6 @@ class TestBounds:
         assert sum(shape[0] for shape in width) == 48
         assert peak < 2**26  # blocks of 16 MB, and what they are made of
 
-    def test_a_shape_that_is_only_claimed_is_not_allocated(self, tmp_path):
-        head = {"descr": "<f4", "fortran_order": False, "shape": (10, 1 << 40)}
-        with (tmp_path / "a.npy").open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, head)
-            file.write(b"\0" * 100)
-        with h5py.File(tmp_path / "a.h5", "w") as file:
-            file.create_dataset("tactile", shape=(10, 1 << 40), chunks=(1, 1024), dtype="f4")
-        group = zarr.open_group(tmp_path / "a.zarr", mode="w")
-        group.create_array("tactile", shape=(10, 1 << 40), chunks=(1, 1024), dtype="f4")
-        for name in ("a.npy", "a.h5", "a.zarr"):
-            with pytest.raises(RecordingError):
-                read(tmp_path / name, field=None if name == "a.npy" else "tactile")
-
 
 @pytest.mark.parametrize(
     ("name", "lacks", "named", "extra"),
@@ -358,7 +325,3 @@ def test_a_library_that_is_not_installed_is_named_and_no_file_called_damaged(
         assert "damaged" not in str(raised.value)
         if lacks != "backports":  # which is installed, as anybody sees who looks, and only hidden here
             assert f"[{extra}]" in str(raised.value) and " -m pip install " in str(raised.value)
-
-
-def test_deflate_makes_at_most_as_many_bytes_as_is_reckoned_with():
-    assert len(zlib.compress(bytes(10**7), 9)) * 1032 > 10**7

@@ -20,8 +20,8 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from scroll_tactile.errors import ChannelCountError, FieldError, InputError, RecordingError
 from scroll_tactile.recordings import describe, find, iterate, read, resampled
-from scroll_tactile.recordings.assembly import assemble
 from scroll_tactile.recordings.blocks import Block
+from scroll_tactile.recordings.reader import assemble
 from scroll_tactile.sensors import BIOTAC
 from scroll_tactile.signals.stream import validate
 

@@ -52,40 +52,33 @@ def test_lerobot_episodes_over_several_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "options", "error", "message"),
+    ("file", "content", "message"),
     [
-        (
-            lambda p: (p / "data/chunk-000/file-001.parquet").unlink(),
-            {"field": "tip"},
-            RecordingError,
-            "file-001.parquet",
-        ),
-        (
-            lambda p: (p / "data/chunk-000/file-001.parquet").write_bytes(b"PAR1"),
-            {"field": "tip"},
-            RecordingError,
-            "damaged",
-        ),
-        (lambda p: (p / "meta/info.json").write_text("{"), {"field": "tip"}, RecordingError, "damaged"),
-        (lambda p: (p / "meta/info.json").write_text("[]"), {"field": "tip"}, RecordingError, "damaged"),
-        (
-            lambda p: (p / "meta/info.json").write_text('{"codebase_version": "v2.1"}'),
-            {},
-            RecordingError,
-            "expected v3",
-        ),
-        (lambda p: None, {"field": "observation.tactile.tap"}, FieldError, "nearest is 'observation.tactile.tip'"),
-        (lambda p: None, {"field": "observation.image"}, FieldError, "of type video; expected numbers"),
-        (lambda p: None, {}, FieldError, "expected a field to read"),
-        (lambda p: None, {"field": "tip[40]"}, FieldError, "beyond its 19 columns"),
-        (lambda p: None, {"field": "tip", "clock": "when"}, FieldError, "no column 'when'"),
+        ("data/chunk-000/file-001.parquet", None, "file-001.parquet"),
+        ("data/chunk-000/file-001.parquet", b"PAR1", "damaged"),
+        ("meta/info.json", b"{", "damaged"),
+        ("meta/info.json", b"[]", "damaged"),
+        ("meta/info.json", b'{"codebase_version": "v2.1"}', "expected v3"),
     ],
 )
-def test_lerobot_sets_that_are_not_whole(tmp_path, damage, options, error, message):
+def test_lerobot_sets_that_are_not_whole(tmp_path, file, content, message):
+    place = lerobot(tmp_path / "set") / file
+    place.unlink() if content is None else place.write_bytes(content)
+    with pytest.raises(RecordingError, match=message):
+        read(tmp_path / "set", field="tip")
+
+
+def test_columns_that_a_lerobot_set_does_not_have(tmp_path):
     folder = lerobot(tmp_path / "set")
-    damage(folder)
-    with pytest.raises(error, match=message):
-        read(folder, **options)
+    for options, message in [
+        ({"field": "observation.tactile.tap"}, "nearest is 'observation.tactile.tip'"),
+        ({"field": "observation.image"}, "of type video; expected numbers"),
+        ({}, "expected a field to read"),
+        ({"field": "tip[40]"}, "beyond its 19 columns"),
+        ({"field": "tip", "clock": "when"}, "no column 'when'"),
+    ]:
+        with pytest.raises(FieldError, match=message):
+            read(folder, **options)
 
 
 def test_lerobot_tasks_may_be_missing_and_rows_may_not_differ(tmp_path):

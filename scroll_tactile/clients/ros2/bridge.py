@@ -17,7 +17,7 @@ from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.live.session import HealthNotes
 from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.recordings.paths import FieldPath
-from scroll_tactile.recordings.ros.rosbag import picture
+from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.ranges import all_clipped

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
-from scroll_tactile.recordings.arrays.parquetpages import LONGEST_LIST, require_bounded_pages
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Request, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, Budget, read_text, require_inside, stored_bytes
 from scroll_tactile.recordings.headings import Heading
@@ -76,10 +75,9 @@ class LeRobot(Source):
     def contents(self) -> Contents:
         """The columns that hold numbers, touch first."""
         fps, count = self.info.get("fps"), self.info.get("total_frames")
-        if isinstance(fps, bool) or not isinstance(fps, int | float):
-            fps = None
+        rate = fps if type(fps) in (int, float) else None
         entries = [
-            Entry(None, name, tuple(about["shape"]), count, fps, about["dtype"])
+            Entry(None, name, tuple(about["shape"]), count, rate, about["dtype"])
             for name, about in self.features.items()
             if name not in _BOOKKEEPING and about["dtype"] not in ("video", "image", "string")
         ]
@@ -155,8 +153,8 @@ class LeRobot(Source):
         if heading.unit is not None:
             return rows[:, 0].astype(np.float64)
         # Of whole numbers some of which are missing pyarrow makes floats.
-        names = ["" if math.isnan(number) else str(number) for number in rows[:, 0].tolist()]
-        return np.array([name.removesuffix(".0") for name in names], object)
+        numbers = rows[:, 0].tolist()
+        return np.array(["" if math.isnan(number) else str(number).removesuffix(".0") for number in numbers], object)
 
     def _opened(self, path: Path, columns: list[str] | None, texts: list[str] | None = None) -> Any:
         """A parquet file to read these columns of, or any; raises RecordingError for one that lies elsewhere.
@@ -170,7 +168,7 @@ class LeRobot(Source):
         require_inside(self.path, path)
         self.budget.add(stored_bytes(path))
         require_bounded_pages(path, columns, self.budget)
-        limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": LONGEST_LIST}
+        limits = {"thrift_string_size_limit": _LONGEST, "thrift_container_size_limit": _LONGEST_LIST}
         try:
             return self.parquet.ParquetFile(path, pre_buffer=False, read_dictionary=texts, **limits)
         except KeyError as error:
@@ -193,8 +191,7 @@ class LeRobot(Source):
         rows = rows_of(8 * len(numbers)) if text is None else 1
         for batch in file.iter_batches(batch_size=rows, columns=columns):
             self.budget.work(_TABLE_ROW * batch.num_rows)
-            if text is not None:
-                self.budget.take(batch.nbytes)
+            self.budget.take(batch.nbytes)
             for name, values in batch.to_pydict().items():
                 table[name] += values
         return table
@@ -235,14 +232,10 @@ class LeRobot(Source):
         while hasattr(array.type, "value_type"):
             if array.null_count:
                 raise RecordingError(f"column {name!r} of {self.address} has rows without a value")
-            inner = array.flatten()
-            if len(array) and len(inner) % len(array) == 0 and hasattr(array, "offsets"):
-                lengths = np.diff(array.offsets.to_numpy())
-                if len(lengths) and (lengths != lengths[0]).any():
-                    self._ragged(name)
-            elif len(array) and len(inner) % len(array):
-                self._ragged(name)
-            array = inner
+            lengths = np.diff(array.offsets.to_numpy()) if hasattr(array, "offsets") else np.empty(0)
+            if (lengths != lengths[:1]).any():
+                raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
+            array = array.flatten()
         return np.ascontiguousarray(array.to_numpy(zero_copy_only=False)).reshape(count, -1)
 
     def _require_numbers(self, kind: Any, name: str, *, texts: bool = False) -> None:
@@ -262,9 +255,6 @@ class LeRobot(Source):
         if not (self.types.is_integer(kind) or self.types.is_floating(kind) or self.types.is_boolean(kind)):
             raise FieldError(f"column {name!r} of {self.address} holds {kind}; expected numbers")
 
-    def _ragged(self, name: str) -> None:
-        raise RecordingError(f"column {name!r} of {self.address} is ragged: its rows differ in length")
-
     def _files(self) -> list[Path]:
         """The parquet files that the episodes are in; raises RecordingError where one is missing."""
         listed: dict[tuple[int, int], None] = {}
@@ -278,9 +268,8 @@ class LeRobot(Source):
             raise RecordingError(f"{self.address} names its data {pattern!r:.100}; expected chunk_index and file_index")
         files = [self.path / pattern.format(chunk_index=chunk, file_index=file) for chunk, file in sorted(listed)]
         files = files or sorted((self.path / "data").glob("**/*.parquet"))
-        root = self.path.resolve()
-        if not all(file.resolve().is_relative_to(root) for file in files):
-            raise RecordingError(f"{self.address} names data outside its folder: {pattern!r:.100}")
+        for file in files:
+            require_inside(self.path, file)
         absent = [str(file.relative_to(self.path)) for file in files if not file.is_file()]
         if absent or not files:
             raise RecordingError(
@@ -298,5 +287,167 @@ class LeRobot(Source):
             # pandas writes an index without a name under one of its own
             name = next((name for name in file.schema_arrow.names if name != "task_index"), None)
             table = self._table(file, ["task_index"], name)
-        indices, texts = table["task_index"], table.get(name or "", [])
-        return {int(i): str(text) for i, text in zip(indices, texts, strict=False)}
+        return {int(i): str(text) for i, text in zip(table["task_index"], table.get(name or "", []), strict=False)}
+
+
+# What the pages of a parquet file claim to hold, looked at before pyarrow is: it allocates whatever they claim.
+#
+# The file ends with a footer that says where the pages of each column are, and each page begins with a header that
+# says what it becomes. Both are structures in Thrift's compact protocol (apache/parquet-format: parquet.thrift has the
+# numbers of their fields). They are read here as the code that Thrift generates reads them, and refused where that code
+# and this could read different things: a column that only pyarrow sees would be bounded by nobody.
+
+_LONGEST_LIST = 1 << 16  # row groups, columns or other elements in a footer: pyarrow makes 1 KB of each
+_I16, _I32, _I64, _BINARY, _LIST, _SET, _STRUCT = 4, 5, 6, 8, 9, 10, 12
+_BITS = {_I16: 16, _I32: 32, _I64: 64}
+_DEEPEST = 32  # structures, lists or groups of columns within each other
+_HEADER = 1 << 14  # bytes of a page's header, the largest and smallest value of the page in it
+_A_PAGE = 10  # steps of work
+_VALUE = 8  # bytes of a value in memory: a wide number, or a narrow one and its place in a list
+
+# What the lists of a footer hold. Thrift's code does not compare it with what a list says of itself.
+_COLUMN: Any = {
+    3: {2: [_I32], 3: [_BINARY], 8: [{}], 13: [{}], 16: {2: [_I64], 3: [_I64]}, 17: {2: [_I32]}},
+    8: {2: {1: [_BINARY]}},
+}
+_FOOTER: Any = {2: [{}], 4: [{1: [_COLUMN], 4: [{}]}], 5: [{}], 7: [{}]}
+_ABOUT = {0: 5, 2: 7, 3: 8}  # fields of a page's header by its type: data, a dictionary, and data of version 2
+
+_Struct = dict[tuple[int, int], Any]
+
+
+def require_bounded_pages(path: Path, columns: Collection[str] | None, budget: Budget) -> None:
+    """Charge the budget for the pages of these columns, or of all; raises RecordingError where they claim too much.
+
+    Raises another error, which `guarded` makes one, for a file that no writer writes.
+    """
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(max(size - 8, 0))
+        length, magic = int.from_bytes(file.read(4), "little"), file.read(4)
+        if magic != b"PAR1" or length > size - 12:
+            raise ValueError(f"{path.name} does not end as a parquet file does")
+        budget.work(length)
+        file.seek(size - 8 - length)
+        footer = _Thrift(file.read(length)).struct(_FOOTER)
+        elements = iter(footer[2, _LIST])
+        chosen = list(_chosen(elements, None if columns is None else {name.encode() for name in columns}))
+        for group in footer[4, _LIST]:
+            for column, is_read in zip(group[1, _LIST], chosen, strict=True):
+                if is_read:
+                    _charge(file, column[3, _STRUCT], size - 8 - length, budget)
+
+
+def _chosen(
+    elements: Iterator[_Struct], columns: set[bytes] | None, path: bytes = b"", depth: int = 0
+) -> Iterator[bool]:
+    """Whether each column below the next element of a schema is read: pyarrow does if one of `columns` is its path."""
+    element = next(elements, {})
+    children = element.get((5, _I32), 0)
+    if depth:
+        path += (b"." if path else b"") + element[4, _BINARY]
+        columns = None if columns is not None and path in columns else columns
+    if depth > _DEEPEST:
+        raise ValueError(f"more than {_DEEPEST} groups of columns within each other")
+    if not children and (1, _I32) in element:
+        yield columns is None
+    for _ in range(children):
+        yield from _chosen(elements, columns, path, depth + 1)
+
+
+def _charge(file: BinaryIO, column: _Struct, size: int, budget: Budget) -> None:
+    """Charge the budget for what the pages of a column claim; raises ValueError where they leave their place.
+
+    Raises RecordingError where there are none, as in a file without rows.
+    """
+    place = column[9, _I64]
+    if 0 < (dictionary := column.get((11, _I64), 0)) < place:
+        place = dictionary
+    if not place and not column[5, _I64]:  # as pyarrow writes it
+        raise RecordingError(f"{file.name} has no rows: remove it, or write it again")
+    end, values = place + column[7, _I64], 0
+    if end > size:
+        raise ValueError(f"a column ends at byte {end}, behind the {size} bytes of all")
+    while place < end:
+        budget.work(_A_PAGE)
+        file.seek(place)
+        thrift = _Thrift(file.read(min(_HEADER, end - place)))
+        header = thrift.struct({})
+        form, whole, stored = (header[field, _I32] for field in (1, 2, 3))
+        count = header[_ABOUT[form], _STRUCT][1, _I32]
+        place += thrift.at + stored
+        if min(whole, stored, count) < 0 or place > end:
+            raise ValueError(
+                f"a page of {count} values, {whole} bytes in {stored}, ends at {place}, its column at {end}"
+            )
+        budget.take(max(whole, stored, _VALUE * count))
+        values += count if form != 2 else 0
+    if values != column[5, _I64]:  # where it misses values, pyarrow may look for them behind the column's end
+        raise ValueError(f"a column of {column[5, _I64]} values has {values} in its pages")
+
+
+class _Thrift:
+    """Reads a structure of Thrift's compact protocol; `at` is behind what was read.
+
+    Raises IndexError where the data end, and ValueError for what no writer writes.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def struct(self, lists: Any, depth: int = 0) -> _Struct:
+        """Values by their field's number and kind: Thrift's code passes over a field of another kind.
+
+        lists: what the lists in it hold, by field.
+        """
+        found: _Struct = {}
+        field = 0
+        while kind := (head := self._byte()) & 15:
+            field = field + (head >> 4) if head >> 4 else self._integer(16)
+            if (field, kind) in found or not 0 <= field < 1 << 15:
+                raise ValueError(f"field {field} of a structure, twice or beyond all")
+            found[field, kind] = kind == 1 if kind in (1, 2) else self._value(kind, lists.get(field), depth)
+        return found
+
+    def _value(self, kind: int, lists: Any, depth: int) -> Any:
+        if depth > _DEEPEST:
+            raise ValueError(f"more than {_DEEPEST} structures within each other")
+        if kind in _BITS:
+            return self._integer(_BITS[kind])
+        if kind == _STRUCT:
+            return self.struct(lists if isinstance(lists, dict) else {}, depth + 1)
+        if kind in (_LIST, _SET):
+            return self._list(lists[0] if isinstance(lists, list) else None, depth + 1)
+        if kind not in (1, 2, 3, 7, _BINARY):
+            raise ValueError(f"a value of kind {kind}")
+        count = self._number() if kind == _BINARY else 8 if kind == 7 else 1
+        self.at += count
+        if self.at > len(self.data):
+            raise IndexError(f"{count} bytes of a value, more than there are")
+        return self.data[self.at - count : self.at]
+
+    def _list(self, lists: Any, depth: int) -> list[Any]:
+        head = self._byte()
+        count, kind = self._number() if head >> 4 == 15 else head >> 4, head & 15
+        if count > _LONGEST_LIST or (
+            count and lists is not None and kind != (_STRUCT if isinstance(lists, dict) else lists)
+        ):
+            raise ValueError(f"a list of {count} values of kind {kind}")
+        return [self._value(kind, lists, depth) for _ in range(count)]
+
+    def _byte(self) -> int:
+        self.at += 1
+        return self.data[self.at - 1]
+
+    def _number(self) -> int:
+        value = shift = 0
+        while (byte := self._byte()) & 0x80 and shift < 63:
+            value |= (byte & 0x7F) << shift
+            shift += 7
+        return value | byte << shift
+
+    def _integer(self, bits: int) -> int:
+        value = self._number()
+        if value >> bits:
+            raise ValueError(f"a number of more than {bits} bits")
+        return value >> 1 ^ -(value & 1)

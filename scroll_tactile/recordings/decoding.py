@@ -14,11 +14,10 @@ import numpy as np
 
 from scroll_tactile.errors import RecordingError
 from scroll_tactile.libraries import missing
+from scroll_tactile.recordings.bagfiles import Channel
 from scroll_tactile.recordings.blocks import Request
 from scroll_tactile.recordings.bounds import Budget
 from scroll_tactile.recordings.paths import fields_of
-from scroll_tactile.recordings.ros import idl
-from scroll_tactile.recordings.ros.bagfiles import Channel
 
 __all__ = ["MessageTypes"]
 
@@ -51,8 +50,6 @@ class MessageTypes:
         budget.work(reader.steps + len(data) // _NESTED if reader.nested else reader.steps)
         try:
             return reader.read(data)
-        except RecordingError:
-            raise
         except Exception as error:
             raise RecordingError(
                 f"a message of topic {channel.topic!r} does not fit its type {channel.type}, and may be damaged: "
@@ -72,7 +69,7 @@ class _MessageReader:
 def _lines(channel: Channel, given: str) -> int:
     """How many lines of a definition define something; raises RecordingError where they are too many."""
     if channel.idl and not given:
-        count = idl.weight(channel.definition)
+        count = _weight(channel.definition)
     else:
         lines = re.split(r"[\n;]", given or channel.definition)
         count = sum(1 for line in lines if line.strip() and not line.lstrip().startswith("#"))
@@ -97,7 +94,7 @@ def _reader(channel: Channel, given: str) -> _MessageReader:
     text = given or channel.definition
     try:
         if text and channel.idl and not given:
-            for part in idl.parts(text):
+            for part in _parts(text):
                 store.register(get_types_from_idl(part))
         elif text:
             store.register(get_types_from_msg(text, channel.type))
@@ -138,7 +135,8 @@ def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | No
         of, what = about[0] if array or several else (kind, about)
         plain = of == Nodetype.BASE and what[0] != "string"
         inside, deeper = _objects(definitions, what, known) if of == Nodetype.NAME else (1, False)
-        if (array and about[1] < 1) or (of == Nodetype.NAME and _is_empty(definitions[what][1])):
+        names = [name for name, _ in definitions[what][1]] if of == Nodetype.NAME else [field]
+        if (array and about[1] < 1) or names in ([], ["structure_needs_at_least_one_member"]):
             # There could be any number of them in no byte.
             raise RecordingError(f"field {field!r} of {name} can hold nothing; expected numbers or texts in it")
         total += inside * (about[1] if array and not plain else 1)
@@ -147,28 +145,17 @@ def _objects(definitions: Any, name: str, known: dict[str, tuple[int, bool] | No
     return total, nested
 
 
-def _is_empty(fields: Any) -> bool:
-    return not fields or [name for name, _ in fields] == ["structure_needs_at_least_one_member"]
-
-
 def _read_cdr(store: Any, kind: str, data: bytes) -> object:
     try:
         return store.deserialize_cdr(data, kind)
     except Exception:
-        message, left = _begun_with(store, kind, data)
-        if left is not None and data[:2] in (b"\0\0", b"\0\1") and left <= _END + _WIDEST * _empty_lists(message):
-            return message
+        about = store.get_msgdef(kind)
+        with suppress(Exception):  # whatever damage does; the first error says it
+            read = {b"\0\0": about.deserialize_cdr_be, b"\0\1": about.deserialize_cdr_le}[data[:2]]
+            message, end = read(data[4:], 0, about.cls, store)
+            if len(data) - 4 - end <= _END + _WIDEST * _empty_lists(message):
+                return message
         raise
-
-
-def _begun_with(store: Any, kind: str, data: bytes) -> tuple[object, int | None]:
-    """The message that some bytes begin with, and how many are left; None where they begin with none."""
-    about = store.get_msgdef(kind)
-    with suppress(Exception):  # whatever damage does; the caller knows what to say of it
-        read = about.deserialize_cdr_le if data[1] else about.deserialize_cdr_be
-        message, end = read(data[4:], 0, about.cls, store)
-        return message, len(data) - 4 - end
-    return None, None
 
 
 def _empty_lists(message: Any) -> int:
@@ -178,3 +165,46 @@ def _empty_lists(message: Any) -> int:
     if isinstance(message, list):
         return sum(map(_empty_lists, message))
     return sum(_empty_lists(getattr(message, name)) for name in fields_of(message))
+
+
+# Definitions in IDL are made plain for rosbags' parser, which is slow by more than their length. It tries what stands
+# in a parenthesis eighty times, and in two within each other 6400 times; it tries a sequence twice, and one within
+# three others 16 times; it goes through a constant's text 64 times; and it works out whatever numbers a definition has
+# it make. What ROS 2 makes of a .msg has parentheses and shifts in annotations and comments alone.
+_SEPARATOR, _HEADER = "=" * 80 + "\n", re.compile(r"\AIDL: .*\n")
+_TOKEN = re.compile(r'("[^"\\]*(?:\\"?[^"\\]*)*")|/\*.*?(?:\*/|\Z)|//[^\n]*', re.DOTALL)  # a text, or else a comment
+_ANNOTATION = re.compile(r"@\s*[A-Za-z:][\w:]*(?:\s*\([^()]*\))?")
+_REFUSED = re.compile(r"\(|<<|\*|\bsequence ?< ?sequence ?<")
+_EXPRESSION, _PIECE = re.compile(r'[=\[,|^&+\-/%~"]|\bw?string ?<|>>'), re.compile(r"[;{]|::")
+_AN_EXPRESSION = 8  # pieces that take as long
+
+
+@functools.lru_cache(16)  # they are weighed, and then read
+def _parts(text: str) -> tuple[str, ...]:
+    """The definitions in a text, without comments and annotations, and with nothing in the texts of constants.
+
+    One that needs others holds them all, each below a line of = and one with its name. Raises RecordingError for what
+    the parser cannot read in the time that its length allows.
+    """
+    return tuple(_plain(_HEADER.sub("", part)) for part in text.split(_SEPARATOR) if part)
+
+
+def _weight(text: str) -> int:
+    """How many members a definition has, or as much else as takes the parser as long; raises RecordingError as above.
+
+    An array's length, a constant and each operator take as long as eight.
+    """
+    return sum(_AN_EXPRESSION * len(_EXPRESSION.findall(part)) + len(_PIECE.findall(part)) for part in _parts(text))
+
+
+def _plain(text: str) -> str:
+    plain = _TOKEN.sub(lambda found: " " if found[1] is None else '""', text)
+    plain = re.sub(r"\s+", " ", _ANNOTATION.sub(" ", plain))
+    if found := _REFUSED.search(plain):
+        raise RecordingError(
+            f"a definition in IDL has {found[0]!r} in {plain[max(found.start() - 30, 0) : found.end() + 30]!r}; "
+            "expected constants and lengths as plain numbers, and no sequence in a sequence, as ROS 2 writes. Pass "
+            "the type's .msg file in definitions=, or write the numbers out",
+            argument="definitions",
+        )
+    return plain

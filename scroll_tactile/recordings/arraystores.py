@@ -15,10 +15,10 @@ import numpy as np
 
 from scroll_tactile.errors import FieldError, RecordingError
 from scroll_tactile.libraries import missing
-from scroll_tactile.recordings.arrays.zarrfile import open_zarr
 from scroll_tactile.recordings.blocks import Block, Contents, Entry, Source, floats, rows_of
 from scroll_tactile.recordings.bounds import LARGEST, SPARE, Budget, stored_bytes
 from scroll_tactile.recordings.paths import CLOCK_KEYS, matched, select
+from scroll_tactile.recordings.zarrfile import open_zarr
 
 __all__ = ["Hdf5", "Npy", "ZarrBuffer"]
 
@@ -38,7 +38,7 @@ class _Arrays(Source):
         entries = [
             Entry(None, key, tuple(parts[0].shape[1:]), sum(part.shape[0] for part in parts), None, str(parts[0].dtype))
             for key, parts in arrays.items()
-            if parts[0].ndim and parts[0].dtype.kind in "biuf" and key.rpartition("/")[2] not in CLOCK_KEYS
+            if parts[0].shape and parts[0].dtype.kind in "biuf" and key.rpartition("/")[2] not in CLOCK_KEYS
         ]
         entries.sort(key=lambda entry: "tact" not in entry.field.lower())
         return Contents(self.address, tuple(entries))
@@ -60,7 +60,7 @@ class _Arrays(Source):
 
     def _slices(self, array: Any, times: Any, key: str, rest: str, number: int | None) -> Iterator[Block]:
         """Blocks of one array, all of one episode where it has a number."""
-        if not array.ndim or array.dtype.kind not in "biuf":
+        if not array.shape or array.dtype.kind not in "biuf":
             raise FieldError(
                 f"field {key!r} of {self.address} is {array.dtype} of shape {array.shape}; expected numbers"
             )
@@ -70,7 +70,7 @@ class _Arrays(Source):
             raise RecordingError(
                 f"{self.address} claims readings of {width} bytes in {key!r}, {high} at once, and may be damaged"
             )
-        if times is not None and (times.ndim != 1 or times.shape[0] != array.shape[0] or times.dtype.kind not in "iuf"):
+        if times is not None and (times.shape != array.shape[:1] or times.dtype.kind not in "iuf"):
             raise RecordingError(
                 f"{self.address}: the times are {times.dtype} of shape {times.shape}, and {key!r} has "
                 f"{array.shape[0]} readings"
@@ -81,11 +81,9 @@ class _Arrays(Source):
             slab = self._rows(array, first, min(first + step, array.shape[0]))
             for i in range(first, first + len(slab), rows):
                 part = floats(slab[i - first : i - first + rows])
-                clocks = {}
-                if times is not None:
-                    clocks = {"times": self._rows(times, i, i + len(part)).astype(np.float64)}
+                own = {} if times is None else {"times": self._rows(times, i, i + len(part)).astype(np.float64)}
                 episodes = None if number is None else np.full(len(part), number, np.int64)
-                yield Block(select(part, rest, key) if rest else part, clocks, {}, episodes)
+                yield Block(select(part, rest, key), own, {}, episodes)
 
     def _rows(self, array: Any, begin: int, end: int) -> Any:
         """These rows of an array; raises RecordingError where a recording of this size cannot hold them."""
@@ -105,7 +103,6 @@ class Npy(_Arrays):
 
     def blocks(self) -> Iterator[Block]:
         """Its rows."""
-        array = self._array()
         if self.request.field and not self.request.field.startswith("["):
             raise FieldError(f"{self.address} holds one array without a name; came field {self.request.field!r}")
         if self.request.clock is not None:
@@ -113,7 +110,7 @@ class Npy(_Arrays):
                 f"{self.address} holds no clock; came {self.request.clock!r}: give rate= in its place",
                 argument="clock rate",
             )
-        yield from self._slices(array, None, "", self.field(), None)
+        yield from self._slices(self._array(), None, "", self.field(), None)
 
     def _array(self) -> _NpyArray:
         self.budget = Budget(self.address, stored_bytes(self.path))
@@ -142,11 +139,6 @@ class _NpyArray:
             raise RecordingError(f"{address} holds Python objects, which are not read; expected numbers")
         if min(self.shape, default=0) < 0 or size < self._begin + math.prod(self.shape) * self.dtype.itemsize:
             raise RecordingError(f"{address} ends before the array of {self.dtype} {self.shape} that it announces")
-
-    @property
-    def ndim(self) -> int:
-        """How many axes it has."""
-        return len(self.shape)
 
     def __getitem__(self, rows: slice) -> Any:
         """These rows, shape (rows, …); raises RecordingError where the file has been cut off."""
@@ -185,20 +177,16 @@ class Hdf5(_Arrays):
                 raise RecordingError(f"{self.address}: {key!r} is ragged: its demos have readings of {sorted(shapes)}")
             for number, part in arrays[key].items():
                 times = None if clock is None else arrays[clock].get(number)
-                for item in (part, times):
+                for item in [part] if times is None else [part, times]:
                     self._require_own(item)
                 yield from self._slices(part, times, key, rest, number if number >= 0 else None)
 
     def _charge(self, array: Any, begin: int, end: int) -> None:
         super()._charge(array, begin, end)
-        if array.compression == "gzip":
-            self._measure(array, begin, end)
-
-    def _measure(self, array: Any, begin: int, end: int) -> None:
-        """Raises RecordingError for a chunk that deflate would make longer than a chunk is: HDF5 takes all that comes.
-
-        Only large ones can become so large that it matters, and these are decompressed here first.
-        """
+        if array.compression != "gzip":
+            return
+        # HDF5 takes all that deflate makes of a chunk, also where it is longer than a chunk. Only large ones can become
+        # so large that it matters, and these are decompressed here first.
         size = math.prod(array.chunks) * array.dtype.itemsize
         along = [range(begin, end, array.chunks[0])]
         along += [range(0, whole, step) for whole, step in zip(array.shape[1:], array.chunks[1:], strict=True)]
@@ -247,8 +235,6 @@ class Hdf5(_Arrays):
         """Raises RecordingError for numbers that lie in other files, or in what only a plugin decodes."""
         import h5py
 
-        if item is None:
-            return
         about = item.id.get_create_plist()
         virtual = about.get_layout() == h5py.h5d.VIRTUAL
         if virtual or about.get_external_count():
@@ -282,7 +268,7 @@ class ZarrBuffer(_Arrays):
             if name is not None and (why := arrays[name].why):
                 raise RecordingError(f"{self.address}: {name!r} cannot be read: {why}")
         array = arrays[key]
-        ends = None if episode_ends is None else self._ends(episode_ends, array.shape[0] if array.ndim else 0)
+        ends = None if episode_ends is None else self._ends(episode_ends, array.shape[0] if array.shape else 0)
         done = 0
         for block in self._slices(array, arrays[clock] if clock is not None else None, key, rest, None):
             if ends is not None:
@@ -295,7 +281,7 @@ class ZarrBuffer(_Arrays):
         pass  # it charges for its chunks as it reads them
 
     def _ends(self, array: Any, count: int) -> Any:
-        if array.why or array.ndim != 1 or array.dtype.kind not in "iu" or array.shape[0] > count + _EPISODES:
+        if array.why or len(array.shape) != 1 or array.dtype.kind not in "iu" or array.shape[0] > count + _EPISODES:
             why = array.why or f"they are {array.dtype} of shape {array.shape}, of {count} readings"
             raise RecordingError(f"{self.address}: meta/episode_ends cannot be read: {why}")
         ends = array[:].astype(np.int64)

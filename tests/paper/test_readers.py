@@ -6,11 +6,10 @@ import re
 import numpy as np
 import pytest
 import torch
-from real_sets import CACHE
 
 from examples.paper.readers import fabric_slide, letter_spike, physiclear
 from examples.paper.readers.biotac_slide import MATERIALS, all_channels, load
-from examples.paper.readers.fabric_slide import CPM_FINGER, CPM_RATIOS, FABRICS
+from examples.paper.readers.fabric_slide import CPM_FINGER, CPM_RATIOS
 from examples.paper.readers.grades import read_grades
 from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.readers.letter_spike import DOTS, LETTERS, NUSKIN, dots_of, letter_folds, read_events, stream_of
@@ -272,11 +271,6 @@ class TestLetterSpike:
         assert {len(group) for group in groups} == {3}
         assert groups == letter_folds(9, seed=4) != letter_folds(9, seed=5)
 
-    def test_the_real_one(self):
-        if not (CACHE / "letter-spike").is_dir():
-            pytest.skip("letter-spike is not at hand")
-        assert len(letter_spike.load(CACHE, seconds=0.5)) == 1348
-
 
 class TestFabricSlide:
     @pytest.fixture
@@ -337,13 +331,6 @@ class TestFabricSlide:
         np.testing.assert_allclose(shares.readings.mean(axis=1), 0, atol=1e-6)
         with pytest.raises(SensorMismatchError):
             fabric_slide.ratios(shares)
-
-    def test_the_real_one(self):
-        if not (CACHE / "FabricSlide").is_dir():
-            pytest.skip("FabricSlide is not at hand")
-        slides = fabric_slide.load(CACHE, FABRICS[4:5])
-        assert len(slides.recordings) == 72
-        assert not any(stream.clipped for stream in slides.recordings.streams)
 
 
 class TestPhysiclear:

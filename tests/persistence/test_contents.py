@@ -8,7 +8,7 @@ import pytest
 from commands import run
 from forging import spoil_row
 from scroll_tactile.clients.learning.classification import observe_all
-from scroll_tactile_store import Store, StoreClosedError, StoreError, StoreFullError
+from scroll_tactile_store import StoreClosedError, StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
 from touches import SETTINGS, fed, filled, held, stream
 
@@ -145,12 +145,6 @@ class TestRelabel:
 FORCE = Quantity(name="force", unit="N", low=0, high=4, resolution=0.5)
 
 
-def _python(home):
-    with TactileLearner.open(home / "m", **SETTINGS) as learner:
-        receipts = [learner.observe("felt", touch()) for _ in range(2)]
-    assert [receipt.repeated for receipt in receipts] == [False, True]
-
-
 def _a_pass(home):
     with TactileLearner.open(home / "m", **SETTINGS) as learner:
         assert observe_all(learner, [("felt", learner.stream(touch()))] * 2) == 2
@@ -182,25 +176,12 @@ def _merge(home):
             assert (merged := learner.merge(home / other)).observations == 0 and merged.shared == 1
 
 
-def _merge_of_a_forged_memory(home):
-    """Another program wrote a row of it a second time."""
-    filled(home / "o", [])[0].close()
-    with TactileLearner.open(home / "o") as other:
-        other.observe("felt", touch())
-    with Store.open(home / "o") as store:
-        row = store.record(1)
-        store.append(row.kind, row.label, row.key, attributes=row.attributes, arrays=row.arrays)
-    with TactileLearner.open(home / "m", **SETTINGS) as learner:
-        merged = learner.merge(home / "o")
-    assert (merged.observations, merged.shared) == (1, 1)
-
-
 BY_FOLDER = SourceOptions(by="folder")
 
 
 @pytest.mark.parametrize(
     "learned",
-    [_python, _a_pass, _observe_command, _learn_command, _fleet, _merge, _merge_of_a_forged_memory],
+    [_a_pass, _observe_command, _learn_command, _fleet, _merge],
     ids=lambda way: way.__name__.strip("_"),
 )
 def test_a_touch_that_comes_twice_is_one_and_it_is_said(tmp_path, learned):

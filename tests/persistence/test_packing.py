@@ -174,20 +174,6 @@ class TestDamage:
         monkeypatch.undo()
         require_refused(other, file, "format 9; this release reads format 2: upgrade it")
 
-    def test_sums_of_other_touches_than_its_rows(self, tmp_path, other):
-        """Rows of one memory, the checkpoint of another, and right checksums."""
-        one, two = packed(tmp_path, OBSERVED[:4], "one"), packed(tmp_path, OBSERVED[1:5], "two")
-        del one, two
-        with Store.open(tmp_path / "two.memory", mode="read") as store:
-            newest = store.latest()
-        with Store.open(tmp_path / "one.memory") as store:
-            store.commit(newest.arrays, last_sequence=newest.last_sequence, attributes=newest.attributes)
-        archive.write_archive(tmp_path / "one.memory", tmp_path / "forged")
-        before = other.digest()
-        with pytest.raises(DamageError, match=r"forged counts other touches than it names|forged counts \d touches of"):
-            other.merge(tmp_path / "forged")
-        assert other.digest() == before
-
     def test_a_full_disk_leaves_nothing_behind(self, tmp_path, monkeypatch):
         learner, _ = filled(tmp_path / "m", OBSERVED[:2])
 
@@ -340,16 +326,6 @@ def test_one_that_was_made_to_harm(three, other, tmp_path, harm, match, monkeypa
     before = sorted(tmp_path.iterdir())
     require_refused(other, file, match)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_rows_that_no_memory_packs(tmp_path, other):
-    """A retraction of all rows that there could ever be, in a file with right checksums."""
-    with Store.open(tmp_path / "m", identity=dict(other._ledger.store.identity)) as store:
-        store.append("retract", "", b"", attributes={"sequences": [[1, 2**60]]})
-        store.commit({}, last_sequence=1, attributes={})
-    archive.write_archive(tmp_path / "m", tmp_path / "forged")
-    require_refused(other, tmp_path / "forged", "row 1|checkpoint")
-    assert check_memory(tmp_path / "forged")
 
 
 def test_checking_one(three, tmp_path):

@@ -13,7 +13,6 @@ from examples.paper.transfer.maps import Maps
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.persistence import reembed
-from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.reembedding import reembed_memory
 
 OTHER = {
@@ -155,22 +154,6 @@ def test_what_is_observed_meanwhile_is_in_it(path, monkeypatch):
         kept = len(learner.observations())
         assert 8 <= kept <= 9
         assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
-
-
-def test_a_prediction_that_had_begun_is_of_the_memory_before(path, monkeypatch):
-    learner, _ = eventful(path)
-    reading, before = CurrentModel.reading, repr(learner.predict(stream((10, 60))))
-
-    def embedded_again(*given):
-        monkeypatch.undo()
-        extractor = reading(*given)
-        learner.reembed(OTHER["exact"]())
-        return extractor
-
-    monkeypatch.setattr(CurrentModel, "reading", embedded_again)
-    assert repr(learner.predict(stream((10, 60)))) == before
-    assert learner.embedding.dimension == 128
-    learner.close()
 
 
 def test_rows_that_are_not_those_of_the_checkpoint_are_not_carried_over(path):

@@ -1,4 +1,4 @@
-"""A memory: what a journal row holds, and what comes back from a store."""
+"""What a journal row holds, packed and unpacked."""
 
 import numpy as np
 import pytest
@@ -11,9 +11,6 @@ from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
 from scroll_tactile.signals.windows import Scale
-
-DIMENSION, SCALES = 4, (6, 20)
-NARROW = Scale("window", 6)
 
 SHAPES = st.one_of(
     st.tuples(st.integers(1, 9), st.integers(1, 5)), st.tuples(st.integers(1, 3), st.just(2), st.just(3), st.just(3))
@@ -62,7 +59,10 @@ def test_real_touches_take_less_than_ten_kilobytes_on_average(real_data):
 
 
 def test_codes_come_back():
-    codes = {NARROW: np.arange(8, dtype=np.int32).reshape(2, 4), Scale("window", 300): np.zeros((1, 4), np.int32)}
+    codes = {
+        Scale("window", 6): np.arange(8, dtype=np.int32).reshape(2, 4),
+        Scale("window", 300): np.zeros((1, 4), np.int32),
+    }
     again = unpack_codes(pack_codes(codes))
     assert {scale: rows.tolist() for scale, rows in again.items()} == {
         scale: rows.tolist() for scale, rows in codes.items()

@@ -129,45 +129,35 @@ class TestBioTacSlide:
             load(folder, "biotac", seed=-1)
 
     @pytest.mark.parametrize(
-        ("content", "message"),
+        ("file", "content", "message"),
         [
-            (torch.zeros(399, 44), r"its shape is \(399, 44\)"),
-            (torch.zeros(400, 19), r"its shape is \(400, 19\)"),
-            (torch.zeros(400), r"its shape is \(400,\)"),
-            ([1, 2], "it holds a list"),
-            (torch.full((400, 44), torch.nan), "holds no sound readings: .*reading 0, channel 0 is nan"),
-            (b"not a tensor at all", "cannot be read, and may be damaged"),
-            (b"", "cannot be read, and may be damaged"),
+            ("mat1_1.pt", torch.zeros(399, 44), r"its shape is \(399, 44\)"),
+            ("mat1_1.pt", torch.zeros(400, 19), r"its shape is \(400, 19\)"),
+            ("mat1_1.pt", torch.zeros(400), r"its shape is \(400,\)"),
+            ("mat1_1.pt", [1, 2], "it holds a list"),
+            ("mat1_1.pt", torch.full((400, 44), torch.nan), "no sound readings: .*reading 0, channel 0 is nan"),
+            ("mat1_1.pt", b"not a tensor at all", "cannot be read, and may be damaged"),
+            ("mat1_1.pt", b"", "cannot be read, and may be damaged"),
+            ("icub_val_0.npy", np.zeros((200, 60, 75)), r"it holds \(200, 60, 75\)"),
+            ("labels_val_0.npy", np.arange(200), "labels 0 to 19"),
+            ("labels_val_0.npy", np.full(200, 0.5), "labels 0 to 19"),
+            ("labels_val_0.npy", np.zeros((200, 1), int), r"it holds \(200, 1\)"),
+            ("icub_val_0.npy", np.full((200, 6, 10, 75), np.nan), "holds no sound readings"),
+            ("icub_val_0.npy", np.array([None]), "cannot be read"),
         ],
     )
-    def test_a_biotac_file_that_is_not_as_published_is_named(self, folder, content, message):
-        path = folder / "raw_data" / "mat1" / "mat1_1.pt"
+    def test_a_file_that_is_not_as_published_is_named(self, folder, file, content, message):
+        (path,) = folder.rglob(file)
         if isinstance(content, bytes):
             path.write_bytes(content)
         else:
-            torch.save(content, path)
-        named(path, lambda: load(folder, "biotac"), message)
+            torch.save(content, path) if path.suffix == ".pt" else np.save(path, content)
+        named(path, lambda: load(folder, "biotac" if path.suffix == ".pt" else "roboskin"), message)
 
     def test_a_file_that_would_run_code_is_refused(self, folder, capsys):
         torch.save(Planted(), folder / "raw_data" / "mat1" / "mat1_1.pt")
         named(folder / "raw_data" / "mat1" / "mat1_1.pt", lambda: load(folder, "biotac"), "cannot be read")
         assert "ran code" not in capsys.readouterr().out
-
-    @pytest.mark.parametrize(
-        ("file", "content", "message"),
-        [
-            ("icub_val_0", np.zeros((200, 60, 75)), r"it holds \(200, 60, 75\)"),
-            ("labels_val_0", np.arange(200), "labels 0 to 19"),
-            ("labels_val_0", np.full(200, 0.5), "labels 0 to 19"),
-            ("labels_val_0", np.zeros((200, 1), int), r"it holds \(200, 1\)"),
-            ("icub_val_0", np.full((200, 6, 10, 75), np.nan), "holds no sound readings"),
-            ("icub_val_0", np.array([None]), "cannot be read"),
-        ],
-    )
-    def test_a_roboskin_file_that_is_not_as_published_is_named(self, folder, file, content, message):
-        path = folder / "compiled_data" / f"{file}.npy"
-        np.save(path, content)
-        named(path, lambda: load(folder, "roboskin"), message)
 
 
 class Planted:

@@ -93,13 +93,6 @@ class TestReading:
         with pytest.raises(NotAStoreError, match=r"opened with mode=\"read\", or merged"):
             TactileLearner.open(file)
 
-    def test_names_that_a_file_has_in_its_folder_lead_nowhere_else(self, tmp_path):
-        file = packed(tmp_path, OBSERVED[:2])
-        with zipfile.ZipFile(file) as listed:
-            names = listed.namelist()
-        assert names[0] == "CURRENT" and names[1].startswith("log-")
-        assert all(name.startswith("checkpoints/") for name in names[2:])
-
 
 @pytest.fixture(scope="module")
 def three(tmp_path_factory):
@@ -230,11 +223,6 @@ def patched(file, mark, offset, value):
 LISTED, LOCAL = b"PK\1\2", b"PK\3\4"
 
 
-def doubled(name):
-    """A file more, of this name."""
-    return lambda file: zipped(file, [*entries(file), (name, b"any")])
-
-
 def relisted(offset, form, *values):
     """The list of files says other things of each."""
 
@@ -246,8 +234,8 @@ def relisted(offset, form, *values):
 
 
 def holding(make):
-    """A zip of other files."""
-    return lambda file: zipped(file, make(file))
+    """A zip of other files, made of those that there are."""
+    return lambda file: zipped(file, make(entries(file)))
 
 
 def overlapping(file):
@@ -269,10 +257,6 @@ def of_a_full_list(file):
     patched(file, b"PK\5\6", 12, struct.pack("<I", 2**31))
 
 
-def bomb(compress):
-    return lambda file: zipped(file, [*entries(file), ("log-00000002", bytes(2**22))], compress)
-
-
 def in_its_place(make):
     """Something else under the file's name."""
 
@@ -289,25 +273,21 @@ NAMES += ["checkpoints/00000001/a/c/" + "0/" * 70 + "0", "CURRENT", "log-0000000
 SHELL = b"#!/bin/sh\n"
 HARMS = {
     # what is done to a packed memory; what is said of it
-    **{f"a file {name[:30]}": (doubled(name), "(?i)fetch it again") for name in NAMES},
+    **{
+        f"a file {name[:30]}": (holding(lambda own, n=name: [*own, (n, b"any")]), "(?i)fetch it again")
+        for name in NAMES
+    },
     "a link": (lambda file: zipped(file, entries(file), links=["log-00000001"]), "as a link"),
-    "deflated": (bomb(zipfile.ZIP_DEFLATED), "as compressed or encrypted"),
-    "bzip2": (bomb(zipfile.ZIP_BZIP2), "as compressed or encrypted"),
-    "lzma": (bomb(zipfile.ZIP_LZMA), "as compressed or encrypted"),
+    "deflated": (lambda file: zipped(file, entries(file), zipfile.ZIP_DEFLATED), "as compressed or encrypted"),
     "encrypted": (lambda file: patched(file, LISTED, 8, struct.pack("<H", 1)), "as compressed or encrypted"),
     "another name in the list": (lambda file: patched(file, b"CURRENT", 0, b"CURRENS"), None),
     "a place in a file": (relisted(42, "<I", 7), "where another file begins, or none"),
-    "a place of another": (relisted(42, "<I", 0), "where another file begins, or none"),
-    **{f"{size} bytes each": (relisted(20, "<II", size, size), None) for size in (0, 1, 10**6, 2**32 - 2)},
+    **{f"{size} bytes each": (relisted(20, "<II", size, size), None) for size in (0, 2**32 - 2)},
     "files that overlap": (overlapping, "files that overlap"),
     "a script before it": (lambda file: file.write_bytes(SHELL + file.read_bytes()), "cut off or added to"),
-    "zeros before it": (lambda file: file.write_bytes(bytes(1000) + file.read_bytes()), "cut off or added to"),
     "a byte behind it": (lambda file: file.write_bytes(file.read_bytes() + b"x"), "cut off or added to"),
-    "nothing in it": (holding(lambda file: []), "no packed store"),
-    "other things": (holding(lambda file: [("readme.txt", b"any")]), "no packed store"),
-    "itself": (holding(lambda file: [("memory.zip", file.read_bytes())]), "no packed store"),
-    "all in a folder": (holding(lambda file: [("m/" + name, data) for name, data in entries(file)]), "no packed store"),
-    "itself for CURRENT": (holding(lambda file: [("CURRENT", file.read_bytes())]), None),
+    "nothing in it": (holding(lambda _: []), "no packed store"),
+    "all in a folder": (holding(lambda own: [("m/" + name, data) for name, data in own]), "no packed store"),
     "a list that fills the memory": (of_a_full_list, "its list of files takes 2147483648 bytes"),
     "too many files": (of_too_many_files, "(?i)fetch it again"),
     "a pipe": (in_its_place(os.mkfifo), None),

@@ -10,6 +10,7 @@ from pathlib import Path
 import mpmath
 import numpy as np
 import pytest
+from benchmarks.ridge_truth import truth
 from commands import run
 from typer.testing import CliRunner
 
@@ -29,13 +30,6 @@ RNG = np.random.default_rng(0)
 ROWS, TARGETS = RNG.normal(size=(40, 6)), RNG.normal(size=(40, 2))
 
 
-def true(rows, targets, penalty):
-    with mpmath.workdps(80):
-        x, y = mpmath.matrix(rows.tolist()), mpmath.matrix(targets.tolist())
-        system = x.T * x + mpmath.mpf(penalty) * mpmath.eye(x.cols)
-        return [mpmath.lu_solve(system, x.T * y[:, c]) for c in range(y.cols)]
-
-
 def agree(found, expected, within):
     with mpmath.workdps(80):
         for row, column in np.ndindex(found.shape):
@@ -48,7 +42,7 @@ class TestTruth:
     @pytest.mark.parametrize("penalty", [0.0, 1e-3, 1e-30, 1e30])
     def test_exact_elimination_is_the_truth(self, penalty):
         rows = ROWS * np.logspace(0, -12, 6)
-        agree(exact_weights(rows, TARGETS, penalty), true(rows, TARGETS, penalty), 1e-18)
+        agree(exact_weights(rows, TARGETS, penalty), truth(rows, TARGETS, penalty, 80), 1e-18)
 
     def test_repeated_rows_count_so_often(self):
         many = exact_weights(np.tile(ROWS, (7, 1)), np.tile(TARGETS, (7, 1)), 0.5)

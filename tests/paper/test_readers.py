@@ -218,12 +218,6 @@ class TestLetterSpike:
         assert set(second[:12]) == {0} and set(second[12:]) == {1000}
         assert not np.delete(readings, [5, 49], axis=1).any()
 
-    def test_taxels_lie_in_blocks_and_each_once(self):
-        places = letter_spike._places()
-        assert sorted(places) == list(range(80))
-        assert places[[35, 39, 20, 4, 0, 19]].tolist() == [5, 9, 35, 45, 49, 75]
-        assert places[[55, 59, 64, 60, 75]].tolist() == [0, 4, 40, 44, 74]
-
     def test_events_without_a_taxel_are_left_out_and_time_is_put_in_order(self, tmp_path):
         path = tmp_path / "A_0.csv"
         path.write_text(HEADER + "2.0,0,3,5\n1.0,-1,-1,-1\n1.5,0,4,6\n")

@@ -183,7 +183,14 @@ def test_a_damaged_file_is_not_used(made, path, fits):
     with opened(path) as learner:
         assert bits(learner) == made[1]
     kept(path).unlink()
+    (path.parent / "elsewhere").write_bytes(whole)
+    kept(path).symlink_to(path.parent / "elsewhere")  # which is not followed
+    with opened(path) as learner:
+        assert bits(learner) == made[1]
+    assert len(fits) == 6
+    kept(path).unlink()
     kept(path).mkdir()
+    kept(path).with_name(f"{NAME}.new").write_bytes(whole[:1000])  # half written, and replaced
     with opened(path, "write") as learner:
         assert bits(learner) == made[1]  # and it closes
 
@@ -220,14 +227,6 @@ def test_the_model_of_an_axis_is_kept_beside_it_and_refused_where_it_is_wrong(tm
         with opened(path) as learner:
             assert len(by_slip(learner)) == 3
         assert len(fits) == 1
-
-
-def test_a_link_is_not_followed(made, path, fits):
-    shutil.move(kept(path), path.parent / "elsewhere")
-    kept(path).symlink_to(path.parent / "elsewhere")
-    with opened(path) as learner:
-        assert bits(learner) == made[1]
-    assert fits
 
 
 def forge(path, change, name=NAME):
@@ -337,15 +336,6 @@ def test_a_failure_to_write_it_changes_nothing_else(made, path, monkeypatch, cap
     assert [problem for problem in check_store(path) if problem.kind != "leftover"] == []
     with opened(path) as learner:
         assert bits(learner) == said
-
-
-def test_a_half_written_file_is_replaced(made, path):
-    (path / "derived" / f"{NAME}.new").write_bytes(kept(path).read_bytes()[:1000])
-    kept(path).unlink()
-    with opened(path, "write") as learner:
-        bits(learner)
-    with opened(path) as learner:
-        assert bits(learner) == made[1]
 
 
 def test_a_reader_keeps_its_sums_where_a_writer_has_replaced_the_checkpoint(path):

@@ -263,13 +263,7 @@ AXIS = {
     "axis-0-sums-15": [lambda a: a + 2**62, lambda a: a[:1], lambda a: None],
     "axis-0-values-15": [lambda a: a[::-1], lambda a: a * 0],
     "axis-0-places-15": [lambda a: a[:, :-1], lambda a: None],
-    "quantity-sums": [
-        lambda a: a[:0],
-        lambda a: a.astype(float),
-        lambda a: a * 0,
-        lambda a: a * 20,
-        lambda a: a * [1, 2, 1],
-    ],
+    "quantity-sums": [lambda a: a[:0], lambda a: a.astype(float), lambda a: a * 20, lambda a: a * [1, 2, 1]],
 }
 NOTED = {"values": {"force": 50}, "labels": {"slip": "north"}}
 TOLD = {
@@ -278,25 +272,8 @@ TOLD = {
     "touches": [None, 0, 10**6, True],
     "total": [None, 3, "", "x" * 64],
     "sums": [None, [3], [["force"]], [["speed", "a"]], [["force", "z"]], [["force", "a"]] * 2],
-    "axes": [
-        None,
-        {},
-        [3],
-        [["slip"]],
-        [["slip", []]],
-        [["slip", ["north", "north"]]],
-        [["slip", ["x"]], ["slip", []]],
-    ],
-    "sample-annotations": [
-        None,
-        [],
-        [[]],
-        {},
-        [3] * 14,
-        [NOTED] * 14,
-        [[NOTED, 1]] * 14,
-        [{"labels": {"slip": "x"}}] * 14,
-    ],
+    "axes": [None, {}, [3], [["slip"]], [["slip", ["north", "north"]]], [["slip", ["x"]], ["slip", []]]],
+    "sample-annotations": [None, {}, [[]], [3] * 14, [NOTED] * 14, [[NOTED, 1]] * 14, [{"labels": {"slip": "x"}}] * 14],
     "kept-annotations": [None, [{"values": {"force": 101}}] * 14, [{"values": {}}] * 14],
 }
 IN_GENERATIONS = (
@@ -424,39 +401,12 @@ def test_a_time_beyond_the_calendar_is_exported(path, tmp_path):
     assert "-100000000000000.0" in (tmp_path / "plain" / "observations.csv").read_text()
 
 
-def hollow(attributes, arrays):
-    """A second moment that no rows have: its diagonal is theirs, and beside it is more."""
-    dimension = attributes["dimension"]
-    triangle("second-15", attributes, arrays)
-    square = np.zeros((dimension, dimension), np.int64)
-    square[np.tril_indices(dimension)] = arrays["second-15"]
-    square[1, 0] = int(np.sqrt(float(square[0, 0])) * np.sqrt(float(square[1, 1]))) * 2
-    limit = int(arrays["rows-15"].sum()) << 40
-    square[1, 0] = min(int(square[1, 0]), limit)
-    return arrays | {"second-15": square[np.tril_indices(dimension)]}
-
-
 @pytest.mark.parametrize("changed", [{"descriptions": 1}, {"descriptions": {"a": {"x": 2.0}}}, {"tuned": 1}])
 def test_what_a_merge_leaves_out_is_looked_at_where_it_is_there(made, tmp_path, changed):
     path = copied(made / "whole", tmp_path / "m")
     attributes, arrays = checkpoint_of(made / "compacted")
     put_row(path, kind="merge", attributes=attributes | changed, payload=arrays)
     require_refused(path, next(iter(changed)))
-
-
-def test_a_merge_of_sums_that_no_touches_have_changes_nothing(made, tmp_path):
-    path = copied(made / "compacted", tmp_path / "m")
-    attributes, arrays = checkpoint_of(path)
-    put_checkpoint(path, attributes, hollow(attributes, arrays), compaction=True)
-    others = copied(made / "other", tmp_path / "other")
-    with opened(others) as target:
-        before = held(target)
-        with pytest.raises(DamageError, match="second-15"):
-            target.merge(path)
-        assert held(target) == before
-    assert any("second-15" in found for found in check_memory(path))
-    with opened(path) as learner, pytest.raises(ScrollTactileError, match="no readout"):
-        learner.predict(stream((7, 25)))
 
 
 def test_sums_of_more_touches_than_the_journal_names_are_found(made, tmp_path):

@@ -31,6 +31,12 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where a test's memory lies."""
+    return tmp_path / "m"
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of BioTac-20 and RoboSkin-20 as published; skips where the data is not at hand."""

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 import scroll_tactile.memory.state
-from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile import Capabilities, Kernels, Sensor, TactileLearner
 from scroll_tactile.statistics.sample import TouchSample
 
 SMALL = Kernels(seed=0, dimension=64)
@@ -18,6 +18,13 @@ class Windowed(Kernels):
     """Kernels that read windows alone, and no touch as a whole."""
 
     capabilities = dataclasses.replace(Kernels.capabilities, reads_whole_touches=False)
+
+
+class OwnKernels(Kernels):
+    """An embedding of a user's own, exact: a memory cannot make it, and keeps codes beside the readings."""
+
+    name = "own kernels"
+    capabilities = Capabilities(embeds_windows=True, exact=True)
 
 
 class SmallSample(TouchSample):

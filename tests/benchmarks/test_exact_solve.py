@@ -5,6 +5,7 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
+from benchmarks.ridge_truth import truth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -83,14 +84,6 @@ def solved(rows, targets, penalty=0.0):
     return solver.solve()
 
 
-def truth(rows, targets, penalty):
-    """To as many digits as the widest case here needs: its condition is 10²⁰⁰."""
-    with mpmath.workdps(1500):
-        x, y = mpmath.matrix(rows.tolist()), mpmath.matrix(targets.tolist())
-        found = mpmath.lu_solve(x.T * x + mpmath.mpf(penalty) * mpmath.eye(x.cols), x.T * y)
-        return [found[j] for j in range(x.cols)]
-
-
 def geometric(lowest):
     rng = np.random.default_rng(5)
     left, _ = np.linalg.qr(rng.normal(size=(30, 8)))
@@ -131,8 +124,8 @@ def test_every_weight_is_right_to_its_last_bit_or_two(rows, penalty):
     targets = np.random.default_rng(6).normal(size=(len(rows), 1))
     found, diagnosis = solved(rows, targets, penalty)
     assert diagnosis.error_bound < 2.0**-52
-    with mpmath.workdps(1500):
-        for weight, true in zip(found[:, 0], truth(rows, targets, penalty), strict=True):
+    with mpmath.workdps(1500):  # as the widest case here needs: its condition is 10²⁰⁰
+        for weight, true in zip(found[:, 0], truth(rows, targets, penalty, 1500)[0], strict=True):
             assert abs(mpmath.mpf(float(weight)) - true) <= abs(true) * mpmath.mpf(2) ** -52
 
 

@@ -5,13 +5,13 @@ import json
 import runpy
 import sys
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import mpmath
 import numpy as np
 import pytest
-from commands import refused, run
+from benchmarks.ridge_truth import truth
+from commands import run
 from typer.testing import CliRunner
 
 from examples.benchmarks.numerics import comparison
@@ -20,7 +20,7 @@ from examples.benchmarks.numerics.learned import AGREED, answers_error, flips, m
 from examples.benchmarks.numerics.long_runs import run_schedules, run_updates
 from examples.benchmarks.numerics.memories import make_memories
 from examples.benchmarks.numerics.peers import as_case, error_of, measure
-from examples.benchmarks.numerics.recorded import digits, nist_cases
+from examples.benchmarks.numerics.recorded import nist_cases
 from examples.benchmarks.numerics.regressions import Case, make_cases
 from examples.benchmarks.numerics.truth import TrueReadout, exact_weights
 from examples.benchmarks.solvers.methods import SOLVERS
@@ -28,13 +28,6 @@ from scroll_tactile.errors import DatasetError
 
 RNG = np.random.default_rng(0)
 ROWS, TARGETS = RNG.normal(size=(40, 6)), RNG.normal(size=(40, 2))
-
-
-def true(rows, targets, penalty):
-    with mpmath.workdps(80):
-        x, y = mpmath.matrix(rows.tolist()), mpmath.matrix(targets.tolist())
-        system = x.T * x + mpmath.mpf(penalty) * mpmath.eye(x.cols)
-        return [mpmath.lu_solve(system, x.T * y[:, c]) for c in range(y.cols)]
 
 
 def agree(found, expected, within):
@@ -49,7 +42,7 @@ class TestTruth:
     @pytest.mark.parametrize("penalty", [0.0, 1e-3, 1e-30, 1e30])
     def test_exact_elimination_is_the_truth(self, penalty):
         rows = ROWS * np.logspace(0, -12, 6)
-        agree(exact_weights(rows, TARGETS, penalty), true(rows, TARGETS, penalty), 1e-18)
+        agree(exact_weights(rows, TARGETS, penalty), truth(rows, TARGETS, penalty, 80), 1e-18)
 
     def test_repeated_rows_count_so_often(self):
         many = exact_weights(np.tile(ROWS, (7, 1)), np.tile(TARGETS, (7, 1)), 0.5)
@@ -86,21 +79,6 @@ class TestTruth:
                 assert answers.ridge[i].tolist() == pytest.approx([float(v) for v in ridge], rel=1e-14)
                 assert answers.distances[i].tolist() == pytest.approx([float(v - far) for v in near], rel=1e-14)
                 assert answers.novelty[i] == pytest.approx(float(min(near) - far), rel=1e-14)
-
-    @pytest.mark.parametrize("touches", [3, 40])
-    def test_a_true_share_is_the_formulas(self, touches):
-        rows = np.random.default_rng(4).integers(-99, 99, size=(4, 6))  # n < d
-        scatter = sum(np.outer(part[0] - part[1], part[0] - part[1]) for part in (rows[:2], rows[2:])) / 2
-        squares, trace = np.sum(scatter**2), np.trace(scatter)
-        wanted = (squares * 2 / 3 + trace**2) / ((touches + 2 / 3) * (squares - trace**2 / 6))
-        found = TrueReadout(rows, np.array([0, 0, 1, 1]), 1.0, 1.0).share(touches, 1e-4, 0.99)
-        assert found == pytest.approx(min(wanted, 0.99), rel=1e-12)
-
-    def test_a_share_without_scatter_or_with_nothing_to_shrink(self):
-        alone = TrueReadout(np.eye(3, dtype=int), np.arange(3), 1.0, 1.0)
-        assert alone.share(3, 1e-4, 0.99) == 0.0
-        round_ = TrueReadout(np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]), np.zeros(4, int), 1.0, 1.0)
-        assert round_.share(4, 1e-4, 0.99) == 0.99
 
 
 @pytest.mark.parametrize("memory", [*make_memories(1, 0.1)], ids=lambda memory: memory.name)
@@ -208,14 +186,6 @@ def test_nists_certified_digits(nist, name):
     assert one["weights_error"] <= 2.0**-52
 
 
-def test_digits():
-    certified = np.array([1.0, 100.0])
-    assert digits(np.array([[1.0], [100.0]]), certified) == 15
-    assert digits(np.array([[1.0], [100.1]]), certified) == pytest.approx(3)
-    assert digits(np.array([[np.nan], [1.0]]), certified) == 0
-    assert digits(np.array([[-7.0], [1.0]]), certified) == 0
-
-
 def test_a_file_in_nists_form_and_one_that_is_not(tmp_path):
     sets = {
         "note": "…",
@@ -235,16 +205,6 @@ def test_a_file_in_nists_form_and_one_that_is_not(tmp_path):
         list(nist_cases(tmp_path / "bad.json"))
     with pytest.raises(DatasetError, match="cannot be read"):
         list(nist_cases(tmp_path / "none.json"))
-
-
-def test_powers_are_rounded_once(nist):
-    case = next(one for one in nist_cases(nist) if one.name == "Filip")
-    first = json.loads(nist.read_text())["Filip"]["x"][0]
-    assert case.rows[0, 10] == float(Fraction(first) ** 10)
-
-
-def test_what_cannot_be_written_is_refused_before_anything_is_measured(tmp_path):
-    assert "folder" in refused("bench", "numerics", "--quick", "--json", tmp_path / "none" / "n.json")
 
 
 @pytest.mark.parametrize(("agreed", "flipped", "code"), [(True, 0, 0), (False, 0, 1), (True, 1, 1)])

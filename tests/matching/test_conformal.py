@@ -78,22 +78,6 @@ def test_each_material_is_covered(columns):
         assert (covered.mean(axis=(0, 1, 2)) >= 1 - error - 0.01).all()
 
 
-def test_crepes_finds_the_same_on_the_same_scores():
-    crepes = pytest.importorskip("crepes")
-    touches, seeds = kept(), range(100, 104)
-    conformal = Conformal.of(touches)
-    for seed in seeds:
-        asked, own = touch(seed % 4, seed), f"m{seed % 4}"
-        ours = conformal.p_values(asked)
-        places, strange, _, at = conformal.scores(asked)
-        for i, name in enumerate(conformal.materials):
-            classifier = crepes.ConformalClassifier()
-            classifier.fit(strange[places == i], seed=0)
-            theirs = classifier.predict_p(np.array([[at[i]]]), all_classes=True, smoothing=False)
-            assert float(np.ravel(theirs)[0]) == pytest.approx(ours[name].share)
-        assert own in ours
-
-
 def test_any_order_and_any_way_to_it_gives_the_same_bytes():
     touches = kept(of_each=8)
     asked = touch(1, 200, 25)

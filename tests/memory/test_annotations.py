@@ -1,6 +1,5 @@
 """Values and labels of touches: kept with their row, exact, and refused where they cannot be."""
 
-import copy
 import math
 
 import pytest
@@ -75,22 +74,6 @@ def test_a_value_is_kept_to_its_resolution_in_the_decimals_it_was_written_in():
 def test_a_quantity_that_cannot_be_is_refused(wrong):
     with pytest.raises(InputError, match="expected"):
         Quantity(**FORCE.model_dump() | wrong)
-
-
-@pytest.mark.parametrize("how", ["no path", "a path", "backwards", "a batch", "reopened", "a snapshot", "re-embedded"])
-def test_however_they_came_what_is_kept_is_the_same(tmp_path, whole, how):
-    with TactileLearner(**SETTINGS) if how == "no path" else opened(tmp_path / "m") as learner:
-        if how == "a batch":
-            with learner.batch():
-                feel(learner)
-        else:
-            feel(learner, ALL[::-1] if how == "backwards" else ALL)
-        if how == "re-embedded":
-            learner.reembed()
-        assert told(copy.deepcopy(learner) if how == "a snapshot" else learner) == whole
-    if how == "reopened":
-        with opened(tmp_path / "m", mode="read") as again:
-            assert told(again) == whole
 
 
 @pytest.mark.parametrize("keep", [0, 4])

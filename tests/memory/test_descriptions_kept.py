@@ -17,11 +17,6 @@ SAID = {
 }
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "m"
-
-
 def told(path, felt=OBSERVED, said=SAID):
     learner, receipts = filled(path, felt)
     for name, one in said.items():

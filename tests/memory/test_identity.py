@@ -1,7 +1,6 @@
 """What a memory says of its making: it opens from its path alone, with nothing embedded before the first touch."""
 
 import copy
-import dataclasses
 import json
 import pickle
 import subprocess
@@ -10,33 +9,25 @@ import sys
 import numpy as np
 import pytest
 from commands import refused, run
+from live_touches import Means
 from scroll_tactile_store import Store
+from touches import PAD, Windowed
 
 from examples.paper.transfer.maps import Maps
-from scroll_tactile import Joined, Kernels, Sensor, TactileLearner, Vision
+from scroll_tactile import Joined, Kernels, TactileLearner, Vision
 from scroll_tactile.embeddings.protocol import capabilities_of, window_plan
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.recipe import Recipe
 
-PAD = Sensor(name="pad", channels=3, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 EMBEDDINGS = {
     "seeded kernels": lambda: Kernels(dimension=64, seed=3),
     "joined": lambda: Joined(Kernels(dimension=64), Kernels(dimension=128, seed=1)),
 }
 
 
-class Means:
-    """An embedding of a user's own: the mean of each channel."""
-
-    name, dimension, bound, fingerprint = "means", 3, 1.0, "00" * 32
-
-    def embed(self, image):
-        return image.mean(axis=1)
-
-
 def touch(seed, readings=60):
-    return np.random.default_rng(seed).random((readings, 3))
+    return np.random.default_rng(seed).random((readings, 2))
 
 
 def filled(path, **settings):
@@ -128,7 +119,7 @@ class TestSnapshots:
             "except SystemExit: pass\n"
             "print('torch' in sys.modules)\n"
             "learner = pickle.loads(open(sys.argv[2], 'rb').read())\n"
-            "print(learner.digest()); print(learner.predict(np.random.default_rng(9).random((60, 3)))); print(learner)"
+            "print(learner.digest()); print(learner.predict(np.random.default_rng(9).random((60, 2)))); print(learner)"
         )
         words = [sys.executable, "-c", code, str(tmp_path / "m"), str(tmp_path / "learner")]
         output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
@@ -165,13 +156,6 @@ def prepare(path, embedding, change):
     identity = Identity.of(Recipe.of(PAD, embedding)).to_json()
     change(identity)
     Store.open(path, identity=identity).close()
-
-
-class Windowed(Kernels):
-    """An embedding of a user's own, which reads windows alone."""
-
-    name = "windowed"
-    capabilities = dataclasses.replace(Kernels.capabilities, reads_whole_touches=False)
 
 
 VIEWS = ("whole", "shape", "competing")

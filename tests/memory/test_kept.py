@@ -9,11 +9,11 @@ from touches import OBSERVED, PAD, Windowed, fed, filled, held, kept_of, require
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.matching.likelihood import LEVELS, MISSING, levels_of
+from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import KeptTouches
 from scroll_tactile.recipe import default_kept_touches
-from scroll_tactile.sensors import BIOTAC, GELSIGHT, Sensor
+from scroll_tactile.sensors import BIOTAC, GELSIGHT
 
 FEW = 5
 SPARE = [("d", (40 + i, 60)) for i in range(3)]
@@ -26,12 +26,6 @@ def test_levels_are_those_of_the_readings_and_at_most_twice_as_long_as_is_usual(
         assert np.array_equal(levels, levels_of(stream((0, readings))[:100], PAD))
     short = PAD.model_copy(update={"duration": 0.02})
     assert KeptTouches(short, 3).levels(stream((0, 60))).shape == (2, 2)
-
-
-def test_each_channel_has_levels_of_its_own_range():
-    sensor = Sensor(name="two", channels=2, rate=50, low=(0, -10), high=(1, 10), unit="", duration=1)
-    levels = levels_of(np.array([[0, -10], [1, 10], [0.5, 0], [2, -20], [np.nan, 5]]), sensor)
-    assert levels.tolist() == [[0, 254, 127, 254, MISSING], [0, 254, 127, 0, round(0.75 * (LEVELS - 1))]]
 
 
 @given(

@@ -1,6 +1,4 @@
-"""A memory: what a journal row holds, and what comes back from a store."""
-
-from types import SimpleNamespace
+"""What a journal row holds, packed and unpacked."""
 
 import numpy as np
 import pytest
@@ -10,16 +8,9 @@ from hypothesis.extra import numpy as arrays_of
 from scroll_tactile_store.encoding import encode_payload
 
 from examples.paper.readers import biotac_slide
-from scroll_tactile.errors import CapacityError, MismatchError
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
-from scroll_tactile.signals.windows import Scale, WindowPlan, extent
-from scroll_tactile.statistics.moments import MOST_ROWS
-from scroll_tactile.statistics.sample import stage_rows
-
-DIMENSION, SCALES = 4, (6, 20)
-READING = WindowPlan(SCALES)
-NARROW = Scale("window", 6)
+from scroll_tactile.signals.windows import Scale
 
 SHAPES = st.one_of(
     st.tuples(st.integers(1, 9), st.integers(1, 5)), st.tuples(st.integers(1, 3), st.just(2), st.just(3), st.just(3))
@@ -68,7 +59,10 @@ def test_real_touches_take_less_than_ten_kilobytes_on_average(real_data):
 
 
 def test_codes_come_back():
-    codes = {NARROW: np.arange(8, dtype=np.int32).reshape(2, 4), Scale("window", 300): np.zeros((1, 4), np.int32)}
+    codes = {
+        Scale("window", 6): np.arange(8, dtype=np.int32).reshape(2, 4),
+        Scale("window", 300): np.zeros((1, 4), np.int32),
+    }
     again = unpack_codes(pack_codes(codes))
     assert {scale: rows.tolist() for scale, rows in again.items()} == {
         scale: rows.tolist() for scale, rows in codes.items()
@@ -79,46 +73,3 @@ def test_readings_alone_need_their_embedding():
     arrays = pack_readings(np.ones((20, 2), np.float32))
     with pytest.raises(MismatchError, match="by the embedding that made the memory"):
         row_codes(arrays, None)
-
-
-def windows_of(seed):
-    """The codes of all windows of `touch(seed)`."""
-    rng = np.random.default_rng(seed)
-    columns = int(rng.integers(3, 60))
-    return {
-        Scale("window", scale): rng.integers(0, 2**20, size=(len(begin), DIMENSION), dtype=np.int32)
-        for scale, begin in extent(columns, SCALES).items()
-    }
-
-
-def touch(seed):
-    columns = int(np.random.default_rng(seed).integers(3, 60))
-    codes = dict(stage_rows(READING.scored_stages(columns), windows_of(seed)))
-    return "abcd"[seed % 4], np.random.default_rng([seed, 1]).bytes(32), columns, codes
-
-
-def filled(seeds):
-    made_with = SimpleNamespace(
-        plan=READING, embedding=SimpleNamespace(dimension=DIMENSION), exemplars=0, kept_touches=0
-    )
-    memory = Memory(made_with)
-    for i, seed in enumerate(seeds, start=1):
-        memory.add(*touch(seed), i, None, None)
-    return memory
-
-
-def content(memory):
-    pool = [(m, k, t.rows.tobytes(), t.pairs.tobytes()) for m, k, t in memory.sample]
-    return memory.statistics.digest(), pool, memory.sequence
-
-
-def test_a_full_memory_refuses_and_stays_as_it_was():
-    memory = filled(range(5))
-    moment = memory.statistics.second(NARROW)
-    held, moment.rows = moment.rows, MOST_ROWS
-    before = content(memory)
-    with pytest.raises(CapacityError):
-        memory.add(*touch(9), 6, None, None)
-    assert content(memory) == before
-    moment.rows = held
-    assert content(memory) == content(filled(range(5)))

@@ -51,16 +51,6 @@ def test_the_seed_decides_and_nothing_else_is_touched(net, images):
     assert report == [(step, 8) for step in range(1, 9)]
 
 
-@pytest.mark.parametrize("stem", ["torchvision", "universal"])
-def test_the_first_block_is_the_one_that_the_network_has(stem):
-    net = ResNet.random(3, stem=stem)
-    planes = torch.from_numpy(np.random.default_rng(0).standard_normal((2, 3, 20, 30), dtype=np.float32))
-    with torch.inference_mode():
-        maps = net(planes, last=0)[0]
-        below = torch.nn.functional.max_pool2d(maps, 3, 2, 1) if stem == "torchvision" else maps
-        assert torch.equal(first_block(net, planes), net.layer1[0](below))
-
-
 def test_alignment_does_not_see_turns_and_scales_and_sees_everything_else():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(400, 5))

@@ -1,7 +1,5 @@
 """Continual learning: formulas worked by hand, orders, requests, followed ridge heads, fleets, the default learner."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -20,18 +18,14 @@ from examples.paper.studies.continual_metrics import (
     metrics_of,
     tally,
 )
-from examples.paper.studies.default_learner import Checkout, answers
 from examples.paper.studies.fleet_study import deal, federated
 from examples.paper.studies.random_convolution import random_convolution
 from examples.paper.studies.recursive_ridge import RecursiveRidge
 from examples.paper.studies.robustness import SESSION, Robustness, Series, Simulated
 from examples.paper.studies.schedules import SCHEDULES, arrange, part_ends, si_blurry
 from examples.paper.studies.unlearning import Unlearning, relative_error, requests, ridge_from_scratch
-from scroll_tactile import Kernels
 from scroll_tactile.errors import InputError
-from scroll_tactile.recipe import default_kept_touches
 
-HERE = Path(__file__).resolve().parents[2]
 NAMES = [f"m{number}" for number in range(8) for _ in range(3)]
 
 
@@ -235,16 +229,3 @@ class TestRobustness:
         (tmp_path / "text.npz").write_text("none")
         with pytest.raises(InputError, match=r"text\.npz; they cannot be read"):
             Series(tmp_path / "text.npz").fits()
-
-    def test_another_checkout_answers_the_same_touches(self, monkeypatch):
-        monkeypatch.setitem(Kernels.__init__.__kwdefaults__, "dimension", 1008)  # as a process of its own has it
-        monkeypatch.setattr("scroll_tactile.recipe.default_kept_touches", default_kept_touches)
-        sets = recorded(PATCH, materials=3, each=6)
-        train = [(name, stream.readings) for name, stream in zip(sets.materials[::2], sets.streams[::2], strict=True)]
-        tests = {"whole": [stream.readings for stream in sets.streams[1::6]], "none": [sets.streams[3].readings[:2]]}
-        said = []
-        there = dict(Checkout(HERE)(sets.sensor, train, tests, lambda *progress: said.append(progress)))
-        assert there == dict(answers(sets.sensor, train, tests, lambda *progress: None))
-        assert ("learning", 0, 9) in said
-        with pytest.raises(InputError, match="ended with 1"):
-            list(Checkout(HERE)(sets.sensor, [("", train[0][1])], tests, lambda *progress: None))

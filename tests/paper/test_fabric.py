@@ -34,20 +34,6 @@ class TestScore:
         wanted = {"there": 0.0, "correct": 0.5, "precision": 0.0, "recall": None, "unanswered": 0}
         assert figures["constituents"]["part1"] == wanted
 
-    def test_it_agrees_with_scikit_learn(self):
-        metrics = pytest.importorskip("sklearn.metrics")
-        rng = np.random.default_rng(0)
-        truth, predicted = rng.uniform(size=(40, 3)) < 0.4, rng.uniform(size=(40, 3))
-        shares = rng.uniform(size=(2, 40, 3))
-        figures = score("abc", truth, predicted, (shares[0], shares[1]))
-        assert figures["score"] == pytest.approx(1 - metrics.hamming_loss(truth, predicted > 0.5))
-        assert figures["exact"] == pytest.approx(metrics.accuracy_score(truth, predicted > 0.5))
-        assert figures["share_error"] == pytest.approx(metrics.mean_absolute_error(shares[0], shares[1]))
-        precision, recall, *_ = metrics.precision_recall_fscore_support(truth, predicted > 0.5, average=None)
-        for i, name in enumerate("abc"):
-            assert figures["constituents"][name]["precision"] == pytest.approx(precision[i])
-            assert figures["constituents"][name]["recall"] == pytest.approx(recall[i])
-
     def test_what_was_not_predicted_counts_as_absent_and_is_counted(self):
         figures = score(["a", "b"], [[1, 0]] * 4, [[np.nan, 0.1]] * 4)
         assert (figures["score"], figures["constituents"]["a"]["unanswered"]) == (0.5, 4)

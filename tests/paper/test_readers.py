@@ -6,11 +6,10 @@ import re
 import numpy as np
 import pytest
 import torch
-from real_sets import CACHE
 
 from examples.paper.readers import fabric_slide, letter_spike, physiclear
 from examples.paper.readers.biotac_slide import MATERIALS, all_channels, load
-from examples.paper.readers.fabric_slide import CPM_FINGER, CPM_RATIOS, FABRICS
+from examples.paper.readers.fabric_slide import CPM_FINGER, CPM_RATIOS
 from examples.paper.readers.grades import read_grades
 from examples.paper.readers.labelled import Recordings, hold_out
 from examples.paper.readers.letter_spike import DOTS, LETTERS, NUSKIN, dots_of, letter_folds, read_events, stream_of
@@ -130,45 +129,35 @@ class TestBioTacSlide:
             load(folder, "biotac", seed=-1)
 
     @pytest.mark.parametrize(
-        ("content", "message"),
+        ("file", "content", "message"),
         [
-            (torch.zeros(399, 44), r"its shape is \(399, 44\)"),
-            (torch.zeros(400, 19), r"its shape is \(400, 19\)"),
-            (torch.zeros(400), r"its shape is \(400,\)"),
-            ([1, 2], "it holds a list"),
-            (torch.full((400, 44), torch.nan), "holds no sound readings: .*reading 0, channel 0 is nan"),
-            (b"not a tensor at all", "cannot be read, and may be damaged"),
-            (b"", "cannot be read, and may be damaged"),
+            ("mat1_1.pt", torch.zeros(399, 44), r"its shape is \(399, 44\)"),
+            ("mat1_1.pt", torch.zeros(400, 19), r"its shape is \(400, 19\)"),
+            ("mat1_1.pt", torch.zeros(400), r"its shape is \(400,\)"),
+            ("mat1_1.pt", [1, 2], "it holds a list"),
+            ("mat1_1.pt", torch.full((400, 44), torch.nan), "no sound readings: .*reading 0, channel 0 is nan"),
+            ("mat1_1.pt", b"not a tensor at all", "cannot be read, and may be damaged"),
+            ("mat1_1.pt", b"", "cannot be read, and may be damaged"),
+            ("icub_val_0.npy", np.zeros((200, 60, 75)), r"it holds \(200, 60, 75\)"),
+            ("labels_val_0.npy", np.arange(200), "labels 0 to 19"),
+            ("labels_val_0.npy", np.full(200, 0.5), "labels 0 to 19"),
+            ("labels_val_0.npy", np.zeros((200, 1), int), r"it holds \(200, 1\)"),
+            ("icub_val_0.npy", np.full((200, 6, 10, 75), np.nan), "holds no sound readings"),
+            ("icub_val_0.npy", np.array([None]), "cannot be read"),
         ],
     )
-    def test_a_biotac_file_that_is_not_as_published_is_named(self, folder, content, message):
-        path = folder / "raw_data" / "mat1" / "mat1_1.pt"
+    def test_a_file_that_is_not_as_published_is_named(self, folder, file, content, message):
+        (path,) = folder.rglob(file)
         if isinstance(content, bytes):
             path.write_bytes(content)
         else:
-            torch.save(content, path)
-        named(path, lambda: load(folder, "biotac"), message)
+            torch.save(content, path) if path.suffix == ".pt" else np.save(path, content)
+        named(path, lambda: load(folder, "biotac" if path.suffix == ".pt" else "roboskin"), message)
 
     def test_a_file_that_would_run_code_is_refused(self, folder, capsys):
         torch.save(Planted(), folder / "raw_data" / "mat1" / "mat1_1.pt")
         named(folder / "raw_data" / "mat1" / "mat1_1.pt", lambda: load(folder, "biotac"), "cannot be read")
         assert "ran code" not in capsys.readouterr().out
-
-    @pytest.mark.parametrize(
-        ("file", "content", "message"),
-        [
-            ("icub_val_0", np.zeros((200, 60, 75)), r"it holds \(200, 60, 75\)"),
-            ("labels_val_0", np.arange(200), "labels 0 to 19"),
-            ("labels_val_0", np.full(200, 0.5), "labels 0 to 19"),
-            ("labels_val_0", np.zeros((200, 1), int), r"it holds \(200, 1\)"),
-            ("icub_val_0", np.full((200, 6, 10, 75), np.nan), "holds no sound readings"),
-            ("icub_val_0", np.array([None]), "cannot be read"),
-        ],
-    )
-    def test_a_roboskin_file_that_is_not_as_published_is_named(self, folder, file, content, message):
-        path = folder / "compiled_data" / f"{file}.npy"
-        np.save(path, content)
-        named(path, lambda: load(folder, "roboskin"), message)
 
 
 class Planted:
@@ -229,12 +218,6 @@ class TestLetterSpike:
         assert set(second[:12]) == {0} and set(second[12:]) == {1000}
         assert not np.delete(readings, [5, 49], axis=1).any()
 
-    def test_taxels_lie_in_blocks_and_each_once(self):
-        places = letter_spike._places()
-        assert sorted(places) == list(range(80))
-        assert places[[35, 39, 20, 4, 0, 19]].tolist() == [5, 9, 35, 45, 49, 75]
-        assert places[[55, 59, 64, 60, 75]].tolist() == [0, 4, 40, 44, 74]
-
     def test_events_without_a_taxel_are_left_out_and_time_is_put_in_order(self, tmp_path):
         path = tmp_path / "A_0.csv"
         path.write_text(HEADER + "2.0,0,3,5\n1.0,-1,-1,-1\n1.5,0,4,6\n")
@@ -271,11 +254,6 @@ class TestLetterSpike:
         assert sorted(letter for group in groups for letter in group) == sorted(LETTERS)
         assert {len(group) for group in groups} == {3}
         assert groups == letter_folds(9, seed=4) != letter_folds(9, seed=5)
-
-    def test_the_real_one(self):
-        if not (CACHE / "letter-spike").is_dir():
-            pytest.skip("letter-spike is not at hand")
-        assert len(letter_spike.load(CACHE, seconds=0.5)) == 1348
 
 
 class TestFabricSlide:
@@ -337,13 +315,6 @@ class TestFabricSlide:
         np.testing.assert_allclose(shares.readings.mean(axis=1), 0, atol=1e-6)
         with pytest.raises(SensorMismatchError):
             fabric_slide.ratios(shares)
-
-    def test_the_real_one(self):
-        if not (CACHE / "FabricSlide").is_dir():
-            pytest.skip("FabricSlide is not at hand")
-        slides = fabric_slide.load(CACHE, FABRICS[4:5])
-        assert len(slides.recordings) == 72
-        assert not any(stream.clipped for stream in slides.recordings.streams)
 
 
 class TestPhysiclear:

@@ -1,6 +1,5 @@
 """The systems of the comparison: encoding, what each learns, and the training that the networks share."""
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from examples.paper.systems.catalogue import SYSTEMS, Catalogue
 from examples.paper.systems.descent import Batches, Course, Precision, TrainingError, descend, logits_of, seeded
 from examples.paper.systems.inputs import average_columns, one_width, picture
 from examples.paper.systems.least_squares import PENALTIES, LeastSquares
-from examples.paper.systems.networks import ConvLSTM, ResNetClassifier, SpikingNet
+from examples.paper.systems.networks import ConvLSTM, SpikingNet
 from examples.paper.systems.one_pass import OnePass
 from examples.paper.systems.own import is_own, require_own
 from examples.paper.systems.spikes import REST, encode
@@ -24,7 +23,6 @@ from examples.paper.systems.system_protocol import System, silent, unwatched
 from examples.paper.systems.trained import TrainedNetwork
 from scroll_tactile import Vision
 from scroll_tactile.clients.learning.metrics import Labelled
-from scroll_tactile.embeddings.resnet import ResNet
 from scroll_tactile.errors import InputError
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.augmentation import Augmentation
@@ -162,14 +160,6 @@ class TestCatalogue:
         with pytest.raises(InputError, match="came 'tpu'"):
             Catalogue(device="tpu").make("conv-lstm")
 
-    def test_a_missing_library_is_named_with_its_extra(self, monkeypatch: pytest.MonkeyPatch):
-        monkeypatch.setitem(sys.modules, "snntorch", None)
-        with pytest.raises(InputError, match=r"snntorch, which is not installed: .*\[spiking\]"):
-            fit(Catalogue(course=QUICK).make("snn"))
-        monkeypatch.setitem(sys.modules, "sklearn.svm", None)
-        with pytest.raises(InputError, match="scikit-learn, which cannot be imported"):
-            fit(Catalogue().make("svm"))
-
 
 def test_the_validation_chooses_and_is_learned_then():
     # No hyperplane parts the middle from what lies on both sides of it.
@@ -233,16 +223,6 @@ class TestTraining:
         assert received == [(1, 4), (2, 4), (3, 4), (4, 4)]
         assert system.epochs[-1].loss < system.epochs[0].loss
         assert system.epochs[0].validation_loss is not None
-
-    def test_with_augmentation_a_short_touch_goes_on_as_those_learned_did(self):
-        plain, tough = trained(), trained(augmentation=Augmentation())
-        widths: list[int] = []
-        for system in (plain, tough):
-            system.network.register_forward_hook(lambda module, inputs, output: widths.append(inputs[0].shape[-1]))
-            whole = TRAIN[0][1]
-            system.predict([whole, whole.first(whole.seconds / 2)])
-        assert widths[0] == 2 * widths[1] == widths[2]
-        assert len(widths) == 3  # of one width, and in one batch
 
     def test_the_rate_falls_on_a_plateau_and_the_best_epoch_stays(self):
         images = torch.randn(12, 2, generator=torch.Generator().manual_seed(0))
@@ -313,21 +293,6 @@ class TestNetworks:
         assert set(spikes.unique().tolist()) == {0.0, 1.0}
         gradient = next(net.parameters()).grad
         assert gradient is not None and gradient.abs().sum() > 0
-
-    def test_a_trained_network_starts_training_as_what_it_was(self):
-        net = ResNetClassifier(ResNet.random(0), 4, trained=True).eval()
-        with torch.no_grad():  # statistics folded away, as in some files
-            for norm in net.net.modules():
-                if isinstance(norm, nn.BatchNorm2d):
-                    norm.weight.fill_(3.0)
-                    norm.bias.fill_(0.1)
-        images = torch.rand(16, 12, 40, generator=torch.Generator().manual_seed(0)) * 2 - 1
-        with torch.no_grad():
-            before = net(images)
-            net.prepare([images[:10], images[10:]])
-            assert torch.allclose(net(images), before, rtol=1e-3, atol=1e-3 * float(before.abs().max()))
-            trained = net.train()(images)  # the batch has the statistics that the network now has
-        assert torch.allclose(trained, before, rtol=1e-2, atol=1e-2 * float(before.abs().max()))
 
 
 class Wrong:

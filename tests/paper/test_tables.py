@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from examples.paper.__main__ import app as paper
-from examples.tables import ROOMS, TEXTS, duration, filled, made, main, read_tables, seconds_of, table_of
+from examples.tables import ROOMS, TEXTS, filled, made, main, read_tables, table_of
 from scroll_tactile.errors import InputError
 
 TABLES = read_tables()
@@ -125,13 +125,6 @@ def test_a_table_is_printed_of_ones_own_results(room, tmp_path, capsys):
         main(["table1-gelsight", "--results", str(room)])
     with pytest.raises(SystemExit, match="expected a table out of"):
         main(["no-table"])
-
-
-def test_how_long_a_result_took():
-    cells = {"a": {"seconds": 60.0, "epochs": [{"seconds": 9.0}]}, "b": {"seconds": 60}}
-    assert seconds_of({"cells": cells}) == 120 and seconds_of({"seconds": 7, "cells": cells}) == 7
-    assert seconds_of({"sets": {"one": {"parts": [{"seconds": 1}, {}]}}}) == 1 and seconds_of({"cells": {}}) is None
-    assert [duration(seconds) for seconds in (40.2, 720, 12600)] == ["40 s", "12 min", "3.5 h"]
 
 
 @pytest.mark.parametrize(

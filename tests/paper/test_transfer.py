@@ -9,7 +9,7 @@ import pytest
 from examples.paper.readers.labelled import Recordings
 from examples.paper.readers.physiclear import HALF_SIZE
 from examples.paper.runs.cells import silent
-from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout, SharesPrior
+from examples.paper.transfer.aligning import Known, MapsAcross, OneReadout
 from examples.paper.transfer.few_touches import (
     WidestFeatures,
     WidestReadout,
@@ -19,7 +19,7 @@ from examples.paper.transfer.few_touches import (
 from examples.paper.transfer.sensors import ALONE, WAYS, SensorTransfer
 from examples.paper.transfer.sensors import rows as sensor_rows
 from examples.paper.transfer.shared_features import SharedFeatures
-from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows, some_frames
+from examples.paper.transfer.tasks import TRAINING, TUNED, TaskTransfer, rows
 from scroll_tactile import Kernels, Vision
 from scroll_tactile.errors import InputError, WeightsError
 from scroll_tactile.learner import TactileLearner
@@ -130,24 +130,19 @@ class TestTasks:
         steps = []
         assert list(study.run(lambda *step: steps.append(step))) == results
         assert steps == []
-        network = study.folder / "tuned-on-patch-fold-0.safetensors"
-        kept = network.read_bytes()
-        notes = study.folder / "transfer-tasks.json"
-        held = json.loads(notes.read_text())
-        again = f"strip, fold 0, {TUNED}patch"
+        network, notes = study.folder / "tuned-on-patch-fold-0.safetensors", study.folder / "transfer-tasks.json"
+        kept, held, again = network.read_bytes(), json.loads(notes.read_text()), f"strip, fold 0, {TUNED}patch"
         before = held["notes"].pop(again)
         notes.write_text(json.dumps(held))
         network.unlink()
-        found = {cell.key: figures for cell, figures in replace(study).run()}
-        assert found[again]["right"] == before["right"]
+        assert {cell.key: figures for cell, figures in replace(study).run()}[again]["right"] == before["right"]
         assert network.read_bytes() == kept
-        network.write_bytes(kept[:1000])
-        notes.write_text(json.dumps(held))
-        with pytest.raises(WeightsError, match="damaged"):
-            list(replace(study).run())
-        network.write_bytes(kept[:-100] + bytes([kept[-100] ^ 1]) + kept[-99:])
-        with pytest.raises(WeightsError, match="not the network that was fine-tuned on patch"):
-            list(replace(study).run())
+        flipped = kept[:-100] + bytes([kept[-100] ^ 1]) + kept[-99:]
+        for harmed, said in ((kept[:1000], "damaged"), (flipped, "not the network that was fine-tuned on patch")):
+            network.write_bytes(harmed)
+            notes.write_text(json.dumps(held))
+            with pytest.raises(WeightsError, match=said):
+                list(replace(study).run())
         network.write_bytes(kept)
         with pytest.raises(InputError, match="another run"):
             list(replace(study, epochs=2).run())
@@ -168,18 +163,6 @@ class TestTasks:
     def test_what_cannot_be_is_refused(self, study, change, words):
         with pytest.raises(InputError, match=words):
             replace(study, **change)
-
-    def test_some_frames_of_each_video(self):
-        frames = np.random.default_rng(0).integers(0, 255, (12, 1, 120, 160, 3))
-        streams = [validate(frame, HALF_SIZE) for frame in frames]
-        video = np.repeat(np.arange(3), 4)
-        camera = Recordings("frames", HALF_SIZE, streams, ["cup"] * 12, video, video % 2, ordered=False)
-        assert [stream.key for stream in some_frames(camera, 2).streams] == [streams[i].key for i in (0, 1, 4, 5, 8, 9)]
-        assert some_frames(camera, 9).repetition.tolist() == video.tolist()
-        touches = recorded(PATCH)
-        assert some_frames(touches, 1) is touches
-        with pytest.raises(InputError, match="1 frame"):
-            some_frames(camera, 0)
 
 
 def vectors(seed, each=12, shift=0.0, turn=None):
@@ -232,20 +215,6 @@ class TestAligning:
         mapped = MapsAcross(lambda stream: made[stream.key], known, turned=turned)
         assert self.share(mapped, streams, [0, 1, 12, 13, 24, 25], names) > 0.9
         assert self.share(OneReadout(lambda s: made[s.key], known, unlabelled=found), streams, [], names) < 0.9
-
-    def test_its_readout_is_lda_of_the_drawn_means(self, streams):
-        found, names = vectors(2, each=3)
-        made = self.features(streams[:9], found)
-        prior = SharesPrior(lambda stream: made[stream.key], self.known(streams), likeness=0.0)
-        for i in range(9):
-            prior.observe(names[i], streams[i])
-        scaled = (found - found.mean(axis=0)) / found.std(axis=0)
-        means = np.stack([scaled[i : i + 3].mean(axis=0) for i in (6, 3, 0)])  # fast, middle, slow
-        rest = scaled - np.repeat(means[::-1], 3, axis=0)
-        drawn = means / (1 + 0.3 / 3)
-        weights = np.linalg.solve(rest.T @ rest / 9 + 0.03 * np.eye(8), drawn.T)
-        assert prior.fitted[0] == pytest.approx(weights)
-        assert prior.fitted[1] == pytest.approx(np.einsum("cd,dc->c", drawn, weights) / 2)
 
     def test_before_anything_was_learned_it_is_an_error(self, streams):
         found, _ = vectors(2)

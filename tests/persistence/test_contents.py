@@ -3,18 +3,14 @@
 import copy
 import pickle
 
-import numpy as np
 import pytest
-from commands import run
 from forging import spoil_row
-from scroll_tactile.clients.learning.classification import observe_all
-from scroll_tactile_store import Store, StoreClosedError, StoreError, StoreFullError
+from scroll_tactile_store import StoreClosedError, StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
 from touches import SETTINGS, fed, filled, held, stream
 
 from scroll_tactile import TactileLearner
-from scroll_tactile.clients.learning.fleet import learn
-from scroll_tactile.clients.learning.sources import SourceOptions
+from scroll_tactile.clients.learning.metrics import observe_all
 from scroll_tactile.errors import AnnotationError
 from scroll_tactile.quantities import Quantity
 
@@ -145,78 +141,15 @@ class TestRelabel:
 FORCE = Quantity(name="force", unit="N", low=0, high=4, resolution=0.5)
 
 
-def _python(home):
-    with TactileLearner.open(home / "m", **SETTINGS) as learner:
-        receipts = [learner.observe("felt", touch()) for _ in range(2)]
-    assert [receipt.repeated for receipt in receipts] == [False, True]
-
-
-def _a_pass(home):
-    with TactileLearner.open(home / "m", **SETTINGS) as learner:
-        assert observe_all(learner, [("felt", learner.stream(touch()))] * 2) == 2
-        assert observe_all(learner, [("felt", learner.stream(touch()))] * 2) == 1  # it looks once more, at one
-
-
-def _observe_command(home):
-    for said in ("kept as observation 1", "learned already, as observation 1"):
-        assert said in run("observe", home / "m", "felt", home / "felt" / "0.npy").output
-
-
-def _learn_command(home):
-    assert "1 touch that it had already" in run("learn", home / "m", home / "felt", "--label-by", "folder").output
-
-
-def _fleet(home):
-    done = learn(home / "m", [home / "felt"], BY_FOLDER, workers=2, **SETTINGS)
-    assert (done.observations, done.repeated, done.refused) == (1, 1, [])
-
-
-def _merge(home):
-    for name in "mo":
-        with TactileLearner.open(home / name, **SETTINGS) as learner:
-            learner.observe("felt", touch())
-            if name == "m":
-                learner.pack(home / "packed")
-    with TactileLearner.open(home / "m") as learner:
-        for other in ("o", "packed"):
-            assert (merged := learner.merge(home / other)).observations == 0 and merged.shared == 1
-
-
-def _merge_of_a_forged_memory(home):
-    """Another program wrote a row of it a second time."""
-    filled(home / "o", [])[0].close()
-    with TactileLearner.open(home / "o") as other:
-        other.observe("felt", touch())
-    with Store.open(home / "o") as store:
-        row = store.record(1)
-        store.append(row.kind, row.label, row.key, attributes=row.attributes, arrays=row.arrays)
-    with TactileLearner.open(home / "m", **SETTINGS) as learner:
-        merged = learner.merge(home / "o")
-    assert (merged.observations, merged.shared) == (1, 1)
-
-
-BY_FOLDER = SourceOptions(by="folder")
-
-
-@pytest.mark.parametrize(
-    "learned",
-    [_python, _a_pass, _observe_command, _learn_command, _fleet, _merge, _merge_of_a_forged_memory],
-    ids=lambda way: way.__name__.strip("_"),
-)
-def test_a_touch_that_comes_twice_is_one_and_it_is_said(tmp_path, learned):
-    (tmp_path / "felt").mkdir()
-    for name in ("0.npy", "1.npy"):
-        np.save(tmp_path / "felt" / name, touch())
-    if "command" in learned.__name__:
-        TactileLearner.open(tmp_path / "m", **SETTINGS).close()
-    learned(tmp_path)
-    with TactileLearner.open(tmp_path / "m") as learner:
-        assert learner.materials == {"felt": 1}
-        assert held(learner) == held(fed([("felt", (7, 60))]))
-
-
-def touch():
-    return stream((7, 60)).astype(np.float32)
+def test_a_touch_that_a_pass_or_a_merge_brings_twice_is_one(tmp_path):
+    with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner, filled(tmp_path / "o", OBSERVED[:1])[0] as other:
+        touches = [(OBSERVED[0][0], learner.stream(stream(OBSERVED[0][1])))] * 2
+        assert [observe_all(learner, touches) for _ in range(2)] == [2, 1]  # it looks once more, at one
+        other.pack(tmp_path / "packed")
+        for brought in (other, tmp_path / "packed"):
+            merged = learner.merge(brought)
+            assert (merged.observations, merged.shared) == (0, 1)
+        assert held(learner) == held(fed(OBSERVED[:1]))
 
 
 class TestInMemory:

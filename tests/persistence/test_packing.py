@@ -93,13 +93,6 @@ class TestReading:
         with pytest.raises(NotAStoreError, match=r"opened with mode=\"read\", or merged"):
             TactileLearner.open(file)
 
-    def test_names_that_a_file_has_in_its_folder_lead_nowhere_else(self, tmp_path):
-        file = packed(tmp_path, OBSERVED[:2])
-        with zipfile.ZipFile(file) as listed:
-            names = listed.namelist()
-        assert names[0] == "CURRENT" and names[1].startswith("log-")
-        assert all(name.startswith("checkpoints/") for name in names[2:])
-
 
 @pytest.fixture(scope="module")
 def three(tmp_path_factory):
@@ -174,20 +167,6 @@ class TestDamage:
         monkeypatch.undo()
         require_refused(other, file, "format 9; this release reads format 2: upgrade it")
 
-    def test_sums_of_other_touches_than_its_rows(self, tmp_path, other):
-        """Rows of one memory, the checkpoint of another, and right checksums."""
-        one, two = packed(tmp_path, OBSERVED[:4], "one"), packed(tmp_path, OBSERVED[1:5], "two")
-        del one, two
-        with Store.open(tmp_path / "two.memory", mode="read") as store:
-            newest = store.latest()
-        with Store.open(tmp_path / "one.memory") as store:
-            store.commit(newest.arrays, last_sequence=newest.last_sequence, attributes=newest.attributes)
-        archive.write_archive(tmp_path / "one.memory", tmp_path / "forged")
-        before = other.digest()
-        with pytest.raises(DamageError, match=r"forged counts other touches than it names|forged counts \d touches of"):
-            other.merge(tmp_path / "forged")
-        assert other.digest() == before
-
     def test_a_full_disk_leaves_nothing_behind(self, tmp_path, monkeypatch):
         learner, _ = filled(tmp_path / "m", OBSERVED[:2])
 
@@ -244,11 +223,6 @@ def patched(file, mark, offset, value):
 LISTED, LOCAL = b"PK\1\2", b"PK\3\4"
 
 
-def doubled(name):
-    """A file more, of this name."""
-    return lambda file: zipped(file, [*entries(file), (name, b"any")])
-
-
 def relisted(offset, form, *values):
     """The list of files says other things of each."""
 
@@ -260,8 +234,8 @@ def relisted(offset, form, *values):
 
 
 def holding(make):
-    """A zip of other files."""
-    return lambda file: zipped(file, make(file))
+    """A zip of other files, made of those that there are."""
+    return lambda file: zipped(file, make(entries(file)))
 
 
 def overlapping(file):
@@ -283,10 +257,6 @@ def of_a_full_list(file):
     patched(file, b"PK\5\6", 12, struct.pack("<I", 2**31))
 
 
-def bomb(compress):
-    return lambda file: zipped(file, [*entries(file), ("log-00000002", bytes(2**22))], compress)
-
-
 def in_its_place(make):
     """Something else under the file's name."""
 
@@ -303,25 +273,21 @@ NAMES += ["checkpoints/00000001/a/c/" + "0/" * 70 + "0", "CURRENT", "log-0000000
 SHELL = b"#!/bin/sh\n"
 HARMS = {
     # what is done to a packed memory; what is said of it
-    **{f"a file {name[:30]}": (doubled(name), "(?i)fetch it again") for name in NAMES},
+    **{
+        f"a file {name[:30]}": (holding(lambda own, n=name: [*own, (n, b"any")]), "(?i)fetch it again")
+        for name in NAMES
+    },
     "a link": (lambda file: zipped(file, entries(file), links=["log-00000001"]), "as a link"),
-    "deflated": (bomb(zipfile.ZIP_DEFLATED), "as compressed or encrypted"),
-    "bzip2": (bomb(zipfile.ZIP_BZIP2), "as compressed or encrypted"),
-    "lzma": (bomb(zipfile.ZIP_LZMA), "as compressed or encrypted"),
+    "deflated": (lambda file: zipped(file, entries(file), zipfile.ZIP_DEFLATED), "as compressed or encrypted"),
     "encrypted": (lambda file: patched(file, LISTED, 8, struct.pack("<H", 1)), "as compressed or encrypted"),
     "another name in the list": (lambda file: patched(file, b"CURRENT", 0, b"CURRENS"), None),
     "a place in a file": (relisted(42, "<I", 7), "where another file begins, or none"),
-    "a place of another": (relisted(42, "<I", 0), "where another file begins, or none"),
-    **{f"{size} bytes each": (relisted(20, "<II", size, size), None) for size in (0, 1, 10**6, 2**32 - 2)},
+    **{f"{size} bytes each": (relisted(20, "<II", size, size), None) for size in (0, 2**32 - 2)},
     "files that overlap": (overlapping, "files that overlap"),
     "a script before it": (lambda file: file.write_bytes(SHELL + file.read_bytes()), "cut off or added to"),
-    "zeros before it": (lambda file: file.write_bytes(bytes(1000) + file.read_bytes()), "cut off or added to"),
     "a byte behind it": (lambda file: file.write_bytes(file.read_bytes() + b"x"), "cut off or added to"),
-    "nothing in it": (holding(lambda file: []), "no packed store"),
-    "other things": (holding(lambda file: [("readme.txt", b"any")]), "no packed store"),
-    "itself": (holding(lambda file: [("memory.zip", file.read_bytes())]), "no packed store"),
-    "all in a folder": (holding(lambda file: [("m/" + name, data) for name, data in entries(file)]), "no packed store"),
-    "itself for CURRENT": (holding(lambda file: [("CURRENT", file.read_bytes())]), None),
+    "nothing in it": (holding(lambda _: []), "no packed store"),
+    "all in a folder": (holding(lambda own: [("m/" + name, data) for name, data in own]), "no packed store"),
     "a list that fills the memory": (of_a_full_list, "its list of files takes 2147483648 bytes"),
     "too many files": (of_too_many_files, "(?i)fetch it again"),
     "a pipe": (in_its_place(os.mkfifo), None),
@@ -340,16 +306,6 @@ def test_one_that_was_made_to_harm(three, other, tmp_path, harm, match, monkeypa
     before = sorted(tmp_path.iterdir())
     require_refused(other, file, match)
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_rows_that_no_memory_packs(tmp_path, other):
-    """A retraction of all rows that there could ever be, in a file with right checksums."""
-    with Store.open(tmp_path / "m", identity=dict(other._ledger.store.identity)) as store:
-        store.append("retract", "", b"", attributes={"sequences": [[1, 2**60]]})
-        store.commit({}, last_sequence=1, attributes={})
-    archive.write_archive(tmp_path / "m", tmp_path / "forged")
-    require_refused(other, tmp_path / "forged", "row 1|checkpoint")
-    assert check_memory(tmp_path / "forged")
 
 
 def test_checking_one(three, tmp_path):

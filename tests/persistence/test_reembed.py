@@ -13,7 +13,6 @@ from examples.paper.transfer.maps import Maps
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.persistence import reembed
-from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.reembedding import reembed_memory
 
 OTHER = {
@@ -21,11 +20,6 @@ OTHER = {
     "not exact": lambda: Maps(layout=(2,)),
     "its own": lambda: Kernels(seed=0, dimension=64),
 }
-
-
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "m"
 
 
 @pytest.fixture(params=["exact", "not exact"])
@@ -90,6 +84,9 @@ def test_a_run_that_was_cut_short_goes_on(path, name, stopped, monkeypatch):
 
     with learner:
         with pytest.raises(KeyboardInterrupt):
+            learner.reembed(Kernels(seed=5, dimension=64), progress=stop)  # a run for another begins anew
+        steps.clear()
+        with pytest.raises(KeyboardInterrupt):
             learner.reembed(other, progress=stop)
         require_carried(learner, SMALL)
         learner.observe("a", stream((10, 60)))
@@ -98,19 +95,6 @@ def test_a_run_that_was_cut_short_goes_on(path, name, stopped, monkeypatch):
         assert steps[stopped][0] == min(4 * (stopped + 1), 18)
         assert steps[-1] == (18, 18)
         require_carried(learner, other)
-
-
-def test_a_run_for_another_embedding_begins_anew(path):
-    learner, _ = eventful(path)
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    with learner:
-        with pytest.raises(KeyboardInterrupt):
-            learner.reembed(OTHER["exact"](), progress=stop)
-        learner.reembed(Kernels(seed=5, dimension=64))
-        require_carried(learner, Kernels(seed=5, dimension=64))
 
 
 @pytest.mark.parametrize("call", range(3))
@@ -155,22 +139,6 @@ def test_what_is_observed_meanwhile_is_in_it(path, monkeypatch):
         kept = len(learner.observations())
         assert 8 <= kept <= 9
         assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
-
-
-def test_a_prediction_that_had_begun_is_of_the_memory_before(path, monkeypatch):
-    learner, _ = eventful(path)
-    reading, before = CurrentModel.reading, repr(learner.predict(stream((10, 60))))
-
-    def embedded_again(*given):
-        monkeypatch.undo()
-        extractor = reading(*given)
-        learner.reembed(OTHER["exact"]())
-        return extractor
-
-    monkeypatch.setattr(CurrentModel, "reading", embedded_again)
-    assert repr(learner.predict(stream((10, 60)))) == before
-    assert learner.embedding.dimension == 128
-    learner.close()
 
 
 def test_rows_that_are_not_those_of_the_checkpoint_are_not_carried_over(path):

@@ -7,21 +7,12 @@ import pytest
 from commands import run
 from forging import spoil_row
 from scroll_tactile_store import DamageError, Store
-from touches import OBSERVED, PAD, fed, held, stream, without
+from touches import OBSERVED, PAD, SMALL, OwnKernels, fed, held, stream, without
 
 from examples.paper.transfer.maps import Maps
-from scroll_tactile import Capabilities, Joined, Kernels, TactileLearner
+from scroll_tactile import Joined, TactileLearner
 from scroll_tactile.persistence import open_memory
 
-
-class OwnKernels(Kernels):
-    """An embedding of a user's own, exact: a memory cannot make it, and keeps codes beside the readings."""
-
-    name = "own kernels"
-    capabilities = Capabilities(embeds_windows=True, exact=True)
-
-
-SMALL = Kernels(seed=0, dimension=64)
 MADE = {
     "kernels": {"embedding": SMALL},
     "a user's own": {"embedding": OwnKernels(seed=0, dimension=64)},

@@ -8,11 +8,6 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.errors import InputError, MaterialError, ObservationError
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "m"
-
-
 def sources(learner):
     return [(row.sequence, row.material, row.state, row.source) for row in learner.observations()]
 

@@ -110,23 +110,6 @@ def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares)
 
 
 class TestDescribing:
-    def test_after_the_touching_is_as_before_to_the_byte(self):
-        names = ["c", "l", "s", "cl", "ls", "csw"]
-        before, after = (TactileLearner(sensor=SKIN, embedding=Kernels(seed=0, dimension=64)) for _ in range(2))
-        for name in reversed(names):
-            before.describe(name, described(mixtures()[name]))
-        for name, at in itertools.product(names, range(4)):
-            before.observe(name, touch(mixtures()[name], at))
-        for name, at in itertools.product(reversed(names), range(4)):
-            after.observe(name, touch(mixtures()[name], at))
-        digest = after.digest()
-        for name in names:
-            after.describe(name, described(mixtures()[name]))
-        assert after.digest() == before.digest() == digest
-        for seed in range(4):
-            stream = touch(mixtures()["sw"], 50 + seed)
-            assert repr(after.compose(stream)) == repr(before.compose(stream))
-
     def test_a_later_description_changes_the_answer_without_a_touch(self, three):
         trained = copy.deepcopy(three)
         for name in "cls":

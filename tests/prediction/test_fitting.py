@@ -1,7 +1,5 @@
 """A model is fitted once, to touches held out: to their beginnings and to them at other paces."""
 
-import copy
-
 import numpy as np
 import pytest
 
@@ -61,23 +59,6 @@ def table(model):
     ]
     arrays = [said.chances, said.novelty, *(part for row in rows for part in vars(row.calibration).values())]
     return numbers, [array.tobytes() for array in arrays]
-
-
-def test_a_readout_without_a_touch_is_one_that_followed_its_going(model, extractor):
-    material, touch = TOUCHES[5]
-    codes = extractor.codes(extractor.image(touch))
-    for scale, readout in model.readouts.items():
-        before = readout.scores(codes[scale].mean(axis=0), np.arange(len(NAMES)), "lda")
-        without = readout.without(material, codes[scale].astype(np.float64))
-        followed = copy.deepcopy(readout)
-        followed.follow([(material, codes[scale], -1)])
-        asked = codes[scale].mean(axis=0)
-        places = np.arange(len(NAMES))
-        assert without.scores(asked, places, "lda") == pytest.approx(followed.scores(asked, places, "lda"), rel=1e-9)
-        assert without.novelty(asked, places) == pytest.approx(followed.novelty(asked, places), rel=1e-7)
-        own = NAMES.index(material)
-        assert without.scores(asked, places, "lda")[own] < before[own]
-        assert readout.scores(asked, places, "lda").tobytes() == before.tobytes()  # it stays as it was
 
 
 def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model, extractor):

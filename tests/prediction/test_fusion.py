@@ -16,7 +16,7 @@ from scroll_tactile.prediction.fusion import (
     fuse,
     moments_of,
 )
-from scroll_tactile.prediction.moment_table import Moment, tempered
+from scroll_tactile.prediction.moment_table import tempered
 from scroll_tactile.readouts.calibration import FEWEST, Calibration, HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]
@@ -143,14 +143,6 @@ def test_where_too_few_were_held_out_the_readouts_decide(count):
         assert (moment.outlier_rate > 0) == (moment.model_outlier_rate > 0) == (count > 0)
 
 
-def test_without_kept_touches_the_readouts_have_the_word():
-    rng = np.random.default_rng(5)
-    own = judged(10, evidence(rng, KEYS), None)
-    fusion = fuse(None, [own], [own], [], {}, 1.0)
-    assert fusion.complete.model_weight == 1.0
-    assert fusion.trajectories.novelty.size == 0
-
-
 def test_the_moment_of_a_touch_is_the_latest_that_it_reached():
     rng = np.random.default_rng(6)
     fusion = fused(*(judged(columns, evidence(rng, KEYS), None) for columns in (10, 20, 40)))
@@ -158,32 +150,6 @@ def test_the_moment_of_a_touch_is_the_latest_that_it_reached():
     paced = [judged(columns, evidence(rng, KEYS), None) for columns in (20, 80)]
     fusion = fuse(MATCHER, [paced[0]], paced, KEYS, dict.fromkeys(KEYS, 1.0), 1.0)
     assert [fusion.at_pace(columns).steps for columns in (2, 39, 41, 900)] == [20, 20, 80, 80]
-
-
-def test_trajectories_are_what_is_then_said_of_the_touches():
-    rng = np.random.default_rng(7)
-    half = KEYS[::2]
-    fusion = fused(
-        judged(10, evidence(rng, KEYS), None), judged(20, evidence(rng, half), None, half), judged(40, None, None)
-    )
-    said = fusion.trajectories
-    assert said.chances.shape == (len(KEYS), 2, C)
-    np.testing.assert_allclose(said.chances[:, 0].sum(axis=1), 1.0)
-    assert np.isnan(said.chances[1::2, 1]).all() and not np.isnan(said.chances[::2, 1]).any()
-    assert np.nanmax(said.chances) <= max([1 - m.outlier_rate * (1 - 1 / C) for m in fusion.moments[:-1]])
-    right = (said.chances[:, 0].argmax(axis=1) == said.targets).mean()
-    assert said.chances[:, 0].max(axis=1).mean() == pytest.approx(right, abs=0.08)
-
-
-def test_it_is_a_function_of_the_set():
-    rng = np.random.default_rng(8)
-    rows = evidence(rng, KEYS), evidence(rng, KEYS)
-    order = rng.permutation(len(KEYS))
-    one = fused(judged(10, *rows)).complete
-    turned = judged(10, rows[0][order], rows[1][order], [KEYS[i] for i in order])
-    other = fused(turned).complete
-    assert (other.model_weight, other.match_weight) == (one.model_weight, one.match_weight)
-    assert other.outlier_rate == one.outlier_rate
 
 
 def test_touches_are_chosen_evenly_and_the_least_sure_beside_them(monkeypatch):
@@ -220,15 +186,6 @@ def test_noise_leaves_the_word_to_kept_touches_by_themselves():
     assert moment.match_weight_at(way(0.0), 1.0) == pytest.approx(beta(moment))
     assert moment.match_weight_at(way(1.0), 1.0) == pytest.approx(1 / (1 + (1 / moment.lone_match_weight - 1) * 0.5))
     assert moment.match_weight_at(way(0.0), 0.5) > moment.match_weight_at(way(0.0), 1.0)
-
-
-def test_the_threshold_of_a_moment_is_the_conformal_quantile_of_its_touches():
-    calibration = Calibration(
-        np.ones(1), np.array([[0.0, 1.0]]), np.ones(1), np.arange(1.0, 100.0), np.arange(51.0, 150.0)
-    )
-    numbers = 1.0, 0.5, 0.5, 0.0, 0.0, np.inf, 0.0, 1.0
-    moment = Moment(10, 0, calibration, *numbers)
-    assert [moment.threshold(share) for share in (0.05, 0.5)] == [calibration.threshold(share) for share in (0.05, 0.5)]
 
 
 def test_the_further_off_a_touch_lies_the_less_the_readouts_weigh_and_at_another_pace_half_as_much():

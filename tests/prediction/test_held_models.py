@@ -14,7 +14,7 @@ from touches import PAD, SMALL
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live import session
-from scroll_tactile.matching.likelihood import Likelihood, Noise
+from scroll_tactile.matching.likelihood import Noise
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft
 
@@ -194,25 +194,6 @@ def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
         learner.observe("a", touch("a", 60 + seed, 20))
     assert learner.memory.statistics.fifth_percentile_length == 20
     assert draft.fit(learner._predictor.extractor).least == other.model().least == 50
-
-
-def test_tables_are_there_for_any_number_of_threads():
-    likelihood, raised = Likelihood(np.full(255, 3.0), np.ones(255)), []
-    expected = {step: likelihood._made(Noise(step)).logs.tobytes() for step in range(0, 420, 42)}
-
-    def ask(seed):
-        try:
-            for step in np.random.default_rng(seed).permutation(sorted(expected)).tolist():
-                assert likelihood.table(Noise(step)).logs.tobytes() == expected[step]
-        except BaseException as error:
-            raised.append(error)
-
-    threads = [threading.Thread(target=ask, args=(seed,)) for seed in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not raised
 
 
 # Embedded again

@@ -88,24 +88,6 @@ def test_readings_of_a_hundredth_of_the_range_whose_zero_moved():
     assert right(windowed, ASKED, lambda touch: small(touch) + 0.2) <= 0.75
 
 
-@pytest.mark.parametrize("kind", [Kernels, Windowed])
-def test_materials_that_were_only_ever_touched_briefly(kind):
-    brief = set(NAMES[3:])
-
-    def observed(material, touch):
-        return touch.first(0.35) if material in brief else touch
-
-    learner = learned([(name, observed(name, touch)) for name, touch in TOUCHES], kind(dimension=256))
-    assert right(learner, [(name, observed(name, touch)) for name, touch in ASKED]) >= 0.9
-    for seconds in (0.05, 0.3, 0.6, 1.0):
-        for name, touch in ASKED[:4]:
-            prediction = learner.predict(touch.first(seconds))
-            assert {material for material, _ in prediction.ranking} == set(NAMES)
-            assert sum(share for _, share in prediction.ranking) == pytest.approx(1)
-            assert np.isfinite(prediction.novelty)
-            assert learner.predict(touch.first(seconds), scene=[name]).probability == 1
-
-
 def test_joined_kernels_have_views(viewed):
     joined = learned(TOUCHES, Joined(Kernels(dimension=128), Kernels(seed=2, dimension=128)))
     assert joined.plan.views == viewed.plan.views != ()

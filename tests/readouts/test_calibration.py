@@ -62,22 +62,6 @@ def calibrated(kind="lda", **settings):
     return stages_of(*scene(**settings), kind)
 
 
-def logits(touches, classes, seed=0, size=2.0):
-    """Scores whose softmax is the truth, and targets drawn from it."""
-    rng = np.random.default_rng(seed)
-    scores = rng.normal(size=(touches, classes)) * size
-    chances = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
-    targets = [int(rng.choice(classes, p=row)) for row in chances]
-    return scores[:, None, :], targets
-
-
-@pytest.mark.parametrize("factor", [0.01, 0.25, 1.0, 4.0, 30.0])
-def test_the_temperature_undoes_whatever_the_scores_were_multiplied_by(factor):
-    scores, targets = logits(1500, 5)
-    weights = fit_weights(scores * factor, targets, np.array([1 / factor]))
-    assert weights * factor == pytest.approx(1.0, rel=0.12)
-
-
 def documented_loss(weights, scores, targets, prior):
     """Held-out log loss, and half a touch's worth of (w / prior − 1)² / 2 for each scale."""
     value = 0.25 * float(np.square(weights / prior - 1).sum())
@@ -200,26 +184,6 @@ def test_a_touch_counts_only_where_every_scale_left_it_out():
     narrow, wide = stages_of(statistics, sample)
     assert len(narrow.novelties) == 27
     assert len(wide.novelties) == 10  # four of a and six of d
-
-
-@pytest.mark.parametrize("kind", ["lda", "ridge"])
-def test_small_and_dull_memories_calibrate_without_a_warning(kind):
-    for dull in ({"materials": 1, "touches": 1}, {"materials": 2, "touches": 2}, {"noises": (0, 0), "unit": 0}):
-        for stage in calibrated(kind, **dull):
-            assert np.isfinite(stage.weights).all()
-            assert np.isfinite(stage.threshold(0.05))
-            assert np.isfinite(stage.novelty(np.array([1.0] * len(stage.weights))))
-
-
-def test_the_order_of_what_was_observed_changes_no_bit():
-    statistics, pool = scene()
-    turned = TouchSample()
-    for entry in reversed(list(pool)):
-        turned.add(*entry)
-    for ours, theirs in zip(stages_of(statistics, pool), stages_of(statistics, turned), strict=True):
-        assert ours.weights.tobytes() == theirs.weights.tobytes()
-        assert ours.scale_novelty.tobytes() == theirs.scale_novelty.tobytes()
-        assert ours.novelties.tobytes() == theirs.novelties.tobytes()
 
 
 positive = st.floats(1e-3, 1e6)

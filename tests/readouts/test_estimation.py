@@ -106,21 +106,6 @@ def test_risks_too_small_for_the_touches_give_the_range(estimator):
     assert asked(estimator, felt("felt", 3)[0], risk=0.1)["force"].missing == ""
 
 
-@pytest.mark.parametrize(
-    ("touches", "missing"),
-    [
-        (LEARNED[:20], "all of 'felt'; it takes two materials"),
-        ([], "0 sampled touches"),
-        ([valued(name, 0) for name in NAMES[:2]], "2 sampled touches"),
-        ([valued(name, i, value=1.0) for name in NAMES[:2] for i in range(3)], "the same value, 1;"),
-    ],
-)
-def test_what_is_missing_is_said_and_no_number_given(touches, missing):
-    estimate = asked(estimator_of(touches), felt("felt", 3)[0])["force"]
-    assert estimate.value is None and estimate.interval is None and estimate.width is None
-    assert missing in estimate.missing and estimate.unit == "N"
-
-
 def test_touches_without_a_value_have_no_part_and_cost_nothing():
     heat = Quantity(name="hot", unit="K", low=200.0, high=400.0, resolution=0.1)
     mixed = [valued(name, 200 + i, quantity=heat, value=300.0 + i % 7) for i, (name, *_) in enumerate(LEARNED[::4])]

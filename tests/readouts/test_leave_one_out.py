@@ -46,6 +46,7 @@ def groups_of(touches):
     return groups
 
 
+KIND = st.sampled_from(["lda", "ridge"])
 # Of a touch: material, rows, and how often they are there.
 KINDS = st.lists(st.tuples(st.integers(0, 4), st.integers(1, 3), st.integers(1, 2)), min_size=2, max_size=9)
 
@@ -74,23 +75,31 @@ def require_left_out(found, place, row, own, without, every, material, weight, r
     require_near(found.diagonal_distances[place], far * (1 - share**2) if best == material else far)
 
 
-@settings(max_examples=25, deadline=None)
-@given(KINDS, st.integers(0, 999), st.sampled_from([0, 900_000]), st.sampled_from(["lda", "ridge"]), st.booleans())
-def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind, others):
-    """With the same P and γ. others: some materials are of no sampled touch, as where there are very many."""
+@settings(max_examples=40, deadline=None)
+@given(KINDS, st.integers(0, 999), st.sampled_from([0, 900_000]), KIND, st.booleans(), st.booleans())
+def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind, others, elsewhere):
+    """With the same P and γ. others: some materials are of no sampled touch, as where there are very many.
+
+    elsewhere: other rows are asked in place of its own, as of its beginnings, or of the touch at another pace.
+    """
     touches = touches_of(kinds, seed, offset)
     unsampled = {"d", "e"} if others and kind == "lda" else set()
     if not {material for material, *_ in touches} - unsampled:
         return
     statistics, sample = learned(touches, unsampled)
     reference = [name for name in statistics.names(SCALE) if name not in unsampled]
-    task = Task.of(statistics, SCALE, reference)
-    readout = task.solve()
-    found = held_out_scores(readout, sample, STAGES, kind)
+    readout = Task.of(statistics, SCALE, reference).solve()
+    places, asked = {(material, key): at for at, (material, key, _) in enumerate(sample)}, None
+    if elsewhere:
+        rng = np.random.default_rng(seed + 1)
+        asked = {
+            place: {2 * at: np.rint(rng.normal(size=WIDTH) * 60_000 + offset) for at in range(int(rng.integers(0, 4)))}
+            for place in places.values()
+        }
+    found = held_out_scores(readout, sample, STAGES, kind, asked)
     assert found.names == reference
     total = Fraction(int(statistics.second(SCALE).rows))
     excess = total / sum(int(count) for count in statistics.counts(SCALE, reference))
-    places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
     every = Dense(groups_of(touches), readout.penalty, readout.share)
     judged = set()
     for i, (material, key, rows, copies) in enumerate(touches):
@@ -98,44 +107,13 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
         if material in unsampled or material not in {other for other, *_ in rest}:
             continue
         dense = Dense(groups_of(rest), readout.penalty, readout.share, reference, total, excess)
-        for stage, row in enumerate(rows):
-            judged.add((places[material, key], stage))
-            place = found.rows[places[material, key], stage]
-            require_left_out(found, place, row, row, dense, every, material, len(rows) * copies, readout, kind)
-    assert found.rows.keys() == judged
-    assert sorted(found.rows.values()) == list(range(len(found.scores)))
-
-
-@settings(max_examples=15, deadline=None)
-@given(KINDS, st.integers(0, 999), st.sampled_from([0, 900_000]), st.sampled_from(["lda", "ridge"]))
-def test_what_is_asked_in_place_of_its_rows_is_scored_as_if_the_touch_had_never_been_observed(
-    kinds, seed, offset, kind
-):
-    """The beginnings of a touch, or the touch at another pace: other rows, of which the readout has none."""
-    touches = touches_of(kinds, seed, offset)
-    statistics, sample = learned(touches)
-    reference = statistics.names(SCALE)
-    readout = Task.of(statistics, SCALE, reference).solve()
-    total = Fraction(int(statistics.second(SCALE).rows))
-    places = {(material, key): number for number, (material, key, _) in enumerate(sample)}
-    rng = np.random.default_rng(seed + 1)
-    asked = {
-        place: {2 * at: np.rint(rng.normal(size=WIDTH) * 60_000 + offset) for at in range(int(rng.integers(0, 4)))}
-        for place in places.values()
-    }
-    found = held_out_scores(readout, sample, STAGES, kind, asked)
-    every = Dense(groups_of(touches), readout.penalty, readout.share)
-    judged = set()
-    for i, (material, key, rows, copies) in enumerate(touches):
-        rest = [other for j, other in enumerate(touches) if i != j]
-        if material not in {other for other, *_ in rest}:
-            continue
-        dense = Dense(groups_of(rest), readout.penalty, readout.share, reference, total, Fraction(1))
-        for number, codes in asked[places[material, key]].items():
+        for number, codes in (asked[places[material, key]] if elsewhere else dict(enumerate(rows))).items():
             judged.add((places[material, key], number))
             place, row = found.rows[places[material, key], number], codes.astype(np.int64)
-            require_left_out(found, place, row, rows[-1], dense, every, material, len(rows) * copies, readout, kind)
+            own = rows[-1] if elsewhere else row
+            require_left_out(found, place, row, own, dense, every, material, len(rows) * copies, readout, kind)
     assert found.rows.keys() == judged
+    assert sorted(found.rows.values()) == list(range(len(found.scores)))
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])

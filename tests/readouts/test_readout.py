@@ -77,19 +77,6 @@ def test_of_materials_fifty_thousand_spreads_apart_some_digits_of_novelty_and_ri
     require_textbook(readout_of(statistics_of(touches)), touches, [*PROBES, touches[0][1][0]], 1e-6)
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 10**6), st.integers(2, 9), st.integers(1, 3), st.integers(1, 9))
-def test_of_a_reference_and_other_materials(seed, materials, each, reference):
-    touches = [touch("abcdefghi"[i % materials], seed + i) for i in range(materials * each)]
-    names = sorted({name for name, _ in touches})[: min(reference, materials)]
-    readout = readout_of(statistics_of(touches), names)
-    few = sorted({name for name, _ in touches})[-3:]
-    dense = Dense(groups_of(touches), readout.penalty, readout.share, names)
-    for row in PROBES:
-        found = readout.scores(row.astype(float), [readout.places[name] for name in few], "lda")
-        require_near(found, dense.lda(row, few, readout.origin))
-
-
 # A touch that comes, of a material and a number; or one that goes, by its place among those that are there.
 CHANGES = st.lists(
     st.lists(

@@ -13,11 +13,6 @@ from scroll_tactile import TactileLearner
 DAMAGED = 5  # a row, of the second touch of "b"
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "m"
-
-
 def harm(path, place):
     """Flip a bit in the frame of a row, or in its head."""
     with LogReader(log_of(path)) as log:

@@ -148,8 +148,7 @@ class Kernels:
         """
         _require_image(image)
         width = image.shape[1] if width is None else width
-        features: npt.NDArray[np.float32] = self.embed_windows(image, {width: [0]})[width][0]
-        return features
+        return np.asarray(self.embed_windows(image, {width: [0]})[width][0])
 
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
@@ -287,12 +286,6 @@ def _dilations(width: int) -> list[int]:
     return dilations
 
 
-def _contests(features: int, width: int | None) -> dict[int, int]:
-    """Dilation → the number of its groups of competing kernels in an image of a width."""
-    dilations = _dilations(width) if width else []
-    return dict(zip(dilations, groups_by_dilation(features, len(dilations)), strict=True)) if dilations else {}
-
-
 @lru_cache(maxsize=256)
 def _parts(
     dimension: int,
@@ -303,7 +296,8 @@ def _parts(
 ) -> list[Part]:
     """What is counted of each dilation: for windows, by width their first steps, and for an image that competes."""
     shares = {width: _shares(channels, _thresholded(dimension, width), width) for width, _ in widths}
-    contests = _contests(dimension, competing)
+    contests = _dilations(competing) if competing else []
+    groups = dict(zip(contests, groups_by_dilation(dimension, len(contests)), strict=True))
     parts = []
     for dilation in _dilations(max([*shares, competing or 0])):
         windows: list[tuple[int, int]] = []
@@ -315,7 +309,7 @@ def _parts(
                 windows += [(start, start + places) for start in starts]
                 pools.append((width, slice(first, len(windows)), features, places))
         most = max((features for _, _, features, _ in pools), default=0)
-        parts.append(Part(dilation, most, tuple(windows), contests.get(dilation, 0), tuple(pools)))
+        parts.append(Part(dilation, most, tuple(windows), groups.get(dilation, 0), tuple(pools)))
     return parts
 
 

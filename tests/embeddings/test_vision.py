@@ -42,7 +42,6 @@ def test_features_are_the_definition(real_weights):
 def test_dimension_is_the_sum_of_the_stages_widths():
     assert RANDOM.dimension == 64 + 128 + 256
     assert Vision(None, seed=0, stages=(4,)).dimension == 512
-    assert Vision(None, seed=0, stages=(0, 4), depth=50).dimension == 64 + 2048
     with pytest.raises(InputError, match="needs a seed"):
         Vision({}, seed=0)
 
@@ -81,15 +80,6 @@ def test_a_window_covers_the_columns_of_a_map_that_it_should(columns, shrink, da
     pooled = pool_windows([stage], columns, [(start, width)])[0, 0].numpy()
     expected = np.array([np.arange(first, after).mean(), 1.0])
     assert np.allclose(pooled, expected / np.linalg.norm(expected))
-
-
-def test_bulk_is_the_same_but_for_the_last_bits():
-    pictures = [image(19, columns, seed) for seed in range(3) for columns in (40, 60)]
-    pictures[0].flags.writeable = False
-    bulk = RANDOM.embed_bulk(pictures)
-    assert bulk.shape == (6, RANDOM.dimension)
-    assert np.abs(bulk - np.stack([RANDOM.embed(one) for one in pictures])).max() < 1e-5
-    assert RANDOM.embed_bulk([]).shape == (0, RANDOM.dimension)
 
 
 def test_the_fingerprint_is_of_all_that_features_depend_on():
@@ -159,7 +149,6 @@ def test_planes_are_scaled_as_in_the_networks_training():
         {"stages": (1, 1)},
         {"stages": (5,)},
         {"seed": None},
-        {"depth": 19},
     ],
     ids=str,
 )
@@ -169,7 +158,7 @@ def test_settings_that_do_not_fit_are_refused(wrong):
 
 
 def test_the_universal_stem_says_what_is_too_small_for_it():
-    vision = Vision(ResNet.random(0, 18, "universal").state_dict())
+    vision = Vision(ResNet.random(0, "universal").state_dict())
     assert vision.embed(image(3, 3)).shape == vision.embed(image(3, 2)).shape == (448,)
     assert vision.fingerprint
     with pytest.raises(InputError, match="at least 3 channels"):

@@ -13,7 +13,7 @@ from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import CapacityError, MismatchError
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
-from scroll_tactile.signals.windows import Scale, WindowPlan, extent
+from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import MOST_ROWS
 from scroll_tactile.statistics.sample import stage_rows
 
@@ -87,7 +87,7 @@ def windows_of(seed):
     columns = int(rng.integers(3, 60))
     return {
         Scale("window", scale): rng.integers(0, 2**20, size=(len(begin), DIMENSION), dtype=np.int32)
-        for scale, begin in extent(columns, SCALES).items()
+        for scale, begin in WindowPlan(SCALES).extent(columns).items()
     }
 
 

@@ -208,22 +208,18 @@ def bank(seed: int, channels: int, dilation: int) -> Bank:
     """Make the bank of a dilation for images of `channels` rows; the same arguments give the same bank."""
     rng = np.random.default_rng([seed, channels, dilation])
     count = bank_size(channels, dilation)
-    rows = _rows(rng, count)
-    summed = np.zeros((-(-count // ROUND) * ROUND, channels), dtype=np.float32)
+    # In each round of 84 all positions of the heavy taps, shuffled.
+    row = {heavy: i for i, heavy in enumerate(HEAVY)}
+    places = np.array([row[heavy] for heavy in combinations(range(TAPS), 3)], dtype=np.intp)
+    rounds = -(-count // ROUND)
+    rows = np.concatenate([ROUND * i + places[rng.permutation(ROUND)] for i in range(rounds)])[:count]
+    summed = np.zeros((rounds * ROUND, channels), dtype=np.float32)
     most = min(channels, MOST_CHANNELS)
     for row in rows:
         chosen = min(most, int((most + 1) ** rng.random()))
         summed[row, rng.permutation(channels)[:chosen]] = 1
     without = Bank(dilation, summed, rows, np.empty((0, count), dtype=np.float32))
     return replace(without, thresholds=_thresholds(rng, without, channels))
-
-
-def _rows(rng: np.random.Generator, count: int) -> npt.NDArray[np.intp]:
-    """The row of each kernel: in each round of 84 all positions of the heavy taps, shuffled."""
-    row = {heavy: i for i, heavy in enumerate(HEAVY)}
-    rows = np.array([row[heavy] for heavy in combinations(range(TAPS), 3)], dtype=np.intp)
-    rounds = -(-count // ROUND)
-    return np.concatenate([ROUND * i + rows[rng.permutation(ROUND)] for i in range(rounds)])[:count]
 
 
 def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Floats:
@@ -381,21 +377,18 @@ def competing_groups(bank: Bank, count: int) -> Groups:
 
 def count_by_c(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]:
     """What `count` gives, by the compiled module. Raises ValueError for requests that do not fit the image."""
-    whole = np.ascontiguousarray(levels, np.int16)  # a stretched image comes in the other order
-    return [_counted(whole, request) for request in requests]
-
-
-def _counted(levels: npt.NDArray[np.int16], request: CountRequest) -> Counts:
-    bank, (edges, spans), groups = compiled_bank(request.bank), _segments(request.windows), request.groups
-    competing = 0 if groups is None else len(groups.members)
-    counted = np.empty((len(spans), request.features), np.int32)
-    contests = np.empty((2, competing, GROUP), np.int32)
-    members, weights = (b"", b"") if groups is None else (groups.members, groups.weights)
-    native.count(
-        levels.shape[1], request.bank.dilation, request.features, levels, *bank, edges, spans, members, weights,
-        counted, contests,
-    )  # fmt: skip
-    return Counts(counted, contests)
+    whole, found = np.ascontiguousarray(levels, np.int16), []  # a stretched image comes in the other order
+    for of in requests:
+        edges, spans = _segments(of.windows)
+        members, weights = (b"", b"") if of.groups is None else (of.groups.members, of.groups.weights)
+        counted = np.empty((len(spans), of.features), np.int32)
+        contests = np.empty((2, len(members), GROUP), np.int32)
+        native.count(
+            whole.shape[1], of.bank.dilation, of.features, whole, *compiled_bank(of.bank), edges, spans, members,
+            weights, counted, contests,
+        )  # fmt: skip
+        found.append(Counts(counted, contests))
+    return found
 
 
 @lru_cache(maxsize=64)

@@ -127,7 +127,10 @@ class Frames:
             from scroll_tactile.embeddings.weights import digest_of
 
             weights = {"name": self._source, "sha256": digest_of(self._net)}
-        rest = _picture_to_json(self.rest) if isinstance(self.rest, np.ndarray) else self.rest
+        rest: Any = self.rest
+        if isinstance(rest, np.ndarray):
+            deflated = zlib.compress(np.ascontiguousarray(rest, "<f4").tobytes(), 9)
+            rest = {"shape": list(rest.shape), "float32": base64.b64encode(deflated).decode("ascii")}
         return {"kind": "frames", "weights": weights, "rest": rest, "cosines": self.cosines, "seed": self.seed}
 
     @cached_property
@@ -228,12 +231,6 @@ def _checked(rest: Rest | npt.ArrayLike) -> Rest:
         )
     picture.setflags(write=False)
     return picture
-
-
-def _picture_to_json(picture: FloatArray) -> dict[str, Any]:
-    """A resting picture (height, width, 3) in JSON's types, to the bit."""
-    deflated = zlib.compress(np.ascontiguousarray(picture, "<f4").tobytes(), 9)
-    return {"shape": list(picture.shape), "float32": base64.b64encode(deflated).decode("ascii")}
 
 
 def light(frame: IntArray) -> FloatArray:

@@ -163,7 +163,8 @@ class Kernels:
         _require_image(image)
         steps = image.shape[1]
         if steps > MOST_STEPS and any(width < steps for width in windows):
-            return {width: self._one_by_one(image, width, starts) for width, starts in windows.items()}
+            cut = {w: [np.ascontiguousarray(image[:, at : at + w]) for at in starts] for w, starts in windows.items()}
+            return {width: np.stack([self.embed(part, width) for part in parts]) for width, parts in cut.items()}
         return self._embedded(to_levels(image), windows)[0]
 
     def embed_competing(
@@ -230,10 +231,6 @@ class Kernels:
                 cuts = (_mirrored(levels[:, start : start + width], wide) for start in starts)
                 features[width] = np.stack([self._read(cut, {wide: (0,)})[0][wide][0] for cut in cuts])
         return features, proportions
-
-    def _one_by_one(self, image: npt.NDArray[np.float32], width: int, starts: Sequence[int]) -> npt.NDArray[np.float32]:
-        parts = (np.ascontiguousarray(image[:, start : start + width]) for start in starts)
-        return np.stack([self.embed(part, width) for part in parts])
 
     def _counted(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]], competing: int | None

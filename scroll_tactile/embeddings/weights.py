@@ -194,14 +194,10 @@ def _cleaned(tensors: Mapping[str, Any], where: str) -> Tensors:
         tensors = next((held for name in CONTAINERS if isinstance(held := tensors.get(name), Mapping)), tensors)
     named = {PREFIXES.sub("", str(name)): tensor for name, tensor in tensors.items()}
     kept = {name: tensor for name, tensor in named.items() if not HEADS.search(name)}
-    strange = [name for name, tensor in kept.items() if not _is_dense(tensor)]
-    if strange:
+    dense = {n for n, t in kept.items() if isinstance(t, torch.Tensor) and t.layout == torch.strided and not t.is_meta}
+    if strange := kept.keys() - dense:
         raise WeightsError(f"expected dense tensors by name in {where}; {_listed(sorted(strange))} are none")
     return kept
-
-
-def _is_dense(value: object) -> bool:
-    return isinstance(value, torch.Tensor) and value.layout == torch.strided and not value.is_meta
 
 
 def _stem(tensors: Tensors, where: str) -> Stem:

@@ -10,13 +10,10 @@ are drawn for each image of a batch apart.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-
-from scroll_tactile.errors import InputError
 
 __all__ = ["Augmentation", "Change", "crop", "fit", "flip", "jitter", "resize"]
 
@@ -105,8 +102,6 @@ class Augmentation:
     flip: the probability of the other direction. speed: (least, most) factor, drawn evenly on a logarithmic scale.
     keep: the least part of the touch that stays. noise, drift: the most, as standard deviations in units of the
     image, half the sensor's range.
-
-    Raises InputError for strengths that cannot be.
     """
 
     flip: float = 0.5
@@ -114,16 +109,6 @@ class Augmentation:
     keep: float = 0.8
     noise: float = 0.01
     drift: float = 0.02
-
-    def __post_init__(self) -> None:
-        numbers = (self.flip, *self.speed, self.keep, self.noise, self.drift)
-        possible = all(map(math.isfinite, numbers)) and len(self.speed) == 2
-        possible = possible and 0 <= self.flip <= 1 and 0 < self.speed[0] <= self.speed[1] and 0 < self.keep <= 1
-        if not possible or min(self.noise, self.drift) < 0:
-            raise InputError(
-                f"expected a probability to flip, speeds 0 < least ≤ most, keep in (0, 1], noise and drift of 0 or "
-                f"more; came {self}"
-            )
 
     def draw(self, rng: np.random.Generator) -> Change:
         """One change of at most these strengths; it takes the same numbers from `rng` whatever they are."""

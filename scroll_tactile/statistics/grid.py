@@ -36,9 +36,7 @@ def mean_code(total: npt.NDArray[np.integer], rows: int | npt.NDArray[np.int64])
 
 
 def table_of(rows: Codes) -> tuple[Codes, Codes]:
-    """The different values of rows (n, d), ascending, and the place of each code among them, shape (d, n)."""
-    if not rows.size:
-        return np.zeros(0, dtype=np.int32), np.zeros(rows.shape[::-1], dtype=np.int32)
+    """The different values of rows (n, d), n and d at least 1, ascending, and the place of each code among them, shape (d, n)."""
     low = int(rows.min())
     offsets = (rows.T - low).astype(np.intp)
     # Codes are 21 bits: to look them up takes a thirtieth of the time that sorting takes.

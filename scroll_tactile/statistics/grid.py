@@ -36,7 +36,7 @@ def mean_code(total: npt.NDArray[np.integer], rows: int | npt.NDArray[np.int64])
 
 
 def table_of(rows: Codes) -> tuple[Codes, Codes]:
-    """The different values of rows (n, d), which are there, ascending, and the place of each code among them, (d, n)."""
+    """The different values of rows (n, d), all there, ascending, and the place of each code among them, (d, n)."""
     low = int(rows.min())
     offsets = (rows.T - low).astype(np.intp)
     # Codes are 21 bits: to look them up takes a thirtieth of the time that sorting takes.

@@ -24,7 +24,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations
+from itertools import accumulate, combinations, pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -59,13 +59,11 @@ TAPS = 9
 ROUND = 84  # each position of the three heavy taps once
 
 # Those positions, in an order in which kernels that follow each other have them a place later: rows of a matrix that
-# follow each other, read with one step more, are then added at once; see `Workspace`.
+# follow each other, read with one step more, are then added at once; see `_add_heavy`.
 HEAVY = [(i, i + p, i + q) for q in range(2, TAPS) for p in range(1, q) for i in range(TAPS - q)]
 TOGETHER = 2**18  # responses: so many stay in the processor's cache
-MOST_STEPS = 64  # of dilations and lengths of images
 
 Floats = npt.NDArray[np.float32]
-Step = tuple[np.ufunc, Floats, Floats | float, Floats]  # what is done with two arrays, and where to
 
 LEVELS = 2**11  # integer readings lie in ±2¹¹: finer than a 12-bit converter over the sensor's range
 MOST_CHANNELS = 64  # to a kernel: 64 channels × Σ|w| = 12 × 2¹¹ < 2²⁴, so that responses are exact in float32
@@ -118,76 +116,57 @@ class Bank:
 
 
 class Workspace(threading.local):
-    """The arrays of a thread that every image is convolved in, and the steps of it.
-
-    To get their pages from the system anew takes as long as to convolve, and to make views of them a tenth of it.
-    """
+    """The arrays of a thread that every image is convolved in: to get their pages anew takes as long as to convolve."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, Floats] = {}
-        self._steps: dict[tuple[int, int, int, int], tuple[list[Step], Floats]] = {}
 
     def array(self, name: str, rows: int, columns: int) -> Floats:
         """The array of a name, shape (rows, columns), of whatever values."""
         size = rows * columns
         if name not in self._arrays or len(self._arrays[name]) < size:
             self._arrays[name] = np.empty(size, dtype=np.float32)
-            self._steps.clear()  # they keep those before
         return self._arrays[name][:size].reshape(rows, columns)
-
-    def respond(self, rows: slice, readings: int, dilation: int) -> Floats:
-        """Responses of whole rounds of kernels to sums of channels: the array "sums" has these, in so many rows.
-
-        Exact integers of shape (rows, readings − 8·dilation): three times the heavy taps less the sum of all nine.
-        The sums are lost, the responses stay until the next are made.
-        """
-        key = rows.start, rows.stop, readings, dilation
-        if key not in self._steps:
-            if len(self._steps) >= MOST_STEPS:
-                self._steps.clear()
-            self._steps[key] = self._planned(rows, readings, dilation)
-        steps, responses = self._steps[key]
-        for put, left, right, into in steps:
-            put(left, right, into)
-        return responses
-
-    def _planned(self, rows: slice, readings: int, dilation: int) -> tuple[list[Step], Floats]:
-        sums, count = self.array("sums", rows.stop, readings)[rows], rows.stop - rows.start
-        responses = self.array("responses", count, readings + dilation)
-        block = ROUND * max(1, TOGETHER // (ROUND * readings))
-        first, second = (self.array(name, min(block, count), readings) for name in ("first", "second"))
-        steps: list[Step] = []
-        for i in range(0, count, block):
-            some = slice(i, min(i + block, count))
-            steps += _steps(sums[some], responses[some], first, second, dilation)
-        return steps, responses[:, : readings - (TAPS - 1) * dilation]
 
 
 workspace = Workspace()
 
 
-def _steps(sums: Floats, responses: Floats, first: Floats, second: Floats, dilation: int) -> Iterator[Step]:
-    """How sums of channels become responses; two arrays like the sums are between."""
-    (rows, readings), flat = sums.shape, sums.reshape(-1)
-    one, two = first.reshape(-1), second.reshape(-1)
-    # The sum of nine by doubling, of all rows as one: what runs over into the next lies behind the places of its own.
+def _respond(sums: Floats, dilation: int) -> Floats:
+    """Responses of whole rounds of kernels to sums of channels, (rows, readings).
+
+    Exact integers of shape (rows, readings − 8·dilation): three times the heavy taps less the sum of all nine.
+    The sums are lost, the responses stay until the next are made.
+    """
+    count, readings = sums.shape
+    responses = workspace.array("responses", count, readings + dilation)
+    block, places = ROUND * max(1, TOGETHER // (ROUND * readings)), readings - (TAPS - 1) * dilation
+    for i in range(0, count, block):
+        some, own = sums[i : i + block], responses[i : i + block]
+        nine = _nine(some, dilation)
+        np.multiply(some, 3.0, some)
+        _add_heavy(some.reshape(-1), own.reshape(-1), readings, dilation)
+        np.subtract(own[:, :places], nine[:, :places], own[:, :places])
+    return responses[:, :places]
+
+
+def _nine(sums: Floats, dilation: int) -> Floats:
+    """The sum of nine taps by doubling, of all rows as one: what runs over into the next lies behind its own places."""
+    flat, nine = sums.reshape(-1), workspace.array("first", *sums.shape)
+    one, two = nine.reshape(-1), workspace.array("second", *sums.shape).reshape(-1)
     size = len(flat) - dilation
-    yield np.add, flat[:size], flat[dilation:], one[:size]
+    np.add(flat[:size], flat[dilation:], one[:size])
     size -= 2 * dilation
-    yield np.add, one[:size], one[2 * dilation :][:size], two[:size]
+    np.add(one[:size], one[2 * dilation :][:size], two[:size])
     size -= 4 * dilation
-    yield np.add, two[:size], two[4 * dilation :][:size], one[:size]
+    np.add(two[:size], two[4 * dilation :][:size], one[:size])
     size -= dilation
-    yield np.add, one[:size], flat[8 * dilation :], one[:size]
-    yield np.multiply, flat, 3.0, flat
-    yield from _heavy_steps(flat, responses.reshape(-1), readings, dilation)
-    places = readings - (TAPS - 1) * dilation
-    own = responses[:, :places]
-    yield np.subtract, own, first[:rows, :places], own
+    np.add(one[:size], flat[8 * dilation :], one[:size])
+    return nine
 
 
-def _heavy_steps(sums: Floats, responses: Floats, readings: int, dilation: int) -> Iterator[Step]:
-    """How the sums at the three heavy taps of each row are added; both flat, a row of sums as long as the readings.
+def _add_heavy(sums: Floats, responses: Floats, readings: int, dilation: int) -> None:
+    """Add the sums at the three heavy taps of each row; both flat, a row of sums as long as the readings.
 
     A row of responses is longer by the dilation: where the taps of the next row lie one place later, the rows of both
     are one run.
@@ -203,8 +182,8 @@ def _heavy_steps(sums: Floats, responses: Floats, readings: int, dilation: int) 
             _runs(sums, row * readings + tap * dilation, shape, (ROUND * readings, each * readings + later * dilation))
             for tap, later in ((0, 0), (1, 1), (outer, 0))
         ]
-        yield np.add, taps[0], taps[1], into
-        yield np.add, into, taps[2], into
+        np.add(taps[0], taps[1], into)
+        np.add(into, taps[2], into)
         row += runs * each
 
 
@@ -221,8 +200,7 @@ def bank_size(channels: int, dilation: int) -> int:
 
 def to_levels(image: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
     """Round a tactile image in [-1, 1] to integers in ±LEVELS, held as float32; same shape."""
-    levels: npt.NDArray[np.float32] = np.rint(image * np.float32(LEVELS)).astype(np.float32, copy=False)
-    return levels
+    return np.asarray(np.rint(image * np.float32(LEVELS)), dtype=np.float32)
 
 
 @lru_cache(maxsize=64)
@@ -230,22 +208,18 @@ def bank(seed: int, channels: int, dilation: int) -> Bank:
     """Make the bank of a dilation for images of `channels` rows; the same arguments give the same bank."""
     rng = np.random.default_rng([seed, channels, dilation])
     count = bank_size(channels, dilation)
-    rows = _rows(rng, count)
-    summed = np.zeros((-(-count // ROUND) * ROUND, channels), dtype=np.float32)
+    # In each round of 84 all positions of the heavy taps, shuffled.
+    row = {heavy: i for i, heavy in enumerate(HEAVY)}
+    places = np.array([row[heavy] for heavy in combinations(range(TAPS), 3)], dtype=np.intp)
+    rounds = -(-count // ROUND)
+    rows = np.concatenate([ROUND * i + places[rng.permutation(ROUND)] for i in range(rounds)])[:count]
+    summed = np.zeros((rounds * ROUND, channels), dtype=np.float32)
     most = min(channels, MOST_CHANNELS)
     for row in rows:
         chosen = min(most, int((most + 1) ** rng.random()))
         summed[row, rng.permutation(channels)[:chosen]] = 1
     without = Bank(dilation, summed, rows, np.empty((0, count), dtype=np.float32))
     return replace(without, thresholds=_thresholds(rng, without, channels))
-
-
-def _rows(rng: np.random.Generator, count: int) -> npt.NDArray[np.intp]:
-    """The row of each kernel: in each round of 84 all positions of the heavy taps, shuffled."""
-    row = {heavy: i for i, heavy in enumerate(HEAVY)}
-    rows = np.array([row[heavy] for heavy in combinations(range(TAPS), 3)], dtype=np.intp)
-    rounds = -(-count // ROUND)
-    return np.concatenate([ROUND * i + rows[rng.permutation(ROUND)] for i in range(rounds)])[:count]
 
 
 def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Floats:
@@ -258,9 +232,8 @@ def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Float
     for i, stream in enumerate(streams):  # one by one: the responses to all would fill ten times the memory
         round_, kernel = np.nonzero(chosen == i)
         used, place_of = np.unique(kernel, return_inverse=True)
-        np.matmul(kernels.channels, stream, out=workspace.array("sums", len(kernels.channels), stream.shape[1]))
-        responses = workspace.respond(slice(0, len(kernels.channels)), stream.shape[1], kernels.dilation)
-        responses = np.sort(responses[kernels.rows[used]], axis=-1)
+        sums = np.matmul(kernels.channels, stream, out=workspace.array("sums", len(kernels.channels), stream.shape[1]))
+        responses = np.sort(_respond(sums, kernels.dilation)[kernels.rows[used]], axis=-1)
         place = (quantiles[round_, kernel] * responses.shape[-1]).astype(np.int64)
         thresholds[round_, kernel] = responses[place_of, place] + np.float32(0.5)
     return thresholds
@@ -404,21 +377,18 @@ def competing_groups(bank: Bank, count: int) -> Groups:
 
 def count_by_c(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]:
     """What `count` gives, by the compiled module. Raises ValueError for requests that do not fit the image."""
-    whole = np.ascontiguousarray(levels, np.int16)  # a stretched image comes in the other order
-    return [_counted(whole, request) for request in requests]
-
-
-def _counted(levels: npt.NDArray[np.int16], request: CountRequest) -> Counts:
-    bank, (edges, spans), groups = compiled_bank(request.bank), _segments(request.windows), request.groups
-    competing = 0 if groups is None else len(groups.members)
-    counted = np.empty((len(spans), request.features), np.int32)
-    contests = np.empty((2, competing, GROUP), np.int32)
-    members, weights = (b"", b"") if groups is None else (groups.members, groups.weights)
-    native.count(
-        levels.shape[1], request.bank.dilation, request.features, levels, *bank, edges, spans, members, weights,
-        counted, contests,
-    )  # fmt: skip
-    return Counts(counted, contests)
+    whole, found = np.ascontiguousarray(levels, np.int16), []  # a stretched image comes in the other order
+    for of in requests:
+        edges, spans = _segments(of.windows)
+        members, weights = (b"", b"") if of.groups is None else (of.groups.members, of.groups.weights)
+        counted = np.empty((len(spans), of.features), np.int32)
+        contests = np.empty((2, len(members), GROUP), np.int32)
+        native.count(
+            whole.shape[1], of.bank.dilation, of.features, whole, *compiled_bank(of.bank), edges, spans, members,
+            weights, counted, contests,
+        )  # fmt: skip
+        found.append(Counts(counted, contests))
+    return found
 
 
 @lru_cache(maxsize=64)
@@ -469,35 +439,27 @@ def _agrees() -> bool:
 def count_by_numpy(levels: Floats, requests: Sequence[CountRequest]) -> list[Counts]:
     """What `count` gives, without a compiled module: the channels of all banks are summed in one product."""
     needed = (max(of.features, 0 if of.groups is None else of.groups.members.size) for of in requests)
-    banks = _banks(tuple(of.bank for of in requests), tuple(needed))
-    readings, found = levels.shape[1], []
+    channels, rows = _banks(tuple(of.bank for of in requests), tuple(needed))
+    found = []
     with one_thread():
-        np.matmul(banks.channels, levels, out=workspace.array("sums", len(banks.channels), readings))
-        for of, rows in zip(requests, banks.rows, strict=True):
-            responses = workspace.respond(rows, readings, of.bank.dilation)
+        sums = np.matmul(channels, levels, out=workspace.array("sums", len(channels), levels.shape[1]))
+        for of, own in zip(requests, rows, strict=True):
+            responses = _respond(sums[own], of.bank.dilation)
             none = np.zeros((2, 0, GROUP), np.int64)
             competing = none if of.groups is None else competing_counts(responses, of.bank, of.groups)
             found.append(Counts(_exceeding(of, responses), competing))
     return found
 
 
-@dataclass(frozen=True)
-class Banks:
-    """The channels of several banks below each other, for one product with an image, and the rows of each."""
-
-    channels: Floats
-    rows: list[slice]
-
-
 @lru_cache(maxsize=16)  # of at most 0.3 MB each
-def _banks(banks: tuple[Bank, ...], counts: tuple[int, ...]) -> Banks:
-    """Of each dilation's bank the rounds that so many features need."""
-    parts, rows, last = [], [], 0
-    for part, count in zip(banks, counts, strict=True):
-        parts.append(part.channels[: -(-min(count, len(part)) // ROUND) * ROUND])
-        first, last = last, last + len(parts[-1])
-        rows.append(slice(first, last))
-    return Banks(np.concatenate(parts), rows)
+def _banks(banks: tuple[Bank, ...], counts: tuple[int, ...]) -> tuple[Floats, list[slice]]:
+    """The channels of the rounds that so many features of each bank need, below each other, and the rows of each."""
+    parts = [
+        part.channels[: -(-min(count, len(part)) // ROUND) * ROUND] for part, count in zip(banks, counts, strict=True)
+    ]
+    edges = accumulate((len(part) for part in parts), initial=0)
+    rows = [slice(first, last) for first, last in pairwise(edges)]
+    return np.concatenate(parts), rows
 
 
 def _exceeding(request: CountRequest, responses: Floats) -> Integers:
@@ -510,8 +472,7 @@ def _exceeding(request: CountRequest, responses: Floats) -> Integers:
         size = min(len(kernels), count - first)
         thresholds = kernels.thresholds[first // len(kernels), :size, None]
         np.copyto(exceeded[first : first + size], responses[kernels.rows[:size]] > thresholds)
-    counted: Integers = (exceeded @ _pooling(responses.shape[1], request.windows)).T.astype(np.int64)
-    return counted
+    return np.asarray((exceeded @ _pooling(responses.shape[1], request.windows)).T, np.int64)
 
 
 @lru_cache(maxsize=16)  # of at most 1 MB each

@@ -15,7 +15,7 @@ import os
 import zlib
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -127,7 +127,10 @@ class Frames:
             from scroll_tactile.embeddings.weights import digest_of
 
             weights = {"name": self._source, "sha256": digest_of(self._net)}
-        rest = _picture_to_json(self.rest) if isinstance(self.rest, np.ndarray) else self.rest
+        rest: Any = self.rest
+        if isinstance(rest, np.ndarray):
+            deflated = zlib.compress(np.ascontiguousarray(rest, "<f4").tobytes(), 9)
+            rest = {"shape": list(rest.shape), "float32": base64.b64encode(deflated).decode("ascii")}
         return {"kind": "frames", "weights": weights, "rest": rest, "cosines": self.cosines, "seed": self.seed}
 
     @cached_property
@@ -140,9 +143,10 @@ class Frames:
         if self._net is not None:
             import torch
 
+            from scroll_tactile.embeddings.resnet import DEPTH
             from scroll_tactile.embeddings.weights import hash_tensors
 
-            digest.update(f"{self._net.depth} {self._net.stem} {torch.__version__}".encode())
+            digest.update(f"{DEPTH} {self._net.stem} {torch.__version__}".encode())
             hash_tensors(digest, self._net)
         for channels, columns in ((3, 1), (24, 9), (120, 64)):
             digest.update(self.embed(canary(channels, columns)).astype("<f4").tobytes())
@@ -179,8 +183,7 @@ class Frames:
         weights, phases = self._waves
         with steady():
             waves = torch.cos(weights @ torch.from_numpy(counts).double() + phases)
-            rounded: FloatArray = (torch.round(waves * STEPS) / STEPS).float().numpy()
-            return rounded
+            return np.asarray((torch.round(waves * STEPS) / STEPS).float().numpy())
 
     def _seen(self, planes: npt.NDArray[np.float32]) -> FloatArray:
         """What the network sees of the relief: of each stage the mean and the spread of its maps, of length 1 each."""
@@ -199,8 +202,7 @@ class Frames:
                 parts += [found.mean(dim=1), found.std(dim=1, correction=0)]
             normalised = torch.cat([functional.normalize(part, dim=0) for part in parts])
             # Rounding may pass 1 by a unit in the last place.
-            features: FloatArray = np.minimum(normalised.numpy(), np.float32(1))
-            return features
+            return np.asarray(np.minimum(normalised.numpy(), np.float32(1)))
 
 
 def _blurred(planes: torch.Tensor, deviation: int) -> torch.Tensor:
@@ -216,10 +218,8 @@ def _blurred(planes: torch.Tensor, deviation: int) -> torch.Tensor:
 
 
 def _checked(rest: Rest | npt.ArrayLike) -> Rest:
-    if rest is None:
-        return None
-    if isinstance(rest, str) and rest == "first":
-        return "first"
+    if rest is None or (isinstance(rest, str) and rest == "first"):
+        return cast(Rest, rest)
     try:
         picture = np.array(rest, dtype=np.float32)
     except (TypeError, ValueError):
@@ -233,12 +233,6 @@ def _checked(rest: Rest | npt.ArrayLike) -> Rest:
     return picture
 
 
-def _picture_to_json(picture: FloatArray) -> dict[str, Any]:
-    """A resting picture (height, width, 3) in JSON's types, to the bit."""
-    deflated = zlib.compress(np.ascontiguousarray(picture, "<f4").tobytes(), 9)
-    return {"shape": list(picture.shape), "float32": base64.b64encode(deflated).decode("ascii")}
-
-
 def light(frame: IntArray) -> FloatArray:
     """Mean colours of 6 × 8 cells, in [-1, 1], float32 of shape (LIGHT,), of a frame of levels in ±LEVELS, (3, H, W).
 
@@ -248,8 +242,7 @@ def light(frame: IntArray) -> FloatArray:
     total = np.pad(frame.cumsum(axis=1).cumsum(axis=2), ((0, 0), (1, 0), (1, 0)))
     rows = total[:, under] - total[:, top]
     sums = rows[:, :, after] - rows[:, :, left]
-    means: FloatArray = (sums / (LEVELS * np.outer(under - top, after - left))).astype(np.float32).ravel()
-    return means
+    return np.asarray(sums / (LEVELS * np.outer(under - top, after - left)), np.float32).ravel()
 
 
 def _edges(size: int, count: int) -> tuple[IntArray, IntArray]:
@@ -288,19 +281,16 @@ def _directions(along: IntArray, across: IntArray, edges: list[int]) -> FloatArr
     strength = sum((squared > edge * edge).astype(np.int64) for edge in edges)
     kind = (octant * (len(edges) + 1) + strength).reshape(COLOURS, -1)
     counts = np.stack([np.bincount(plane, minlength=_HISTOGRAM) for plane in kind])
-    shares: FloatArray = angles(kind.shape[1])[counts]
-    return shares
+    return np.asarray(angles(kind.shape[1])[counts])
 
 
 def _curvatures(bent: IntArray, edges: list[int]) -> FloatArray:
     """How often the surface is bent by more than each edge, up and down: (2 · edges, 3)."""
     counts = [np.count_nonzero(beyond, axis=(1, 2)) for edge in edges for beyond in (bent > edge, bent < -edge)]
-    shares: FloatArray = angles(bent[0].size)[np.stack(counts)]
-    return shares
+    return np.asarray(angles(bent[0].size)[np.stack(counts)])
 
 
 def _halved(sums: IntArray) -> IntArray:
     """Sums over 2 × 2 pixels; of an odd row or column at the end, twice itself."""
     padded = np.pad(sums, ((0, 0), (0, sums.shape[1] % 2), (0, sums.shape[2] % 2)), mode="edge")
-    halved: IntArray = padded[:, ::2, ::2] + padded[:, 1::2, ::2] + padded[:, ::2, 1::2] + padded[:, 1::2, 1::2]
-    return halved
+    return np.asarray(padded[:, ::2, ::2] + padded[:, 1::2, ::2] + padded[:, ::2, 1::2] + padded[:, 1::2, 1::2])

@@ -148,8 +148,7 @@ class Kernels:
         """
         _require_image(image)
         width = image.shape[1] if width is None else width
-        features: npt.NDArray[np.float32] = self.embed_windows(image, {width: [0]})[width][0]
-        return features
+        return np.asarray(self.embed_windows(image, {width: [0]})[width][0])
 
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
@@ -164,7 +163,8 @@ class Kernels:
         _require_image(image)
         steps = image.shape[1]
         if steps > MOST_STEPS and any(width < steps for width in windows):
-            return {width: self._one_by_one(image, width, starts) for width, starts in windows.items()}
+            cut = {w: [np.ascontiguousarray(image[:, at : at + w]) for at in starts] for w, starts in windows.items()}
+            return {width: np.stack([self.embed(part, width) for part in parts]) for width, parts in cut.items()}
         return self._embedded(to_levels(image), windows)[0]
 
     def embed_competing(
@@ -232,10 +232,6 @@ class Kernels:
                 features[width] = np.stack([self._read(cut, {wide: (0,)})[0][wide][0] for cut in cuts])
         return features, proportions
 
-    def _one_by_one(self, image: npt.NDArray[np.float32], width: int, starts: Sequence[int]) -> npt.NDArray[np.float32]:
-        parts = (np.ascontiguousarray(image[:, start : start + width]) for start in starts)
-        return np.stack([self.embed(part, width) for part in parts])
-
     def _counted(
         self, levels: npt.NDArray[np.float32], windows: Mapping[int, tuple[int, ...]], competing: int | None
     ) -> Iterator[tuple[Part, Counts]]:
@@ -287,12 +283,6 @@ def _dilations(width: int) -> list[int]:
     return dilations
 
 
-def _contests(features: int, width: int | None) -> dict[int, int]:
-    """Dilation → the number of its groups of competing kernels in an image of a width."""
-    dilations = _dilations(width) if width else []
-    return dict(zip(dilations, groups_by_dilation(features, len(dilations)), strict=True)) if dilations else {}
-
-
 @lru_cache(maxsize=256)
 def _parts(
     dimension: int,
@@ -303,7 +293,8 @@ def _parts(
 ) -> list[Part]:
     """What is counted of each dilation: for windows, by width their first steps, and for an image that competes."""
     shares = {width: _shares(channels, _thresholded(dimension, width), width) for width, _ in widths}
-    contests = _contests(dimension, competing)
+    contests = _dilations(competing) if competing else []
+    groups = dict(zip(contests, groups_by_dilation(dimension, len(contests)), strict=True))
     parts = []
     for dilation in _dilations(max([*shares, competing or 0])):
         windows: list[tuple[int, int]] = []
@@ -315,7 +306,7 @@ def _parts(
                 windows += [(start, start + places) for start in starts]
                 pools.append((width, slice(first, len(windows)), features, places))
         most = max((features for _, _, features, _ in pools), default=0)
-        parts.append(Part(dilation, most, tuple(windows), contests.get(dilation, 0), tuple(pools)))
+        parts.append(Part(dilation, most, tuple(windows), groups.get(dilation, 0), tuple(pools)))
     return parts
 
 

@@ -115,5 +115,4 @@ class ModuleEmbedding:
                 f"expected from {self!r} features of shape {(1, self.dimension)} for an image of {image.shape}; "
                 f"came {came}"
             )
-        features: npt.NDArray[np.float32] = output[0].float().contiguous().numpy()
-        return features
+        return np.asarray(output[0].float().contiguous().numpy())

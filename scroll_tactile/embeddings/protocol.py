@@ -85,26 +85,21 @@ class Embedding(Protocol):
     @property
     def name(self) -> str:
         """What messages call it."""
-        ...
 
     @property
     def dimension(self) -> int:
         """The number of features."""
-        ...
 
     @property
     def bound(self) -> float:
         """The largest magnitude that a feature can have."""
-        ...
 
     @property
     def fingerprint(self) -> str:
         """Hex of a hash over all that the features depend on."""
-        ...
 
     def embed(self, image: npt.NDArray[np.float32]) -> FloatArray:
         """Features of shape (d,) for a tactile image of shape (C, T) in [-1, 1], whatever C and T."""
-        ...
 
 
 class WindowEmbedding(Embedding, Protocol):
@@ -114,7 +109,6 @@ class WindowEmbedding(Embedding, Protocol):
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
     ) -> Mapping[int, FloatArray]:
         """Width → features (windows, d) of width → first steps; see the function `embed_windows`."""
-        ...
 
 
 class CompetingEmbedding(WindowEmbedding, Protocol):
@@ -124,7 +118,6 @@ class CompetingEmbedding(WindowEmbedding, Protocol):
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
     ) -> tuple[Mapping[int, FloatArray], FloatArray]:
         """What `embed_windows` gives; and features (d,) of all of the image, which stands for one of `width` steps."""
-        ...
 
 
 class CompositeEmbedding(Embedding, Protocol):
@@ -133,7 +126,6 @@ class CompositeEmbedding(Embedding, Protocol):
     @property
     def parts(self) -> tuple[Embedding, ...]:
         """The embeddings, in the order of their features."""
-        ...
 
 
 def is_embedding(value: object) -> bool:
@@ -254,5 +246,4 @@ def canary(channels: int, steps: int) -> npt.NDArray[np.float32]:
     A sawtooth of integers: no sine, whose last bit differs between machines.
     """
     place = np.arange(channels * steps).reshape(channels, steps)
-    image: npt.NDArray[np.float32] = ((place * (place + 7) * 13 % 255) / 127.0 - 1).astype(np.float32)
-    return image
+    return np.asarray((place * (place + 7) * 13 % 255) / 127.0 - 1, np.float32)

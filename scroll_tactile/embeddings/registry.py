@@ -98,7 +98,7 @@ class VisionConfiguration(Configuration):
     kind: Literal["vision"]
     weights: WeightsConfiguration | None
     seed: _Seed | None
-    depth: Literal[18, 34, 50]
+    depth: Literal[18]
     stem: Literal["torchvision", "universal"]
     stages: Annotated[list[Annotated[int, Field(ge=0, le=4)]], Field(min_length=1, max_length=5)]
 
@@ -163,7 +163,6 @@ def _picture(held: PictureConfiguration) -> npt.NDArray[np.float32]:
 
 
 def _validated(configuration: Mapping[str, Any]) -> AnyConfiguration:
-    _require_shallow(configuration)
     try:
         return ADAPTER.validate_python(configuration)
     except ValidationError as error:
@@ -176,41 +175,23 @@ def _validated(configuration: Mapping[str, Any]) -> AnyConfiguration:
         ) from error
 
 
-def _require_shallow(configuration: object) -> None:
-    """Raise EmbeddingError where mappings and lists lie too deep within each other; without recursion."""
-    waiting = [(configuration, 0)]
-    while waiting:
-        value, depth = waiting.pop()
-        if depth > MOST_DEPTH:
-            raise EmbeddingError(
-                f"expected an embedding's configuration of at most {MOST_DEPTH} levels; came more. Pass the embedding "
-                "itself: embedding=…"
-            )
-        inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
-        waiting += [(each, depth + 1) for each in inside]
-
-
 def _made(held: AnyConfiguration) -> Embedding:
     make = getattr(import_module(f"{__package__}.{held.kind}"), _KINDS[held.kind])
-    settings = held.model_dump(exclude={"kind"})
     if isinstance(held, JoinedConfiguration):
         return cast(Embedding, make(*map(_made, held.parts)))
     if isinstance(held, FramesConfiguration):
         rest = _picture(held.rest) if isinstance(held.rest, PictureConfiguration) else held.rest
-        return _weighted(make, held.weights, **settings | {"rest": rest})
+        return _weighted(make, held.weights, rest=rest, cosines=held.cosines, seed=held.seed)
     if isinstance(held, VisionConfiguration):
-        if held.weights is not None:
-            del settings["depth"]
-        del settings["stem"]
-        return _weighted(make, held.weights, **settings)
-    return cast(Embedding, make(**settings))
+        return _weighted(make, held.weights, stages=held.stages, seed=held.seed)
+    return cast(Embedding, make(seed=held.seed, dimension=held.dimension))
 
 
 def _weighted(make: Callable[..., Any], held: WeightsConfiguration | None, **settings: Any) -> Embedding:
     if held is None:
-        return cast(Embedding, make(**settings | {"weights": None}))
+        return cast(Embedding, make(None, **settings))
     source = _source(held, make.__name__)
-    embedding = make(**settings | {"weights": source})
+    embedding = make(source, **settings)
     found = embedding.configuration()["weights"]["sha256"]
     if found != held.sha256:
         raise EmbeddingError(
@@ -226,12 +207,10 @@ def _source(held: WeightsConfiguration, kind: str) -> str | Path:
 
     if held.name in PUBLISHED:
         return held.name
-    came, put = "a state dict", ""
-    if held.name is not None:
-        file = cache_folder() / held.name
-        if file.is_file():
-            return file
-        came, put = f"the file {held.name!r}", f", or put that file into {file.parent}"
+    folder = cache_folder()
+    if held.name is not None and (folder / held.name).is_file():
+        return folder / held.name
+    came, put = ("a state dict", "") if held.name is None else (repr(held.name), f", or put that file into {folder}")
     raise EmbeddingError(
         f"expected the weights of a {kind} that came from {came} and whose tensors have the SHA-256 "
         f"{held.sha256[:12]}…; they are not at hand. Pass embedding={kind}(weights=…) with them{put}"

@@ -7,13 +7,13 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import TOGETHER, Capabilities, canary
-from scroll_tactile.embeddings.resnet import ResNet, folded
+from scroll_tactile.embeddings.resnet import DEPTH, ResNet, folded
 from scroll_tactile.embeddings.steady import steady
 from scroll_tactile.embeddings.weights import digest_of, hash_tensors, load_network, source_name
 from scroll_tactile.errors import InputError
@@ -38,17 +38,15 @@ DEVIATION = (0.229, 0.224, 0.225)
 # these see only what was observed: pooled from a whole pass, the first 0.3 s were right in 7 % instead of 87.
 MOST_STEPS = 4096  # of a whole image passed at once; of longer ones every window is read by itself, at bounded memory
 LEAST = {"torchvision": 1, "universal": 3}  # rows and columns: a kernel has to fit the padded image
-BATCH = 32  # images at once in `embed_bulk`
 
 
 class Vision:
     """Stages of a ResNet, each averaged over a window and scaled to length 1, side by side.
 
-    weights: torchvision's "resnet18", "resnet34" or "resnet50", fetched once; a `.safetensors` or `.pth` file in
-        torchvision's or Meta-Dataset's (URL) layout; a state dict; or None for a random network, the control that shows
-        what the weights are worth.
+    weights: torchvision's "resnet18", fetched once; a `.safetensors` or `.pth` file in torchvision's or Meta-Dataset's
+        (URL) layout; a state dict; or None for a random network, the control that shows what the weights are worth.
     stages: which, ascending: 0 the stem, 1 to 4 the layers. Nothing after the last of them is computed.
-    seed, depth: of the random network; the depth of given weights is seen from them.
+    seed: of the random network.
 
     A touch narrower than a window is not read at that scale (`Capabilities.partial_windows`): a network is lost at a
     length that it did not learn from. Where several scales fit only the widest is judged (`judged_scales`), so that
@@ -74,7 +72,6 @@ class Vision:
         *,
         stages: Sequence[int] = (1, 2, 3),
         seed: int | None = None,
-        depth: int = 18,
     ) -> None:
         self.stages = tuple(stages)
         if not self.stages or list(self.stages) != sorted(set(self.stages) & set(range(5))):
@@ -86,29 +83,25 @@ class Vision:
             )
         self.seed = seed
         self._source = source_name(weights)
-        if weights is None:
-            assert seed is not None
-            self._net = ResNet.random(seed, depth)
-        else:
-            self._net = load_network(weights)
-        self._net.requires_grad_(False)
+        net = load_network(weights) if weights is not None else ResNet.random(cast(int, seed))
+        self._net = net.requires_grad_(False)
         self._quick = folded(self._net, self.stages[-1])
         self.dimension = sum(self._net.widths[stage] for stage in self.stages)
 
     def __repr__(self) -> str:
         source = repr(self._source or "<state dict>") if self.seed is None else f"None, seed={self.seed}"
-        return f"Vision({source}, stages={self.stages}, depth={self._net.depth})"
+        return f"Vision({source}, stages={self.stages})"
 
     def configuration(self) -> dict[str, Any]:
         """What makes an equal one, in JSON's types; of weights their file's name and their hash."""
         weights = {"name": self._source, "sha256": digest_of(self._net)} if self.seed is None else None
-        network = {"weights": weights, "seed": self.seed, "depth": self._net.depth, "stem": self._net.stem}
+        network = {"weights": weights, "seed": self.seed, "depth": DEPTH, "stem": self._net.stem}
         return {"kind": "vision", **network, "stages": list(self.stages)}
 
     @cached_property
     def fingerprint(self) -> str:
         """A hash of all the tensors, the settings, torch's version and the features of three fixed images."""
-        settings = (self._net.depth, self._net.stem, self.stages, torch.__version__)
+        settings = (DEPTH, self._net.stem, self.stages, torch.__version__)
         digest = hashlib.sha256(f"vision 1 {settings} {MEAN} {DEVIATION} {TOGETHER}".encode())
         hash_tensors(digest, self._net)
         for channels, steps in ((3, 9), (19, 30), (60, 75)):
@@ -121,8 +114,7 @@ class Vision:
         Raises InputError for an image that has not two axes, or an empty one.
         """
         image = self._readable(image)
-        features: FloatArray = self._read(image, [(0, image.shape[1])])[0]
-        return features
+        return np.asarray(self._read(image, [(0, image.shape[1])])[0])
 
     def embed_windows(
         self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
@@ -144,26 +136,7 @@ class Vision:
                 if width in wide
                 else [self.embed(np.ascontiguousarray(image[:, start : start + width])) for start in starts]
             )
-            features[width] = np.stack(rows) if rows else np.empty((0, self.dimension), np.float32)
-        return features
-
-    def embed_bulk(self, images: Sequence[npt.NDArray[np.float32]]) -> FloatArray:
-        """Features (N, d) of whole images, for work where speed counts and the last bits do not.
-
-        Images of one size go through the network together, on as many threads as torch has, and so their last bits
-        differ from those of `embed`: what a memory is to hold has to come from the latter.
-        """
-        features = np.empty((len(images), self.dimension), np.float32)
-        sizes: dict[tuple[int, ...], list[int]] = {}
-        images = [self._readable(image) for image in images]
-        for i, image in enumerate(images):
-            sizes.setdefault(image.shape, []).append(i)
-        for (_, steps), members in sizes.items():
-            for first in range(0, len(members), BATCH):
-                batch = members[first : first + BATCH]
-                with torch.inference_mode(), torch.autocast("cpu", enabled=False):
-                    planes = to_planes(torch.from_numpy(np.stack([images[i] for i in batch]).astype(np.float32)))
-                    features[batch] = self._window_features(planes, [(0, steps)], steps)[:, 0]
+            features[width] = np.stack(rows)
         return features
 
     def network(self) -> TunableVision:
@@ -191,15 +164,10 @@ class Vision:
         """Features (windows, d) from one pass over an image."""
         with steady():
             planes = to_planes(torch.tensor(image[None], dtype=torch.float32))
-            features: FloatArray = self._window_features(planes, windows, image.shape[1])[0]
-            return features
-
-    def _window_features(self, planes: torch.Tensor, windows: Sequence[tuple[int, int]], steps: int) -> FloatArray:
-        maps = self._quick(planes.contiguous(memory_format=torch.channels_last), self.stages[-1])
-        pooled = pool_windows([maps[stage] for stage in self.stages], steps, windows)
-        # Rounding may pass 1 by a unit in the last place.
-        features: FloatArray = np.minimum(pooled.numpy(), np.float32(1))
-        return features
+            maps = self._quick(planes.contiguous(memory_format=torch.channels_last), self.stages[-1])
+            pooled = pool_windows([maps[stage] for stage in self.stages], image.shape[1], windows)[0]
+            # Rounding may pass 1 by a unit in the last place.
+            return np.asarray(np.minimum(pooled.numpy(), np.float32(1)))
 
 
 class TunableVision(nn.Module):

@@ -13,11 +13,11 @@ import re
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
-from scroll_tactile.embeddings.resnet import BLOCKS, BOTTLENECK, ResNet, Stem
+from scroll_tactile.embeddings.resnet import ResNet, Stem
 from scroll_tactile.errors import WeightsError
 from scroll_tactile.libraries import optional
 
@@ -38,11 +38,7 @@ __all__ = [
 Tensors = dict[str, torch.Tensor]
 
 # torchvision's; a name ends in the first eight hex digits of the file's SHA-256.
-PUBLISHED: Final = {
-    "resnet18": "https://download.pytorch.org/models/resnet18-f37072fd.pth",
-    "resnet34": "https://download.pytorch.org/models/resnet34-b627a593.pth",
-    "resnet50": "https://download.pytorch.org/models/resnet50-0676ba61.pth",
-}
+PUBLISHED: Final = {"resnet18": "https://download.pytorch.org/models/resnet18-f37072fd.pth"}
 CACHE_VARIABLE: Final = "SCROLL_TACTILE_CACHE"
 CONTAINERS = ("state_dict", "model_state_dict", "model", "net", "backbone")  # under which checkpoints keep the tensors
 PREFIXES = re.compile(r"^(?:(?:module|backbone|model|encoder|net)\.)+")  # left by wrappers around the network
@@ -53,8 +49,8 @@ NAMED = 5  # tensors in a message
 def load_network(source: str | os.PathLike[str] | Mapping[str, torch.Tensor]) -> ResNet:
     """Make the network of a published name, a file or a state dict, in float32 and evaluation mode.
 
-    source: "resnet18", "resnet34" or "resnet50" for torchvision's ImageNet weights, fetched once into the cache;
-    the path of a `.safetensors`, `.pth` or `.pt` file; or tensors by name.
+    source: "resnet18" for torchvision's ImageNet weights, fetched once into the cache; the path of a `.safetensors`,
+    `.pth` or `.pt` file; or tensors by name.
 
     Raises WeightsError for weights that cannot be had, are damaged, or belong to another architecture.
     """
@@ -90,8 +86,8 @@ def read_tensors(path: Path) -> Mapping[str, Any]:
     """
     if not path.is_file():
         raise WeightsError(
-            f"expected a file of weights; there is none at {path}. Give a .safetensors or .pth file, or one of the "
-            f"published names {sorted(PUBLISHED)}"
+            f"expected a file of weights; there is none at {path}. Give a .safetensors or .pth file, or "
+            "'resnet18', which is fetched"
         )
     if path.suffix == ".safetensors":
         return _read_safetensors(path)
@@ -113,17 +109,17 @@ def read_tensors(path: Path) -> Mapping[str, Any]:
 
 
 def _network_of(tensors: Mapping[str, Any], where: str) -> ResNet:
-    """Make the network that tensors belong to; depth and stem are read off their names and shapes.
+    """Make the network that tensors belong to; its stem is read off their shapes.
 
     where: what messages call their source. The tensors are copied.
 
     Raises WeightsError that names what is missing, left over, of another shape, or not finite.
     """
     given = _cleaned(tensors, where)
-    depth, stem = _architecture(given, where)
-    net = ResNet.empty(depth, stem)
+    stem = _stem(given, where)
+    net = ResNet.empty(stem)
     wanted = {name: t for name, t in net.state_dict().items() if not HEADS.search(name)}
-    kind = f"a ResNet-{depth} with the {stem} stem"
+    kind = f"a ResNet-18 with the {stem} stem"
     if missing := sorted(set(wanted) - set(given)):
         raise WeightsError(f"{where} looks like {kind}, but lacks {_listed(missing)}")
     if extra := sorted(set(given) - set(wanted)):
@@ -143,19 +139,21 @@ def _network_of(tensors: Mapping[str, Any], where: str) -> ResNet:
 
 
 def cache_folder() -> Path:
-    """Where fetched weights are kept: $SCROLL_TACTILE_CACHE, or the platform's cache folder; weights/ within it."""
-    if chosen := os.environ.get(CACHE_VARIABLE):
-        return Path(chosen).expanduser() / "weights"
-    return Path(_pooch().os_cache("scroll-tactile")) / "weights"
+    """Where fetched weights are kept: weights/ in $SCROLL_TACTILE_CACHE, or in the user's cache of scroll-tactile."""
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.environ.get(CACHE_VARIABLE) or f"{cache}/scroll-tactile").expanduser() / "weights"
 
 
 def _published(name: str) -> Path:
     """The file of a published name, fetched where the cache has none."""
     url = PUBLISHED[name]
     path = cache_folder() / url.rsplit("/", 1)[1]
+    expected = path.stem.rsplit("-", 1)[1]
     if not path.is_file():
         try:
-            _fetch(url, path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Into a file beside it, which is compared and then renamed: what is there is whole.
+            torch.hub.download_url_to_file(url, str(path), expected, progress=False)
         except Exception as error:  # the downloader's errors are many: no network, no room, a proxy that refuses
             raise WeightsError(
                 f"the weights {name!r} could not be fetched from {url} ({type(error).__name__}: {error!s:.200}). "
@@ -163,7 +161,6 @@ def _published(name: str) -> Path:
                 "which need none"
             ) from error
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    expected = path.stem.rsplit("-", 1)[1]
     if not digest.startswith(expected):
         raise WeightsError(
             f"{path} is damaged: its SHA-256 begins with {digest[:8]}, where its publisher's name says {expected}. "
@@ -172,37 +169,23 @@ def _published(name: str) -> Path:
     return path
 
 
-def _fetch(url: str, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Into a file beside it first, and then renamed: what is there is whole. The hash is compared by the caller.
-    _pooch().retrieve(url, known_hash=None, fname=path.name, path=path.parent)
-
-
-def _pooch() -> Any:
-    with optional("pooch", "vision", "fetching published weights", "give the path of a file of weights"):
-        import pooch
-    return pooch
-
-
 def _read_safetensors(path: Path) -> Tensors:
     with optional("safetensors", "vision", str(path)):
         from safetensors import SafetensorError
         from safetensors.torch import load_file
     try:
-        tensors: Tensors = load_file(path)
+        return cast(Tensors, load_file(path))
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise WeightsError(f"{path} cannot be read as safetensors: {error}. It is damaged or cut off") from error
-    return tensors
 
 
 def _numpy_scalars_allowed() -> AbstractContextManager[None]:
     """Checkpoints often hold a best accuracy that is a NumPy scalar, beside the tensors; to read one runs nothing."""
     scalar: Any = np.float64(0).__reduce__()[0]
     kinds = [type(np.dtype(kind)) for kind in ("f8", "f4", "i8", "i4", "?")]
-    context: AbstractContextManager[None] = torch.serialization.safe_globals(
-        [np.dtype, *kinds, scalar, (scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar")]
-    )
-    return context
+    names = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
+    allowed = torch.serialization.safe_globals([np.dtype, *kinds, scalar, *((scalar, name) for name in names)])
+    return cast(AbstractContextManager[None], allowed)
 
 
 def _cleaned(tensors: Mapping[str, Any], where: str) -> Tensors:
@@ -211,29 +194,23 @@ def _cleaned(tensors: Mapping[str, Any], where: str) -> Tensors:
         tensors = next((held for name in CONTAINERS if isinstance(held := tensors.get(name), Mapping)), tensors)
     named = {PREFIXES.sub("", str(name)): tensor for name, tensor in tensors.items()}
     kept = {name: tensor for name, tensor in named.items() if not HEADS.search(name)}
-    if strange := sorted(name for name, tensor in kept.items() if not isinstance(tensor, torch.Tensor)):
-        raise WeightsError(f"expected tensors by name in {where}; {_listed(strange)} are none")
-    if sparse := sorted(name for name, tensor in kept.items() if tensor.layout != torch.strided or tensor.is_meta):
-        raise WeightsError(f"expected dense tensors in {where}; {_listed(sparse)} are of another layout")
+    dense = {n for n, t in kept.items() if isinstance(t, torch.Tensor) and t.layout == torch.strided and not t.is_meta}
+    if strange := kept.keys() - dense:
+        raise WeightsError(f"expected dense tensors by name in {where}; {_listed(sorted(strange))} are none")
     return kept
 
 
-def _architecture(tensors: Tensors, where: str) -> tuple[int, Stem]:
+def _stem(tensors: Tensors, where: str) -> Stem:
     first = tensors.get("conv1.weight")
-    kernel = tuple(first.shape[2:]) if first is not None and first.ndim == 4 else None
+    kernel = tuple(first.shape[2:]) if first is not None else None
+    blocks = {match[0] for name in tensors if (match := re.match(r"layer[1-4]\.\d+\.", name))}
     stems: dict[object, Stem] = {(7, 7): "torchvision", (5, 5): "universal"}
-    found = [re.match(r"layer([1-4])\.(\d+)\.", name) for name in tensors]
-    places = {(int(match[1]), int(match[2])) for match in found if match}
-    blocks = tuple(sum(layer == of for of, _ in places) for layer in (1, 2, 3, 4))
-    bottleneck = any(re.fullmatch(r"layer[1-4]\.\d+\.conv3\.weight", name) for name in tensors)
-    for depth, theirs in BLOCKS.items():
-        if kernel in stems and blocks == theirs and bottleneck == (depth >= BOTTLENECK):
-            return depth, stems[kernel]
+    if kernel in stems and blocks == {f"layer{layer}.{block}." for layer in (1, 2, 3, 4) for block in (0, 1)}:
+        return stems[kernel]
     raise WeightsError(
-        f"expected in {where} a ResNet of depth {', '.join(map(str, BLOCKS))} with a first convolution conv1.weight of "
-        f"7 × 7 (torchvision) or 5 × 5 (universal); found a first kernel of {kernel} and {blocks} "
-        f"{'bottleneck' if bottleneck else 'basic'} blocks in layer1 to layer4, among {len(tensors)} tensors "
-        f"({_listed(sorted(tensors))})"
+        f"expected in {where} a ResNet-18, two blocks in each of layer1 to layer4, with a first convolution "
+        f"conv1.weight of 7 × 7 (torchvision) or 5 × 5 (universal); found a first kernel of {kernel} and {len(blocks)} "
+        f"blocks, among {len(tensors)} tensors ({_listed(sorted(tensors))})"
     )
 
 

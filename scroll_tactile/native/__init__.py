@@ -28,19 +28,10 @@ _module, reason = _load()
 available = _module is not None
 
 
-def count(*arguments: Any) -> None:
-    """`tactile_count` of kernels.h. Raises ValueError for arrays that do not fit together."""
-    _module.count(*arguments)
-
-
-def sum_logs(*arguments: Any) -> None:
-    """`tactile_sum_logs` of matching.h. Raises ValueError likewise."""
-    _module.sum_logs(*arguments)
-
-
-def distances(*arguments: Any) -> None:
-    """`tactile_distances` of matching.h. Raises ValueError likewise."""
-    _module.distances(*arguments)
+# Each raises ValueError for arrays that do not fit together; see kernels.h and matching.h.
+count: Any = getattr(_module, "count", None)
+sum_logs: Any = getattr(_module, "sum_logs", None)
+distances: Any = getattr(_module, "distances", None)
 
 
 def described() -> str:

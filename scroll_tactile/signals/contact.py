@@ -41,10 +41,8 @@ def in_contact(stream: Stream, rest: Rest) -> npt.NDArray[np.bool_]:
     still = frames[0] if isinstance(rest, str) else rest
     gap = np.abs(scaled_down(frames, *_CELLS) - scaled_down(still[None], *_CELLS)).max(axis=3)
     low, high = stream.sensor.limits
-    span = high - low
-    differing = np.count_nonzero(gap >= np.float32(DIFFERENCE) * span, axis=(1, 2))
-    contact: npt.NDArray[np.bool_] = differing >= max(1.0, AREA * gap[0].size)
-    return contact
+    differing = np.count_nonzero(gap >= np.float32(DIFFERENCE) * (high - low), axis=(1, 2))
+    return np.asarray(differing >= max(1.0, AREA * gap[0].size))
 
 
 def pressed(stream: Stream, rest: Rest) -> Stream:

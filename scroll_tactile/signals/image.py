@@ -91,8 +91,7 @@ def stretched(image: Image, steps: int) -> Image:
     before, part = np.divmod(np.arange(steps) * (image.shape[1] - 1), max(steps - 1, 1))
     after = np.minimum(before + 1, image.shape[1] - 1)
     weight = (part / max(steps - 1, 1)).astype(np.float32)
-    blended: Image = image[:, before] * (1 - weight) + image[:, after] * weight
-    return blended
+    return np.asarray(image[:, before] * (1 - weight) + image[:, after] * weight)
 
 
 def shape_image(image: Image) -> Image:

@@ -194,8 +194,12 @@ def _sound(array: _Array, sensor: Sensor) -> Stream:
     with np.errstate(all="ignore"):  # values beyond float32 become infinite here, and are clipped below
         values = np.array(array, dtype=np.float32, order="C", copy=True, subok=False)
         least, most = values.min(), values.max()  # NaN if any value is
-    mask = None if math.isfinite(least) and math.isfinite(most) else _missing(array, sensor)
-    if mask is not None:
+    mask: npt.NDArray[np.bool_] | None = None
+    if not (math.isfinite(least) and math.isfinite(most)) and not np.isfinite(array).all():
+        mask = np.logical_not(np.isfinite(array), order="C")
+        if sensor.non_finite == "refused":
+            _refuse(array, mask, sensor)
+        _require_any(mask, sensor)
         values[mask] = low.min()  # neither clipped nor compared
         mask.setflags(write=False)
     clipped = 0
@@ -208,17 +212,6 @@ def _sound(array: _Array, sensor: Sensor) -> Stream:
     values += np.float32(0)  # −0 becomes 0: equal readings must have equal keys
     values.setflags(write=False)
     return Stream(sensor, values, clipped, mask)
-
-
-def _missing(array: _Array, sensor: Sensor) -> npt.NDArray[np.bool_] | None:
-    """Which values are not finite, None if all are; raises NotFiniteError where that is too many for the sensor."""
-    bad: npt.NDArray[np.bool_] = np.logical_not(np.isfinite(array), order="C")
-    if not bad.any():
-        return None
-    if sensor.non_finite == "refused":
-        _refuse(array, bad, sensor)
-    _require_any(bad, sensor)
-    return bad
 
 
 def _as_array(readings: Any, what: str, sensor: Sensor) -> _Array:

@@ -8,6 +8,7 @@ faster or slower: beside them the whole of it is read in its own time (see `imag
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,13 +31,8 @@ __all__ = [
     "Scale",
     "ScaleKind",
     "WindowPlan",
-    "extent",
-    "fitting",
     "measuring",
-    "milestones",
     "scales",
-    "scored",
-    "stages",
     "whole_steps",
 ]
 
@@ -119,30 +115,6 @@ def whole_steps(sensor: Sensor) -> int:
     return 0 if sensor.camera else min(max(sensor.readings, FEWEST), MOST_STEPS)
 
 
-@lru_cache(maxsize=1024)  # asked three times a touch
-def extent(steps: int, widths: tuple[int, ...], *, partial: bool = True, frames: bool = False) -> Extent:
-    """The windows that are read of a touch of so many steps, at every scale that fits.
-
-    The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
-    rests on: their strides grow from a sixth of the width to the width. Wider ones overlap by half, or by more where
-    few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A touch that is shorter than a scale, but not
-    much, is one window of it, if windows may be `partial`; of the shortest scale every touch is. A camera's windows are
-    its `frames`, and lie across no two of them.
-    """
-    return {
-        width: _thinned(range(0, max(1, steps - width + 1), width))
-        if frames
-        else _starts(steps, width, dense=width == widths[0])
-        for width in fitting(steps, widths, partial=partial)
-    }
-
-
-def fitting(steps: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
-    """The widths of which a touch of so many steps has a window."""
-    enough = ENOUGH if partial else 1.0
-    return [width for width in widths if width == widths[0] or steps >= enough * width]
-
-
 def _starts(steps: int, width: int, *, dense: bool) -> list[int]:
     room = max(0, steps - width)
     if not dense:
@@ -159,43 +131,6 @@ def _thinned(rest: range, begin: Sequence[int] = ()) -> list[int]:
     count = len(begin) + len(rest)
     places = np.linspace(0, count - 1, MOST_WINDOWS).round().astype(int) if count > MOST_WINDOWS else range(count)
     return [begin[place] if place < len(begin) else rest[place - len(begin)] for place in map(int, places)]
-
-
-def scored(extent: Mapping[int, Sequence[int]], length: int, *, partial: bool = True) -> dict[int, list[int]]:
-    """Width → places of the windows whose scores are averaged when the first `length` steps have been observed.
-
-    They lie within it. A window of the shortest width also begins at least half a width after the one before:
-    otherwise the densely read beginning would count for more than the rest.
-    """
-    widths = tuple(sorted(extent))
-    chosen: dict[int, list[int]] = {}
-    for width in fitting(length, widths, partial=partial):
-        begin = extent[width]
-        spacing = width // 2 if width == widths[0] else 1
-        places: list[int] = []
-        for place, start in enumerate(begin):
-            inside = start + width <= length or start == 0
-            if inside and (not places or start >= begin[places[-1]] + spacing):
-                places.append(place)
-        chosen[width] = places
-    return chosen
-
-
-def milestones(widths: tuple[int, ...], *, partial: bool = True) -> tuple[int, ...]:
-    """The lengths at which a touch reaches its stages: where a scale first fits, and halfway to the next (geometric).
-
-    How far a scale is to be believed depends on how many of its windows there are, so calibration is measured at
-    each: BioTac 30, 77 and 195 readings.
-    """
-    fit = [widths[0], *(int(np.ceil((ENOUGH if partial else 1.0) * width)) for width in widths[1:])]
-    between = [round(float(np.sqrt(low * high))) for low, high in pairwise(fit)]
-    return tuple(sorted({*fit, *between}))
-
-
-def stages(steps: int, widths: tuple[int, ...], *, partial: bool = True) -> list[int]:
-    """The lengths of a touch's stages: the milestones that it reached, the last replaced by its own length."""
-    reached = [length for length in milestones(widths, partial=partial) if length <= steps]
-    return [*reached[:-1], steps]
 
 
 @dataclass(frozen=True)
@@ -234,19 +169,47 @@ class WindowPlan:
         return self.windows + self.views
 
     def extent(self, steps: int) -> Extent:
-        """The windows that are read of a touch of so many steps."""
-        return extent(steps, self.widths, partial=self.partial, frames=self.frames)
+        """The windows that are read of a touch of so many steps, at every scale that fits.
+
+        The shortest begin densely where the touch begins, which differs from the rest and is what an early decision
+        rests on: their strides grow from a sixth of the width to the width. Wider ones overlap by half, or by more
+        where few fit. There are at most MOST_WINDOWS of a scale, evenly spread. A touch that is shorter than a scale,
+        but not much, is one window of it, if windows may be `partial`; of the shortest scale every touch is. A camera's
+        windows are its frames, and lie across no two of them.
+        """
+        return _extent(self, steps)
+
+    def fitting(self, steps: int) -> list[int]:
+        """The widths of which a touch of so many steps has a window."""
+        enough = ENOUGH if self.partial else 1.0
+        return [width for width in self.widths if width == self.widths[0] or steps >= enough * width]
 
     def judging(self, length: int) -> list[Scale]:
         """The windows that judge when so many steps have been observed; the views always do."""
-        fit = fitting(length, self.widths, partial=self.partial)
-        chosen = fit[-1:] if self.judged == "widest" else fit
-        return [Scale("window", width) for width in chosen]
+        fit = self.fitting(length)
+        return [Scale("window", width) for width in (fit[-1:] if self.judged == "widest" else fit)]
+
+    def observed(self, steps: int, length: int) -> dict[Scale, list[int]]:
+        """Scale → places of the windows of a touch of so many steps that count when `length` steps are observed.
+
+        They lie within these. A window of the shortest width also begins at least half a width after the one before:
+        otherwise the densely read beginning would count for more than the rest.
+        """
+        extent, chosen = self.extent(steps), {}
+        for width in self.fitting(length):
+            begin, places = extent[width], list[int]()
+            spacing = width // 2 if width == self.widths[0] else 1
+            for place, start in enumerate(begin):
+                inside = start + width <= length or start == 0
+                if inside and (not places or start >= begin[places[-1]] + spacing):
+                    places.append(place)
+            chosen[Scale("window", width)] = places
+        return chosen
 
     def scored(self, steps: int, length: int) -> dict[Scale, list[int]]:
         """Scale → places of the windows that judge a touch of so many steps after the first `length` of them."""
-        places = scored(self.extent(steps), length, partial=self.partial)
-        return {scale: places[scale.width] for scale in self.judging(length)}
+        places = self.observed(steps, length)
+        return {scale: places[scale] for scale in self.judging(length)}
 
     def scored_stages(self, steps: int) -> list[dict[Scale, list[list[int]]]]:
         """For each stage that a touch of so many steps reached: scale → places of the windows that judge there.
@@ -270,17 +233,30 @@ class WindowPlan:
         return dict(_places(self, steps))
 
     def milestones(self) -> tuple[int, ...]:
-        """The lengths at which a touch reaches its stages."""
-        return milestones(self.widths, partial=self.partial)
+        """The lengths at which a touch reaches its stages: where a scale first fits, and geometrically halfway to it.
+
+        How far a scale is to be believed depends on how many of its windows there are, so calibration is measured at
+        each: BioTac 30, 77 and 195 readings.
+        """
+        enough = ENOUGH if self.partial else 1.0
+        fit = [self.widths[0], *(math.ceil(enough * width) for width in self.widths[1:])]
+        between = [round(math.sqrt(low * high)) for low, high in pairwise(fit)]
+        return tuple(sorted({*fit, *between}))
 
     def stages(self, steps: int) -> list[int]:
-        """The lengths of a touch's stages, the last its own."""
-        return stages(steps, self.widths, partial=self.partial)
+        """The lengths of a touch's stages: the milestones that it reached, the last replaced by its own length."""
+        reached = [length for length in self.milestones() if length <= steps]
+        return [*reached[:-1], steps]
+
+
+@lru_cache(maxsize=1024)  # asked three times a touch
+def _extent(plan: WindowPlan, steps: int) -> Extent:
+    if plan.frames:
+        return {width: _thinned(range(0, max(1, steps - width + 1), width)) for width in plan.fitting(steps)}
+    return {width: _starts(steps, width, dense=width == plan.widths[0]) for width in plan.fitting(steps)}
 
 
 @lru_cache(maxsize=1024)
 def _places(plan: WindowPlan, steps: int) -> Mapping[Scale, list[int]]:
     """See `WindowPlan.places`."""
-    places = scored(plan.extent(steps), steps, partial=plan.partial)
-    windows = {Scale("window", width): chosen for width, chosen in places.items()}
-    return windows | {view: [0] for view in plan.views}
+    return plan.observed(steps, steps) | {view: [0] for view in plan.views}

@@ -82,39 +82,26 @@ class Gel:
         random = np.random.default_rng([_TOUCH, self.seed, index, repetition])
         mean = math.exp(random.normal(0, 0.15))
         pressure = np.arange(count) / max(1, count - 1) * (mean if force is None else force)
-        slopes = _pressed(self.seed, index, _grid(self.sensor.shape), random)
-        shares = np.stack([_lit(slopes, float(force)) for force in pressure])
+        height, width = self.sensor.shape[:2]
+        # The pixels' places, in widths of the frame, from its middle.
+        down, right = (np.arange(height) + 0.5 - height / 2) / width, (np.arange(width) + 0.5) / width - 0.5
+        y, x = np.meshgrid(down, right, indexing="ij")
+        slopes = _pressed(self.seed, index, y, x, random)
+        shares = np.stack([_lit(y, x, *slopes, float(force)) for force in pressure])
         shares += _NOISE * random.standard_normal(shares.shape)
         low, high = np.asarray(self.sensor.low), np.asarray(self.sensor.high)
         return validate(low + np.round(np.clip(shares, 0, 1) * (high - low)), self.sensor)
 
 
-@dataclass(frozen=True)
-class _Slopes:
+def _pressed(
+    seed: int, index: int, y: _Floats, x: _Floats, random: np.random.Generator
+) -> tuple[_Floats, _Floats, _Floats]:
     """Of a relief fully pressed in: its slopes and the distance from the middle of the contact, (H, W) each."""
-
-    across: _Floats
-    along: _Floats
-    distance: _Floats
-    places: tuple[_Floats, _Floats]
-
-
-def _grid(shape: tuple[int, ...]) -> tuple[_Floats, _Floats]:
-    """Places (y, x) of the pixels, in widths of the frame, from its middle."""
-    height, width = shape[:2]
-    y, x = np.meshgrid(
-        (np.arange(height) + 0.5 - height / 2) / width, (np.arange(width) + 0.5) / width - 0.5, indexing="ij"
-    )
-    return y, x
-
-
-def _pressed(seed: int, index: int, places: tuple[_Floats, _Floats], random: np.random.Generator) -> _Slopes:
     relief = np.random.default_rng([_RELIEF, seed, index, 0])
     lengths = np.exp(relief.uniform(np.log(0.05), np.log(0.3), _WAVES))
     steepness = relief.dirichlet(np.ones(_WAVES)) * relief.uniform(0.2, 0.5)
     turns = relief.uniform(0, math.pi, _WAVES) + random.normal(0, 0.3)
     phases = random.uniform(0, 2 * math.pi, _WAVES)
-    y, x = places
     middle = random.normal(0, 0.05, 2)
     across, along = np.zeros_like(x), np.zeros_like(x)
     for length, steep, turn, phase in zip(lengths, steepness, turns, phases, strict=True):
@@ -122,16 +109,15 @@ def _pressed(seed: int, index: int, places: tuple[_Floats, _Floats], random: np.
         slope = steep * np.cos(2 * math.pi / length * way + phase)
         across += slope * math.sin(turn)
         along += slope * math.cos(turn)
-    return _Slopes(across, along, np.hypot(y - middle[0], x - middle[1]), places)
+    return across, along, np.hypot(y - middle[0], x - middle[1])
 
 
-def _lit(slopes: _Slopes, pressure: float) -> _Floats:
+def _lit(y: _Floats, x: _Floats, across: _Floats, along: _Floats, distance: _Floats, pressure: float) -> _Floats:
     """A frame as shares of the range, (H, W, 3)."""
-    y, x = slopes.places
-    touched = 1 / (1 + np.exp((slopes.distance - 0.35 * math.sqrt(pressure)) / 0.02)) if pressure else np.zeros_like(x)
+    touched = 1 / (1 + np.exp((distance - 0.35 * math.sqrt(pressure)) / 0.02)) if pressure else np.zeros_like(x)
     colours = []
     for base, lamp in zip(_BASE, _LAMPS, strict=True):
         glow = _GLOW * (math.cos(lamp) * x - math.sin(lamp) * y)
-        shade = math.cos(lamp) * slopes.along - math.sin(lamp) * slopes.across
+        shade = math.cos(lamp) * along - math.sin(lamp) * across
         colours.append(base + glow + _SLOPE * touched * min(pressure, 1.5) * shade * 0.3)
     return np.stack(colours, axis=-1)

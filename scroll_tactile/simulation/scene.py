@@ -139,10 +139,11 @@ class Scene:
     @property
     def step(self) -> _Floats:
         """Of the sensor's converter, in its unit: one for all channels, or one for each."""
+        span: _Floats = np.asarray(self.sensor.high) - np.asarray(self.sensor.low)
         if self.response == "events":
-            whole: _Floats = np.asarray(self.sensor.high) - np.asarray(self.sensor.low)
-            return whole
-        return _step(self.sensor)
+            return span
+        counts = (np.asarray(self.sensor.unit) == "counts") & (span >= 100)  # whole; a unit of rescaled counts is none
+        return np.where(counts, 1.0, span / 4095)
 
     def noise(self, random: np.random.Generator, count: int) -> _Floats:
         """Noise of so many readings, as shares of the range, (count, n); events have none."""
@@ -191,7 +192,8 @@ class Scene:
         elif self.response == "light":
             wander = np.cumsum(random.standard_normal(shares.shape), axis=0) / math.sqrt(self.sensor.rate)
             shares = pad.rest + _LIGHT * (shares - pad.rest) + _WANDER * wander
-        return validate(_quantise(shares, self.sensor, self.step), self.sensor)
+        low, high, step = np.asarray(self.sensor.low), np.asarray(self.sensor.high), self.step
+        return validate(np.clip(low + np.round(shares * (high - low) / step) * step, low, high), self.sensor)
 
 
 @lru_cache(maxsize=256)
@@ -251,8 +253,7 @@ def _slide(
     # Drawn even where they are given, so that a touch at another speed is otherwise the same touch.
     mean_speed = _SPEED * math.exp(random.normal(0, 0.025))
     mean_force = _FORCE * math.exp(random.normal(0, 0.06))
-    speed = mean_speed if speed is None else speed
-    force = mean_force if force is None else force
+    speed, force = mean_speed if speed is None else speed, mean_force if force is None else force
     middle = random.normal(0, 0.5, 2)
     rhythm, turn = random.uniform(0.5, 1.5), random.uniform(0, 2 * math.pi)
 
@@ -267,8 +268,7 @@ def _slide(
     drift = 1 + random.normal(0, 0.02) * times
     load = (press * drift * math.sqrt(force))[:, None]
     noise = random.normal(0, _NOISE) + _NOISE * random.standard_normal(place.shape)
-    shares: _Floats = pad.rest + noise + contact * load * (texture.firmness + height)
-    return shares
+    return np.asarray(pad.rest + noise + contact * load * (texture.firmness + height))
 
 
 def _height(texture: _Texture, place: _Floats, random: np.random.Generator) -> _Floats:
@@ -291,16 +291,3 @@ def _events(shares: _Floats) -> _Floats:
         event[now >= reported + _RISE] = 1.0
         reported = np.where(np.abs(now - reported) >= _RISE, now, reported)
     return events
-
-
-def _quantise(shares: _Floats, sensor: Sensor, step: _Floats) -> _Floats:
-    """In the sensor's unit, within its range, in steps of its converter."""
-    low, high = np.asarray(sensor.low), np.asarray(sensor.high)
-    readings: _Floats = np.clip(low + np.round(shares * (high - low) / step) * step, low, high)
-    return readings
-
-
-def _step(sensor: Sensor) -> _Floats:
-    span = np.asarray(sensor.high) - np.asarray(sensor.low)
-    counts = (np.asarray(sensor.unit) == "counts") & (span >= 100)  # whole counts; a unit of rescaled counts is none
-    return np.where(counts, 1.0, span / 4095)

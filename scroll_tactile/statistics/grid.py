@@ -21,14 +21,12 @@ def to_codes(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np
 
     features: finite and within the bound, see `embeddings.protocol.require_features`.
     """
-    codes: npt.NDArray[np.int32] = np.rint(in_units(features, bound)).astype(np.int32)
-    return codes
+    return np.rint(in_units(features, bound)).astype(np.int32)
 
 
 def in_units(features: npt.NDArray[np.floating], bound: float) -> npt.NDArray[np.float64]:
     """Features in grid units, bound · 2⁻²⁰, not rounded; float64 of the same shape."""
-    scaled: npt.NDArray[np.float64] = np.multiply(features, 2.0**BITS / bound, dtype=np.float64)
-    return scaled
+    return np.asarray(np.multiply(features, 2.0**BITS / bound, dtype=np.float64))
 
 
 def mean_code(total: npt.NDArray[np.integer], rows: int | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -38,9 +36,7 @@ def mean_code(total: npt.NDArray[np.integer], rows: int | npt.NDArray[np.int64])
 
 
 def table_of(rows: Codes) -> tuple[Codes, Codes]:
-    """The different values of rows (n, d), ascending, and the place of each code among them, shape (d, n)."""
-    if not rows.size:
-        return np.zeros(0, dtype=np.int32), np.zeros(rows.shape[::-1], dtype=np.int32)
+    """The different values of rows (n, d), all there, ascending, and the place of each code among them, (d, n)."""
     low = int(rows.min())
     offsets = (rows.T - low).astype(np.intp)
     # Codes are 21 bits: to look them up takes a thirtieth of the time that sorting takes.

@@ -143,10 +143,7 @@ class _Rows:
     def add(self, codes: Codes) -> None:
         """Add rows."""
         last = self._count + len(codes)
-        if len(self._codes) < last:
-            longer = np.empty((min(self._dimension, max(2 * self._count, last, FIRST)), self._dimension), np.int32)
-            longer[: self._count] = self._codes[: self._count]
-            self._codes = longer
+        self._codes = _with_room(self._codes, self._count, last, self._dimension)
         self._codes[self._count : last] = codes
         self._count = last
 
@@ -161,7 +158,8 @@ class _Rows:
         """The lower triangle."""
         rows = self._read()
         if self._packed is None or self._formed < len(rows):
-            packed = _zeros(self._dimension) if self._packed is None else self._packed.copy()
+            size = self._dimension * (self._dimension + 1) // 2
+            packed = np.zeros(size, np.int64) if self._packed is None else self._packed.copy()
             _add_products(packed, rows[self._formed :], np.add)
             self._packed, self._formed = packed, len(rows)
         return self._packed
@@ -204,10 +202,7 @@ class _Triangle:
         if self._count + len(codes) > BLOCK:
             self.packed()
         last = self._count + len(codes)
-        if len(self._waiting) < last:
-            longer = np.empty((min(BLOCK, max(2 * self._count, last, FIRST)), self._dimension), np.int32)
-            longer[: self._count] = self._waiting[: self._count]
-            self._waiting = longer
+        self._waiting = _with_room(self._waiting, self._count, last, BLOCK)
         self._waiting[self._count : last] = codes
         self._count = last
 
@@ -227,8 +222,13 @@ class _Triangle:
         return _Triangle(self._dimension, packed)
 
 
-def _zeros(dimension: int) -> IntArray:
-    return np.zeros(dimension * (dimension + 1) // 2, dtype=np.int64)
+def _with_room(codes: Codes, count: int, needed: int, most: int) -> Codes:
+    """The first rows, so many, with room for those that are needed: twice as many at once, but no more than `most`."""
+    if len(codes) >= needed:
+        return codes
+    longer = np.empty((min(most, max(2 * count, needed, FIRST)), codes.shape[1]), np.int32)
+    longer[:count] = codes[:count]
+    return longer
 
 
 def _without(rows: Codes, gone: Codes) -> Codes | None:
@@ -245,18 +245,15 @@ def _without(rows: Codes, gone: Codes) -> Codes | None:
 
 def _add_products(packed: IntArray, codes: Codes, put: np.ufunc) -> None:
     """Add the lower triangle of codesᵀ · codes to `packed`, exact; or, with np.subtract for `put`, take it out."""
-    for first in range(0, len(codes), BLOCK):
-        _add_product(packed, codes[first : first + BLOCK].astype(np.float64), put)
-
-
-def _add_product(packed: IntArray, rows: FloatArray, put: np.ufunc) -> None:
-    places = list(_rows_of_triangle(rows.shape[1]))
-    for first in range(0, len(places), ROWS):
-        last = min(first + ROWS, len(places))
-        with one_thread():
-            product = (rows[:, first:last].T @ rows[:, :last]).astype(np.int64)
-        for row, place in places[first:last]:
-            put(packed[place], product[row - first, : row + 1], out=packed[place])
+    places = list(_rows_of_triangle(codes.shape[1]))
+    for begin in range(0, len(codes), BLOCK):
+        rows = codes[begin : begin + BLOCK].astype(np.float64)
+        for first in range(0, len(places), ROWS):
+            last = min(first + ROWS, len(places))
+            with one_thread():
+                product = (rows[:, first:last].T @ rows[:, :last]).astype(np.int64)
+            for row, place in places[first:last]:
+                put(packed[place], product[row - first, : row + 1], out=packed[place])
 
 
 def within_scatter(packed: IntArray, counts: IntArray, sums: Sums) -> FloatArray:

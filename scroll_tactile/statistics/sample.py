@@ -14,7 +14,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import InputError
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.statistics.grid import mean_code
@@ -81,13 +80,9 @@ class Sample(Generic[T]):
 
     It holds the first items in the order (rank of the key within its material, key, material). An item more pushes the
     others back or leaves them where they are, so what was dropped never belongs in again.
-
-    Raises InputError for a capacity below 1.
     """
 
-    def __init__(self, capacity: int) -> None:
-        if capacity < 1:
-            raise InputError(f"expected a capacity of 1 or more items; came {capacity}")
+    def __init__(self, capacity: int = CAPACITY) -> None:
         self.capacity = capacity
         self._keys: dict[str, list[bytes]] = {}
         self._items: dict[tuple[str, bytes], T] = {}
@@ -161,9 +156,6 @@ class Sample(Generic[T]):
 
 class TouchSample(Sample[SampledTouch]):
     """At most `capacity` touches of all materials: a function of the set of touches observed."""
-
-    def __init__(self, capacity: int = CAPACITY) -> None:
-        super().__init__(capacity)
 
     def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
         """What a store keeps: arrays by name, and the material of each touch.

@@ -45,39 +45,6 @@ def test_windows_wider_than_the_image_and_of_a_very_long_one(columns):
             assert row.tobytes() == SMALL.embed(whole[:, start : start + width], width).tobytes()
 
 
-@pytest.fixture
-def restored():
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
-    torch.set_float32_matmul_precision("highest")
-    torch.set_default_dtype(torch.float32)
-    torch.set_default_device(None)
-    torch.set_autocast_enabled("cpu", False)
-    forget_caches()
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        lambda: torch.set_num_threads(2),
-        lambda: torch.set_float32_matmul_precision("medium"),
-        lambda: torch.set_default_dtype(torch.float64),
-        lambda: torch.set_default_device("meta"),
-        lambda: torch.set_autocast_enabled("cpu", True),
-    ],
-    ids=["two threads", "medium precision", "float64", "another device", "autocast"],
-)
-@pytest.mark.usefixtures("restored")
-def test_banks_made_under_the_settings_of_the_callers_program_are_the_same(setting):
-    cases = [(embedding, image(19, 400)) for embedding in BOTH] + [(SMALL, image(19, 30))]
-    expected = [embedding.embed(picture).tobytes() for embedding, picture in cases]
-    setting()
-    assert [embedding.embed(picture).tobytes() for embedding, picture in cases] == expected
-    forget_caches()
-    assert [embedding.embed(picture).tobytes() for embedding, picture in cases] == expected
-
-
 def test_images_that_are_not_contiguous():
     plain = image(19, 100)
     wide = np.zeros((38, 200), dtype=np.float32)

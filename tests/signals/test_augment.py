@@ -1,12 +1,10 @@
 """Each augmentation is a change in how the touch was made; together they are a function of image and generator."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from scroll_tactile.errors import InputError
 from scroll_tactile.signals.augmentation import Augmentation, Change, crop, fit, flip, jitter, resize
 
 few = settings(max_examples=40, deadline=None)
@@ -112,68 +110,6 @@ def test_by_default_touches_change_and_only_by_the_generator_given():
     assert first.tobytes() != second.tobytes()
     assert Augmentation().augment(RAMP, np.random.default_rng(0), steps=40).tobytes() == first.tobytes()
     assert np.random.get_state()[1].tobytes() == state  # noqa: NPY002
-
-
-WRONG_IMAGES = {
-    "an empty batch": np.zeros((0, 2, 4), np.float32),
-    "one axis": np.zeros(4, np.float32),
-    "doubles": np.zeros((2, 4)),
-    "no columns": np.zeros((2, 0), np.float32),
-}
-
-
-@pytest.mark.parametrize("image", WRONG_IMAGES.values(), ids=WRONG_IMAGES.keys())
-def test_what_is_no_tactile_image_is_refused(image):
-    rng = np.random.default_rng(0)
-    for change in (
-        flip,
-        lambda image: resize(image, 1),
-        lambda image: crop(image, 0, 1),
-        lambda image: jitter(image, image, image),
-        lambda image: fit(image, 3),
-        lambda image: Augmentation().augment(image, rng),
-    ):
-        with pytest.raises(InputError, match="expected a tactile image"):
-            change(image)
-
-
-def test_other_wrong_arguments_are_refused():
-    zeros = np.zeros((2, 21), np.float32)
-    for noise, drift in ((zeros[:, :3], zeros), (zeros, zeros[:1]), (zeros, zeros[0]), (zeros, zeros[:, :0])):
-        with pytest.raises(InputError, match="came"):
-            jitter(RAMP, noise, drift)
-    for noise, drift in ((zeros * np.nan, zeros), (zeros, zeros + np.inf)):
-        with pytest.raises(InputError, match="finite"):
-            jitter(RAMP, noise, drift)
-    with pytest.raises(InputError, match="came 0"):
-        fit(RAMP, 0)
-    for factor in (0, -1, np.nan, np.inf):
-        with pytest.raises(InputError, match=str(factor)):
-            resize(RAMP, factor)
-    for start, columns in ((-1, 3), (0, 0), (20, 2), (0, 22)):
-        with pytest.raises(InputError, match=f"{columns} from {start}"):
-            crop(RAMP, start, columns)
-    wrong = {"speed": 0}, {"keep": 0}, {"keep": 2}, {"place": -1}, {"noise": -1}, {"drift": np.inf}, {"seed": -1}
-    for fields in wrong:
-        with pytest.raises(InputError, match="came Change"):
-            Change(**fields)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"flip": 1.1},
-        {"speed": (0, 1)},
-        {"speed": (2, 1)},
-        {"speed": (1,)},
-        {"keep": 0},
-        {"noise": -1},
-        {"drift": np.nan},
-    ],
-)
-def test_strengths_that_cannot_be_are_refused(wrong):
-    with pytest.raises(InputError, match="came Augmentation"):
-        Augmentation(**wrong)
 
 
 @few

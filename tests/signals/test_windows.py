@@ -11,12 +11,8 @@ from scroll_tactile.signals.windows import (
     MOST_STEPS,
     MOST_WINDOWS,
     Scale,
-    extent,
-    fitting,
-    milestones,
+    WindowPlan,
     scales,
-    scored,
-    stages,
     whole_steps,
 )
 
@@ -50,8 +46,8 @@ def test_windows_of_all_lengths_lie_within_begin_at_the_beginning_and_are_few(on
     assert list(widths) == sorted(set(widths))
     assert all(0 < width <= one.readings for width in widths[1:])
     for columns in [*range(1, 500), 2000, 10_000, 10**6, 2**28]:
-        read = extent(columns, widths)
-        assert list(read) == fitting(columns, widths)
+        read = WindowPlan(widths).extent(columns)
+        assert list(read) == WindowPlan(widths).fitting(columns)
         assert widths[0] in read
         assert {width for width in widths if width <= columns} <= read.keys()
         for width, begin in read.items():
@@ -66,7 +62,7 @@ def test_windows_of_all_lengths_lie_within_begin_at_the_beginning_and_are_few(on
 @pytest.mark.parametrize("one", [BIOTAC, ROBOSKIN, SLOW], ids=named)
 def test_a_long_touch_is_read_to_its_end(one):
     for columns in (one.readings, 3 * one.readings, 10**6):
-        for width, begin in extent(columns, scales(one)).items():
+        for width, begin in WindowPlan(scales(one)).extent(columns).items():
             assert begin[-1] + 2 * width > columns
 
 
@@ -74,11 +70,12 @@ def test_a_long_touch_is_read_to_its_end(one):
 def test_scored_windows_lie_within_what_was_observed(one):
     widths = scales(one)
     for columns in [*range(1, 400), 977, 2000]:
-        read = extent(columns, widths)
-        for length in stages(columns, widths):
-            chosen = scored(read, length)
-            assert list(chosen) == fitting(length, widths)
-            for width, places in chosen.items():
+        plan = WindowPlan(widths)
+        read = plan.extent(columns)
+        for length in plan.stages(columns):
+            chosen = plan.scored(columns, length)
+            assert [scale.width for scale in chosen] == plan.fitting(length)
+            for width, places in ((scale.width, places) for scale, places in chosen.items()):
                 starts = [read[width][place] for place in places]
                 assert starts[0] == 0
                 assert all(start + width <= length for start in starts[1:])
@@ -88,8 +85,9 @@ def test_scored_windows_lie_within_what_was_observed(one):
 
 
 def test_of_the_shortest_those_are_scored_that_begin_half_a_width_apart():
-    read = extent(100, (30, 300))
-    assert [read[30][place] for place in scored(read, 100)[30]] == [0, 15, 34, 60]
+    plan = WindowPlan((30, 300))
+    places = plan.scored(100, 100)[Scale("window", 30)]
+    assert [plan.extent(100)[30][place] for place in places] == [0, 15, 34, 60]
 
 
 def test_views_have_as_many_columns_as_a_usual_touch_within_bounds():
@@ -98,31 +96,32 @@ def test_views_have_as_many_columns_as_a_usual_touch_within_bounds():
 
 def test_milestones_ascend_from_the_shortest_scale_to_where_the_longest_fits():
     for widths in ((30, 200), (80,), (9, 20, 1000), (15, 56)):
-        reached = milestones(widths)
+        plan = WindowPlan(widths)
+        reached = plan.milestones()
         assert list(reached) == sorted(set(reached))
         assert reached[0] == widths[0]
         assert len(reached) == 2 * len(widths) - 1
-        assert fitting(reached[-1], widths) == list(widths) != fitting(reached[-1] - 1, widths) or len(widths) == 1
+        assert plan.fitting(reached[-1]) == list(widths) != plan.fitting(reached[-1] - 1) or len(widths) == 1
 
 
 @pytest.mark.parametrize("one", ALL, ids=named)
 def test_the_stages_of_a_touch_end_with_its_own_length(one):
-    widths = scales(one)
+    plan = WindowPlan(scales(one))
     for columns in range(1, 700):
-        reached = stages(columns, widths)
+        reached = plan.stages(columns)
         assert reached[-1] == columns
         assert reached == sorted(set(reached))
-        assert len(reached) == max(1, sum(length <= columns for length in milestones(widths)))
+        assert len(reached) == max(1, sum(length <= columns for length in plan.milestones()))
 
 
 @pytest.mark.parametrize("rate", [5.0, 33.0, 100.0])
 def test_at_each_stage_a_touch_has_the_scales_by_which_the_stage_is_judged(rate):
     """Calibration and model know a stage by its number, and take its scales from its milestone."""
     for tenths in range(2, 40, 3):
-        widths = scales(sensor(rate, tenths / 10))
+        plan = WindowPlan(scales(sensor(rate, tenths / 10)))
         for columns in range(1, int(rate * tenths / 5)):
-            for stage, length in enumerate(stages(columns, widths)):
-                assert fitting(length, widths) == fitting(milestones(widths)[stage], widths), (widths, columns)
+            for stage, length in enumerate(plan.stages(columns)):
+                assert plan.fitting(length) == plan.fitting(plan.milestones()[stage]), (plan, columns)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 64, 65, 1000])

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scroll_tactile.errors import InputError
 from scroll_tactile.statistics.grid import mean_code
 from scroll_tactile.statistics.sample import CAPACITY, SampledTouch, TouchSample, stage_rows
 
@@ -92,12 +91,6 @@ def test_what_a_store_keeps_is_all_of_it(before, after):
     for part in (sample, again):
         part.add(*after, touch_of(*after))
     assert content(again) == content(sample) == content(sample_of([*before, after], CAPACITY))
-
-
-@pytest.mark.parametrize("capacity", [0, -1])
-def test_a_sample_of_nothing_is_refused(capacity):
-    with pytest.raises(InputError, match=f"1 or more items; came {capacity}"):
-        TouchSample(capacity)
 
 
 # Of each stage: the places of windows, in groups, at each of two scales; a scale judges there or does not.

@@ -13,7 +13,7 @@ from scroll_tactile_store import DamageError, RecordError, Store, VersionError, 
 from scroll_tactile_store.compression import compress, decompress, decompress_zstd
 from store_builds import taking_at_most
 
-from scroll_tactile.recordings.arrays.blosc import decompress_blosc
+from scroll_tactile.recordings.zarrfile import _decompress_blosc
 
 
 def payload(arrays, version=1):
@@ -122,7 +122,7 @@ FRAMES = {
     "lz4": lambda raw: blosc.compress(raw.view("<u2"), b"lz4", 1, blosc.SHUFFLE),
     "own": lambda raw: compress(raw, 4),
 }
-READ = {"zstd": decompress_blosc, "lz4": decompress_blosc, "own": lambda frame, target: decompress(frame, target, 4)}
+READ = {"zstd": _decompress_blosc, "lz4": _decompress_blosc, "own": lambda frame, target: decompress(frame, target, 4)}
 
 
 @pytest.mark.parametrize("kind", FRAMES)
@@ -141,7 +141,7 @@ def test_no_harmed_frame_writes_outside_its_destination(kind, seed):
     if rng.random() < 0.2:
         del frame[int(rng.integers(len(frame))) :]
     around = np.full(40_000 + 2 * 4096, 0xA5, np.uint8)
-    with contextlib.suppress(ValueError):
+    with contextlib.suppress(ValueError, RuntimeError):
         READ[kind](bytes(frame), around[4096:-4096])
     assert (around[:4096] == 0xA5).all()
     assert (around[-4096:] == 0xA5).all()
@@ -165,8 +165,8 @@ HOSTILE = {
 
 @pytest.mark.parametrize("frame", HOSTILE.values(), ids=HOSTILE)
 def test_a_frame_whose_lengths_are_not_what_is_there_is_refused(frame):
-    with pytest.raises(ValueError):
-        decompress_blosc(frame, np.empty(65536, np.uint8))
+    with pytest.raises((ValueError, RuntimeError)):
+        _decompress_blosc(frame, np.empty(65536, np.uint8))
 
 
 @pytest.mark.parametrize(

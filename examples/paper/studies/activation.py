@@ -271,7 +271,7 @@ class ActivationStudy(SystemStudy):
             net = load_network(self.weights)
             net.load_state_dict(self._first_layers(recordings.name), strict=False)
             found[f"fine-tuned on {recordings.name}"] = net
-        return found | {CONTROL: ResNet.random(self.seed, found[START].depth, found[START].stem)}
+        return found | {CONTROL: ResNet.random(self.seed, found[START].stem)}
 
     def _first_layers(self, dataset: str) -> dict[str, torch.Tensor]:
         if dataset not in self.tuned:

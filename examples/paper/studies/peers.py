@@ -19,7 +19,7 @@ from scroll_tactile.embeddings.protocol import embed_windows
 from scroll_tactile.errors import InputError
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.stream import Stream
-from scroll_tactile.signals.windows import extent, scales
+from scroll_tactile.signals.windows import WindowPlan, scales
 
 __all__ = ["ACIL", "ContinualPeer", "NearestMean", "NearestNeighbour", "RanPAC", "StreamingLDA", "touch_features"]
 
@@ -35,7 +35,7 @@ def touch_features(embedding: Embedding, streams: Sequence[Stream]) -> FloatArra
     for stream in streams:
         widths = scales(stream.sensor)
         image = tactile_image(stream)
-        starts = extent(image.shape[1], widths).get(widths[-1], [0])
+        starts = WindowPlan(widths).extent(image.shape[1]).get(widths[-1], [0])
         rows.append(embed_windows(embedding, image, {widths[-1]: starts})[widths[-1]].mean(axis=0, dtype=np.float64))
     return np.stack(rows)
 

@@ -14,9 +14,9 @@ from robot import EXAMPLES, TOPIC, command, ended_by_ctrl_c, publishing
 from scroll_tactile_store import DamageError
 
 from scroll_tactile import TactileLearner, errors
+from scroll_tactile.clients.ros2 import Bridge, TactileNode, serve
 from scroll_tactile.clients.ros2.inputs import interface, names_in, require_rclpy
-from scroll_tactile.clients.ros2.node import TactileNode
-from scroll_tactile.clients.ros2.serving import _new_sensor, _node, _place, _start, serve
+from scroll_tactile.clients.ros2.node import _new_sensor, _place
 from scroll_tactile.recordings import PRESETS
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
@@ -155,25 +155,8 @@ def opening(own, monkeypatch):
     TactileLearner.open(own).close()  # it was let go
 
 
-@pytest.fixture
-def prepared(spinning, own):
-    """Makes a lifecycle node here, with these values of parameters; it is cleaned up at the end."""
-    made = []
-
-    def node(**values):
-        node = spinning.node("scroll_tactile", _node)
-        given = {"memory": str(own), "topic": TOPIC, "field": "position", "type": "sensor_msgs/msg/JointState"}
-        node.prepare(None, given | values)
-        made.append(node)
-        return node
-
-    yield node
-    for each in made:
-        each.clean_up()
-
-
-def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, prepared, opening):
-    node, (go, paths) = prepared(), opening
+def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, tactile, opening):
+    node, (go, paths) = tactile(own, start=False), opening
 
     def running():
         """What else the node is asked meanwhile."""
@@ -184,44 +167,44 @@ def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, prep
             assert node.trigger_configure() and node.error is None
         return True
 
-    _start(node, running)
-    assert paths == [own] and not node.finger.active
+    node.start(running)
+    assert paths == [own] and node.bridge is not None and not node.active
     node.clean_up()
 
 
-def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(prepared, opening):
-    node = prepared()
-    _start(node, lambda: False)
+def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(own, tactile, opening):
+    node = tactile(own, start=False)
+    node.start(lambda: False)
     opening[0].set()
     node.clean_up()
-    assert node.met["materials"] == 3 and node.finger is None
+    assert node.met["materials"] == 3 and node.bridge is None
 
 
-@pytest.mark.parametrize("step", ["__init__", "activate"])
-def test_whatever_hinders_a_transition_ends_the_start(step, prepared, monkeypatch):
+@pytest.mark.parametrize(("what", "step"), [(Bridge, "__init__"), (TactileNode, "activate")])
+def test_whatever_hinders_a_transition_ends_the_start(what, step, own, tactile, monkeypatch):
     """rclpy makes a result of an exception, without a word."""
-    node, logged = prepared(), []
+    node, logged = tactile(own, start=False), []
 
     def fail(self, *_, **__):
         raise ZeroDivisionError("of all things")
 
     monkeypatch.setattr(node.get_logger(), "error", logged.append)
     with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-        patched.setattr(TactileNode, step, fail)
-        _start(node, lambda: True)
+        patched.setattr(what, step, fail)
+        node.start()
     assert "of all things" in logged[0] and "Traceback" in logged[0]
 
 
-def test_a_transition_that_ros_refuses_ends_the_start(prepared, monkeypatch):
+def test_a_transition_that_ros_refuses_ends_the_start(own, tactile, monkeypatch):
     from rclpy.lifecycle import TransitionCallbackReturn
 
-    node = prepared()
+    node = tactile(own, start=False)
     monkeypatch.setattr(node, "trigger_activate", lambda: TransitionCallbackReturn.ERROR)
     with pytest.raises(errors.ScrollTactileError, match="did not activate the node"):
-        _start(node, lambda: True)
+        node.start()
 
 
-def test_a_damaged_row_is_no_reason_not_to_start(prepared, monkeypatch):
+def test_a_damaged_row_is_no_reason_not_to_start(own, tactile, monkeypatch):
     asked = []
 
     def health(self, *, after=0):
@@ -229,9 +212,8 @@ def test_a_damaged_row_is_no_reason_not_to_start(prepared, monkeypatch):
         raise DamageError("row 7 is damaged", path=self.path)
 
     monkeypatch.setattr(TactileLearner, "health", health)
-    node = prepared(health_after=5)
-    node.configure()
-    assert node.finger is not None and set(asked) == {5}
+    node = tactile(own, health_after=5)
+    assert node.active and set(asked) == {5}
 
 
 @pytest.mark.parametrize("name", ["finger", "hand"])

@@ -18,7 +18,8 @@ from rosbags.typesys import get_types_from_msg
 from touches import SMALL
 
 from scroll_tactile import Sensor, TactileLearner
-from scroll_tactile.clients.ros2 import Bridge, Quality, TactileNode
+from scroll_tactile.clients.ros2 import Bridge
+from scroll_tactile.clients.ros2.inputs import Quality
 from scroll_tactile.recordings import PRESETS, read
 
 MESSAGES = Path(__file__).parents[2] / "examples" / "ros2" / "scroll_tactile_msgs"
@@ -87,19 +88,18 @@ def test_messages_of_drivers_are_answered_as_they_were_serialized(driver, counti
 
 
 @pytest.mark.parametrize("kind", ["Float32MultiArray", "Image", "CompressedImage"])
-def test_a_drivers_process_is_heard_in_each_type_that_there_are_wheels_of(kind, spinning):
-    answers = []
+def test_a_drivers_process_is_heard_in_each_type_that_there_are_wheels_of(kind, spinning, tactile):
     source = gel_learner() if "Image" in kind else learner()
-    served = TactileNode(spinning.node("scroll_tactile"), source, TOPIC, "data", answered=answers.append)
+    served = tactile(source, field="data", type="")
     count = 16 if "Image" in kind else 300
     with publishing(count, 50, kind=kind):
         spinning.until(lambda: served.bridge.report.messages == count, 120)
     assert served.bridge.status() | {"refused": 0, "dropped": 0, "messages": count} == served.bridge.status()
     if "Image" in kind:  # the others have no stamps, and their places in time are those of a busy machine
-        assert [answer["material"] for answer in answers if answer["event"] == "ended"] == [GEL.materials[1]]
+        assert [answer["material"] for answer in served.answers if answer["event"] == "ended"] == [GEL.materials[1]]
 
 
-def test_answers_fill_the_message_package_of_the_examples(spinning, monkeypatch):
+def test_answers_fill_the_message_package_of_the_examples(tactile, monkeypatch):
     """Of the package's text, by another's parser: each field is one that the node fills, with values of its type."""
     name = "scroll_tactile_msgs/msg/TactileAnswer"
     store, sent = bags.typestore(2), []
@@ -109,11 +109,11 @@ def test_answers_fill_the_message_package_of_the_examples(spinning, monkeypatch)
     messages.TactileAnswer = kind
     monkeypatch.setitem(sys.modules, "scroll_tactile_msgs", package)
     monkeypatch.setitem(sys.modules, "scroll_tactile_msgs.msg", messages)
-    node = spinning.node("scroll_tactile")
-    create = node.create_publisher
+    served = tactile(learner(), field="data", type="std_msgs/msg/Float32MultiArray", start=False)
+    create = served.create_publisher
     double = SimpleNamespace(publish=sent.append)
-    monkeypatch.setattr(node, "create_publisher", lambda of, *how: double if of is kind else create(of, *how))
-    served = TactileNode(node, learner(), TOPIC, "data", kind="std_msgs/msg/Float32MultiArray")
+    monkeypatch.setattr(served, "create_publisher", lambda of, *how: double if of is kind else create(of, *how))
+    served.start()
     bare = {"event": "began", "stamp": 3.25, "contact": True, "seconds": 0.0, "decided": False}
     estimate = {"value": 1.5, "low": None, "high": 2.0, "unit": "N"}
     full = bare | {"event": "ended", "end": "released", "touches": 2, "material": "oak", "probability": 0.9}

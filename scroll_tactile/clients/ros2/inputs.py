@@ -7,25 +7,15 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from scroll_tactile.errors import FieldError, InputError, MissingLibraryError
 from scroll_tactile.libraries import install_line
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = [
-    "DYNAMIC",
-    "PARAMETERS",
-    "Listener",
-    "Quality",
-    "declare",
-    "interface",
-    "names_in",
-    "require_rclpy",
-    "verdict",
-]
+__all__ = ["DYNAMIC", "PARAMETERS", "Listener", "Quality", "interface", "names_in", "require_rclpy"]
 
 LOOKED = 0.2  # seconds between looks for a topic that is not there yet
 MISSED = 5.0  # seconds until the first warning about a missing or silent topic; each next wait is twice as long
@@ -78,92 +68,65 @@ def interface(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the node: name, default and what it is for, as ROS shows them.
+    """A parameter of the node: its default and what it is for, as ROS shows them.
 
     choices: the texts that it can be. bounds: of a number, both included.
     """
 
-    name: str
     default: Any
     about: str
     choices: tuple[str, ...] = ()
     bounds: tuple[float, float] | None = None
 
-    def descriptor(self) -> Any:
-        """What ROS shows."""
-        made = interface("rcl_interfaces/msg/ParameterDescriptor")(name=self.name, description=self.about)
-        made.read_only, made.dynamic_typing = self.name == "autostart", self.name == "scene"
+    def descriptor(self, name: str) -> Any:
+        """What ROS shows of it under this name."""
+        made = interface("rcl_interfaces/msg/ParameterDescriptor")(name=name, description=self.about)
+        made.read_only, made.dynamic_typing = name == "autostart", name == "scene"
         made.additional_constraints = f"one of {', '.join(self.choices)}" if self.choices else ""
         if self.bounds is not None:
-            short = "floating_point_range" if isinstance(self.default, float) else "integer_range"
-            kind = interface(f"rcl_interfaces/msg/{short.title().replace('_', '')}")
-            low, high = (type(self.default)(bound) for bound in self.bounds)
-            setattr(made, short, [kind(from_value=low, to_value=high)])
+            short, kind = ("floating_point_range", "FloatingPointRange")
+            if isinstance(self.default, int):
+                short, kind = ("integer_range", "IntegerRange")
+            low, high = self.bounds
+            setattr(made, short, [interface(f"rcl_interfaces/msg/{kind}")(from_value=low, to_value=high)])
         return made
 
-    def refused(self, value: object) -> str:
+    def refused(self, name: str, value: object) -> str:
         """Why it cannot have a value; "" where it can."""
         if self.choices and value not in self.choices:
-            return f"expected parameter {self.name} as {' or '.join(self.choices)}; came {value!r}"
-        if self.name == "risk" and not (isinstance(value, float) and 0 < value < 1):
+            return f"expected parameter {name} as {' or '.join(self.choices)}; came {value!r}"
+        if name == "risk" and not (isinstance(value, float) and 0 < value < 1):
             return f"expected parameter risk as a share of wrong answers between 0 and 1; came {value!r}"
-        try:
-            names_in(value if self.name == "scene" else "")
-        except InputError as error:
-            return f"parameter scene: {error}"
+        if name == "scene":
+            try:
+                names_in(value)
+            except InputError as error:
+                return f"parameter scene: {error}"
         return ""
 
 
-DYNAMIC = (
-    Parameter("risk", 0.05, "The share of wrong answers among those that are decided.", bounds=(0.0, 1.0)),
-    Parameter("scene", "", "The materials that can be here, a list of texts or one with commas; empty: all."),
-    Parameter("health_after", 0, "Count for the sensor's health only later observations.", bounds=(0, 2**62)),
-)
-"""Free to change at any time; risk and scene count from the next touch on."""
+DYNAMIC = ("risk", "scene", "health_after")
+"""The parameters that are free to change at any time; risk and scene count from the next touch on."""
 
-PARAMETERS = (
-    Parameter("memory", "", "The folder of the memory."),
-    Parameter("topic", "", "Where the readings are sent."),
-    Parameter("field", "", "The path to a message's numbers."),
-    Parameter("type", "", "The messages' type, as package/msg/Name; empty: what the topic says."),
-    Parameter("preset", "", "A known sensor, which gives sensor, topic and field: biotac, anyskin, digit …"),
-    Parameter("sensor", "", "Whose readings they are; needed only to make a new memory."),
-    Parameter("mode", "write", "Whether touches can be learned.", choices=("write", "read")),
-    Parameter("contact", "auto", "Who finds touches: auto, or the services begin and end.", choices=("auto", "manual")),
-    Parameter("of", "", "An axis of labels to answer by, in place of materials."),
-    Parameter("watch", False, "Note rest and known touches for the sensor's health, some hundred bytes each."),
-    *(
-        Parameter(f"qos.{name}", of[0], "What is asked of the publishers.", choices=of)
-        for name, of in QUALITIES.items()
-    ),
-    Parameter("qos.depth", 0, "Messages that may wait; 0: 2000, of pictures 120.", bounds=(0, 1_000_000)),
-    Parameter("autostart", True, "Configure and activate when the node starts."),
-    *DYNAMIC,
-)
-"""All of the node. Those that are not dynamic are read when it is configured; autostart once."""
-
-
-def declare(node: Any, parameters: Iterable[Parameter], values: Mapping[str, Any]) -> list[str]:
-    """Declare those that the node does not have yet, and return their names. values: defaults of this node, by name.
-
-    Raises InputError where ROS was started with a value of another type, or out of bounds.
-    """
-    new = [each for each in parameters if not node.has_parameter(each.name)]
-    for each in new:
-        try:
-            node.declare_parameter(each.name, values.get(each.name, each.default), each.descriptor())
-        except Exception as error:  # rclpy's own, whose place has changed from release to release
-            raise InputError(f"parameter {each.name}: {error}") from error
-        if why := each.refused(node.get_parameter(each.name).value):
-            raise InputError(why)
-    return [each.name for each in new]
-
-
-def verdict(parameters: Iterable[Parameter], values: Mapping[str, Any], why: str = "") -> Any:
-    """What ROS is told of values that are to be set, by name: why one of them cannot be, else `why`, or yes."""
-    reasons = [each.refused(values[each.name]) for each in parameters if each.name in values]
-    why = "; ".join(filter(None, reasons)) or why
-    return interface("rcl_interfaces/msg/SetParametersResult")(successful=not why, reason=why)
+PARAMETERS = {
+    "memory": Parameter("", "The folder of the memory."),
+    "topic": Parameter("", "Where the readings are sent."),
+    "field": Parameter("", "The path to a message's numbers."),
+    "type": Parameter("", "The messages' type, as package/msg/Name; empty: what the topic says."),
+    "preset": Parameter("", "A known sensor, which gives sensor, topic and field: biotac, anyskin, digit …"),
+    "sensor": Parameter("", "Whose readings they are; needed only to make a new memory."),
+    "mode": Parameter("write", "Whether touches can be learned.", choices=("write", "read")),
+    "contact": Parameter("auto", "Who finds touches: auto, or the services begin and end.", choices=("auto", "manual")),
+    "of": Parameter("", "An axis of labels to answer by, in place of materials."),
+    "watch": Parameter(False, "Note rest and known touches for the sensor's health, some hundred bytes each."),
+    **{f"qos.{name}": Parameter(of[0], "Asked of the publishers.", choices=of) for name, of in QUALITIES.items()},
+    "qos.depth": Parameter(0, "Messages that may wait; 0: 2000, of pictures 120.", bounds=(0, 1_000_000)),
+    "autostart": Parameter(True, "Configure and activate when the node starts."),
+    "risk": Parameter(0.05, "The share of wrong answers among those that are decided.", bounds=(0.0, 1.0)),
+    "scene": Parameter("", "The materials that can be here, a list of texts or one with commas; empty: all."),
+    "health_after": Parameter(0, "Count for the sensor's health only later observations.", bounds=(0, 2**62)),
+}
+"""All of the node, by name. Those that are not dynamic are read when it is configured; autostart once."""
 
 
 def names_in(value: object) -> list[str]:
@@ -174,9 +137,8 @@ def names_in(value: object) -> list[str]:
     return [name.strip() for text in found for name in text.split(",") if name.strip()]
 
 
-@dataclass(frozen=True)
-class Quality:
-    """The quality of service of a subscription.
+class Quality(NamedTuple):
+    """The quality of service of a subscription, as the parameters qos.* have it.
 
     As it is, best effort and volatile, which any publisher can serve; but its queue holds two seconds of readings at
     1 kHz, not five messages: while a touch is learned and its row reaches the disk no reading is taken, and a sensor at
@@ -188,12 +150,9 @@ class Quality:
     depth: int = 0
 
     def profile(self, kind: str) -> Any:
-        """The same in rclpy's terms, for messages of a kind. Raises InputError for a word that is none of them."""
+        """The same in rclpy's terms, for messages of a kind."""
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-        for name, words in QUALITIES.items():
-            if getattr(self, name) not in words:
-                raise InputError(f"expected {name} as {' or '.join(words)}; came {getattr(self, name)!r}")
         return QoSProfile(
             depth=self.depth or (FEW if kind in PICTURES else DEEP),  # of the last that came
             reliability=ReliabilityPolicy[self.reliability.upper()],
@@ -211,15 +170,14 @@ class Listener:
     A topic that is not there, or silent, is named in a warning after 5, 10, 20 … seconds; one that appears later with
     two types, or with one of a package that is missing, once.
 
-    Raises MissingLibraryError where a package of ROS is missing, InputError for a kind that is none, for a topic of two
-    types and for a quality that is none.
+    Raises MissingLibraryError where a package of ROS is missing, and InputError for a kind that is none and for a topic
+    of two types.
     """
 
-    def __init__(self, node: Any, topic: str, kind: str | None = None, quality: Quality | None = None) -> None:
-        self.node, self.kind, self._quality = node, kind, quality or Quality()
-        self._quality.profile("")  # or raises
+    def __init__(self, node: Any, topic: str, kind: str | None, quality: Quality) -> None:
+        self.node, self.kind, self._quality = node, kind, quality
         self.topic = node.resolve_topic_name(topic)
-        self.received = self._reported = 0.0
+        self.received = self._reported = time.monotonic()
         self.subscription: Any = None
         self._taker: Taker | None = None
         self._waiting: deque[tuple[Any, float, int]] = deque()
@@ -227,32 +185,22 @@ class Listener:
         self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
         self._patience = MISSED
         self._said: set[str] = set()  # why there is no subscription yet
-        self._looking: Any = None
-        self._timer: Any = None
-        self.start()
+        self._look()
+        self._timer: Any = node.create_timer(LOOKED, self._look_again)
 
-    def start(self, taker: Taker | None = None) -> None:
-        """Hear the topic, anew after `stop`. A taker gets what waited, and from now on each message."""
-        if self._timer is None:
-            if not self._look():
-                self._looking = self.node.create_timer(LOOKED, self._look_again)
-            self.received, self._reported, self._numbers = time.monotonic(), time.monotonic(), {}
-            self._timer = self.node.create_timer(1.0, self._each_second)
-        self._taker = taker or self._taker
-        while self._waiting and self._taker is not None:  # a taker may stop it
+    def give(self, taker: Taker) -> None:
+        """Give a taker what waited, and from now on each message."""
+        self._taker = taker
+        while self._waiting:
             message, published, lost = self._waiting.popleft()
             lost, self._left_out = lost + self._left_out, 0
-            self._taker(message, published, lost)
+            taker(message, published, lost)
 
     def stop(self) -> None:
-        """Hear no more, and give no more; what waited is gone."""
-        for timer in filter(None, (self._looking, self._timer)):
-            self.node.destroy_timer(timer)
+        """Hear no more, and give no more."""
+        self.node.destroy_timer(self._timer)
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
-        self._looking = self._timer = self.subscription = self._taker = None
-        self._waiting.clear()
-        self._left_out = 0
 
     def receive(self, message: Any, about: Mapping[str, Any]) -> None:
         """Take a message; about: what ROS says of it."""
@@ -261,10 +209,10 @@ class Listener:
         came = message, published / 1e9, self._lost(about)
         if self._taker is not None:
             self._taker(*came)
-        elif self._timer is not None:
-            self._waiting.append(came)
-            if len(self._waiting) > (FEW if self.kind in PICTURES else WAITING):
-                self._left_out += 1 + self._waiting.popleft()[2]
+            return
+        self._waiting.append(came)
+        if len(self._waiting) > (FEW if self.kind in PICTURES else WAITING):
+            self._left_out += 1 + self._waiting.popleft()[2]
 
     def _lost(self, about: Mapping[str, Any]) -> int:
         """How many messages were lost since the last of the same publisher, where the transport counts them."""
@@ -276,8 +224,8 @@ class Listener:
         self._numbers[publisher] = number
         return lost
 
-    def _look(self) -> bool:
-        """Subscribe, without a kind as soon as the topic is there; whether it is. Raises what the class does."""
+    def _look(self) -> None:
+        """Subscribe, without a kind as soon as the topic is there. Raises what the class does."""
         kinds = [self.kind] if self.kind else dict(self.node.get_topic_names_and_types()).get(self.topic, [])
         if len(kinds) > 1:
             raise InputError(f"topic {self.topic!r} is sent as {' and as '.join(kinds)}: say which, with --type")
@@ -287,20 +235,19 @@ class Listener:
             self.subscription = self.node.create_subscription(message, self.topic, self.receive, profile)
             self.node.get_logger().info(f"reading {self.topic}, {kind}")
             self.received = time.monotonic()  # it is silent from now on
-        return bool(kinds)
 
     def _look_again(self) -> None:
-        """Look from a timer, out of which an error would end the executor: warn of each once, and go on looking."""
-        try:
-            if self._look():
-                self.node.destroy_timer(self._looking)
-                self._looking = None
-        except InputError as error:
-            if str(error) not in self._said:
-                self._said.add(str(error))
-                self.node.get_logger().warning(f"{error}; it is not heard until then")
+        """Look for the topic until it is there, and warn of each error once: out of a timer it would end the executor.
 
-    def _each_second(self) -> None:
+        Warn, too, where nothing came for long.
+        """
+        if self.subscription is None:
+            try:
+                self._look()
+            except InputError as error:
+                if str(error) not in self._said:
+                    self._said.add(str(error))
+                    self.node.get_logger().warning(f"{error}; it is not heard until then")
         now = time.monotonic()
         if now - self.received > MISSED and now - self._reported > self._patience:
             self._reported, self._patience = now, min(2 * self._patience, LONGEST)

@@ -16,6 +16,7 @@ from live_touches import GEL, frames, shift, slide
 from scroll_tactile import TactileLearner
 
 TOPIC = "/finger/tactile"
+ASKED = ("best_effort", "volatile", 0)  # of publishers
 KIND = "sensor_msgs/msg/JointState"
 ROBOT = Path(__file__)
 EXAMPLES = ROBOT.parents[2] / "examples"

@@ -16,7 +16,6 @@ from scroll_tactile_store import DamageError
 from scroll_tactile import TactileLearner, errors
 from scroll_tactile.clients.ros2 import Bridge, TactileNode, serve
 from scroll_tactile.clients.ros2.inputs import interface, names_in, require_rclpy
-from scroll_tactile.clients.ros2.node import _new_sensor, _place
 from scroll_tactile.recordings import PRESETS
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
@@ -272,11 +271,15 @@ def test_the_example_acts_on_what_it_feels(own):
     assert len(said) == 2
 
 
-def test_where_readings_are_and_whose_they_are(memory, tmp_path):
-    assert _place("/t", "a", "biotac") == ("/t", "a")
-    assert _place("", "", "biotac") == ("/rh/tactile", "tactiles[0].electrodes")
-    assert _new_sensor(str(memory), "", "biotac") is None  # a preset may give topic and field alone
-    assert _new_sensor(str(tmp_path / "none"), "", "biotac") == PRESETS["biotac"].sensor
+@pytest.mark.parametrize(("topic", "field"), [("/t", "a"), ("", "")])
+def test_a_preset_says_where_readings_are_and_whose_where_nothing_else_does(topic, field, tactile, tmp_path):
+    node = tactile(tmp_path / "none", topic=topic, field=field, preset="biotac", start=False)
+    assert node.listen() == (field or "tactiles[0].electrodes")
+    assert node.listener.topic == (topic or "/rh/tactile")
+    assert node.open().result().sensor == PRESETS["biotac"].sensor
+
+
+def test_names_are_a_list_or_a_text_with_commas():
     assert names_in([" a", "", "  ", "b, c"]) == ["a", "b", "c"] and names_in(" ") == []
 
 

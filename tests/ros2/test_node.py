@@ -5,12 +5,12 @@ import re
 
 import pytest
 from live_touches import shift
-from robot import KIND, TOPIC, publishing
+from robot import ASKED, KIND, TOPIC, publishing
 from touches import PAD
 
 from scroll_tactile import Health, TactileLearner, errors
 from scroll_tactile.clients.ros2 import inputs
-from scroll_tactile.clients.ros2.inputs import Listener, Quality
+from scroll_tactile.clients.ros2.inputs import Listener
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
@@ -168,7 +168,7 @@ def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_c
     node, kinds, warned, looks = spinning.node("hand"), [], [], []
     monkeypatch.setattr(node, "get_topic_names_and_types", lambda: looks.append(1) or [(TOPIC, kinds)])
     monkeypatch.setattr(node.get_logger(), "warning", warned.append)
-    listener = Listener(node, TOPIC, None, Quality())
+    listener = Listener(node, TOPIC, None, ASKED)
     listener.received -= 100  # it waited that long
     for kinds[:] in (["std_msgs/msg/String", KIND], ["sr_robot_msgs/msg/BiotacAll"]):
         looks.clear()
@@ -185,7 +185,7 @@ def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_c
 
 def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkeypatch):
     monkeypatch.setattr(inputs, "WAITING", 3)
-    listener, taken = Listener(spinning.node("hand"), TOPIC, KIND, Quality()), []
+    listener, taken = Listener(spinning.node("hand"), TOPIC, KIND, ASKED), []
 
     def take(*message):
         taken.append(message)
@@ -198,16 +198,6 @@ def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkey
     listener.give(take)
     receive(7)
     assert taken == [(3, 3.0, 2), (5, 5.0, 1), (6, 6.0, 0), (7, 7.0, 0)]
-
-
-@pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning")  # rclpy's own
-def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
-    from rclpy.qos import qos_profile_sensor_data
-
-    node = spinning.node("hand")
-    listener = Listener(node, TOPIC, KIND, Quality(reliability="reliable", depth=7))
-    spinning.node("driver").create_publisher(JointState, TOPIC, qos_profile_sensor_data)
-    spinning.until(lambda: "qos asks for reliability reliable, and less is promised" in listener.absent())
 
 
 def test_a_node_that_is_cleaned_up_or_not_configured_offers_what_it_did_before(spinning, tactile, learner):

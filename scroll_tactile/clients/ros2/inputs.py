@@ -9,17 +9,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from scroll_tactile.errors import FieldError, InputError, MissingLibraryError
 from scroll_tactile.libraries import install_line
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = ["DYNAMIC", "PARAMETERS", "Listener", "Quality", "interface", "names_in", "require_rclpy"]
+__all__ = ["DYNAMIC", "PARAMETERS", "Listener", "interface", "names_in", "quality", "require_rclpy"]
 
 LOOKED = 0.2  # seconds between looks for a topic that is not there yet
 MISSED = 5.0  # seconds until the first warning about a missing or silent topic; each next wait is twice as long
-LONGEST = 600.0
 PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 DEEP, FEW = 2000, 120  # readings and pictures in the subscription's queue: two seconds at 1 kHz and at 60 Hz
 WAITING = 10_000  # messages that wait for their taker: ten seconds at 1 kHz, some tens of MB; of pictures FEW
@@ -84,11 +83,9 @@ class Parameter:
         made.read_only, made.dynamic_typing = name == "autostart", name == "scene"
         made.additional_constraints = f"one of {', '.join(self.choices)}" if self.choices else ""
         if self.bounds is not None:
-            short, kind = ("floating_point_range", "FloatingPointRange")
-            if isinstance(self.default, int):
-                short, kind = ("integer_range", "IntegerRange")
-            low, high = self.bounds
-            setattr(made, short, [interface(f"rcl_interfaces/msg/{kind}")(from_value=low, to_value=high)])
+            short = "FloatingPoint" if isinstance(self.default, float) else "Integer"
+            bounds = interface(f"rcl_interfaces/msg/{short}Range")(from_value=self.bounds[0], to_value=self.bounds[1])
+            setattr(made, "floating_point_range" if short == "FloatingPoint" else "integer_range", [bounds])
         return made
 
     def refused(self, name: str, value: object) -> str:
@@ -137,27 +134,19 @@ def names_in(value: object) -> list[str]:
     return [name.strip() for text in found for name in text.split(",") if name.strip()]
 
 
-class Quality(NamedTuple):
-    """The quality of service of a subscription, as the parameters qos.* have it.
+def quality(kind: str, reliability: str, durability: str, depth: int) -> Any:
+    """The quality of service of a subscription to messages of a kind, in rclpy's terms.
 
-    As it is, best effort and volatile, which any publisher can serve; but its queue holds two seconds of readings at
-    1 kHz, not five messages: while a touch is learned and its row reaches the disk no reading is taken, and a sensor at
-    1 kHz would overrun a queue of five in 5 ms. depth: messages that may wait; 0: 2000, or 120 pictures.
+    depth: messages that may wait; 0: 2000, or 120 pictures, two seconds of readings at 1 kHz and not five messages:
+    while a touch is learned and its row reaches the disk no reading is taken, and five are overrun in 5 ms.
     """
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-    reliability: str = "best_effort"
-    durability: str = "volatile"
-    depth: int = 0
-
-    def profile(self, kind: str) -> Any:
-        """The same in rclpy's terms, for messages of a kind."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
-        return QoSProfile(
-            depth=self.depth or (FEW if kind in PICTURES else DEEP),  # of the last that came
-            reliability=ReliabilityPolicy[self.reliability.upper()],
-            durability=DurabilityPolicy[self.durability.upper()],
-        )
+    return QoSProfile(
+        depth=depth or (FEW if kind in PICTURES else DEEP),  # of the last that came
+        reliability=ReliabilityPolicy[reliability.upper()],
+        durability=DurabilityPolicy[durability.upper()],
+    )
 
 
 class Listener:
@@ -168,16 +157,16 @@ class Listener:
     waits, the last 10 000 messages, or 120 pictures, so that a memory can be opened meanwhile.
 
     A topic that is not there, or silent, is named in a warning after 5, 10, 20 … seconds; one that appears later with
-    two types, or with one of a package that is missing, once.
+    two types, or with one of a package that is missing, once. asked: reliability, durability and depth, see `quality`.
 
     Raises MissingLibraryError where a package of ROS is missing, and InputError for a kind that is none and for a topic
     of two types.
     """
 
-    def __init__(self, node: Any, topic: str, kind: str | None, quality: Quality) -> None:
-        self.node, self.kind, self._quality = node, kind, quality
+    def __init__(self, node: Any, topic: str, kind: str | None, asked: tuple[str, str, int]) -> None:
+        self.node, self.kind, self._asked = node, kind, asked
         self.topic = node.resolve_topic_name(topic)
-        self.received = self._reported = time.monotonic()
+        self.received = time.monotonic()
         self.subscription: Any = None
         self._taker: Taker | None = None
         self._waiting: deque[tuple[Any, float, int]] = deque()
@@ -197,7 +186,9 @@ class Listener:
             taker(message, published, lost)
 
     def stop(self) -> None:
-        """Hear no more, and give no more."""
+        """Hear no more, and give no more: what is on its way is dropped."""
+        self._waiting.clear()
+        self._taker = lambda message, published, lost: None
         self.node.destroy_timer(self._timer)
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
@@ -231,26 +222,22 @@ class Listener:
             raise InputError(f"topic {self.topic!r} is sent as {' and as '.join(kinds)}: say which, with --type")
         for kind in kinds:
             message, self.kind = interface(kind), kind
-            profile = self._quality.profile(kind)
+            profile = quality(kind, *self._asked)
             self.subscription = self.node.create_subscription(message, self.topic, self.receive, profile)
             self.node.get_logger().info(f"reading {self.topic}, {kind}")
             self.received = time.monotonic()  # it is silent from now on
 
     def _look_again(self) -> None:
-        """Look for the topic until it is there, and warn of each error once: out of a timer it would end the executor.
-
-        Warn, too, where nothing came for long.
-        """
+        """Look until the topic is there, and warn of what hinders it, once, and of silence."""
         if self.subscription is None:
             try:
                 self._look()
-            except InputError as error:
+            except InputError as error:  # out of a timer it would end the executor
                 if str(error) not in self._said:
                     self._said.add(str(error))
                     self.node.get_logger().warning(f"{error}; it is not heard until then")
-        now = time.monotonic()
-        if now - self.received > MISSED and now - self._reported > self._patience:
-            self._reported, self._patience = now, min(2 * self._patience, LONGEST)
+        if time.monotonic() - self.received > self._patience:
+            self._patience *= 2
             self.node.get_logger().warning(self.absent())
 
     def absent(self) -> str:
@@ -265,12 +252,4 @@ class Listener:
         kinds = sorted({each.topic_type for each in about})
         who, send = ("the publisher", "sends") if len(about) == 1 else (f"the {len(about)} publishers", "send")
         other = f", which {send} {' and '.join(kinds)} and not {self.kind}" * (self.kind not in kinds)
-        asked = self._quality.profile("")
-        less = [  # then nothing is ever delivered
-            f"{name} {strict}"
-            for name, (_, strict) in QUALITIES.items()
-            if getattr(self._quality, name) == strict
-            and all(getattr(each.qos_profile, name) != getattr(asked, name) for each in about)
-        ]
-        unfit = f": qos asks for {' and '.join(less)}, and less is promised" if less else ""
-        return f"{silent} from {who} of {self.topic}{other}{unfit}"
+        return f"{silent} from {who} of {self.topic}{other}"

@@ -18,15 +18,7 @@ from typing import Any
 from scroll_tactile_store import StoreError
 
 from scroll_tactile.clients.ros2.bridge import RESTLESS, Answer, Bridge
-from scroll_tactile.clients.ros2.inputs import (
-    DYNAMIC,
-    PARAMETERS,
-    Listener,
-    Quality,
-    interface,
-    names_in,
-    require_rclpy,
-)
+from scroll_tactile.clients.ros2.inputs import DYNAMIC, PARAMETERS, Listener, interface, names_in, require_rclpy
 from scroll_tactile.errors import FieldError, InputError, ScrollTactileError
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner
@@ -96,7 +88,7 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         self._own = None if memory is None or isinstance(memory, str | Path) else memory
         self.bridge: Any = None
         self.active = False
-        self.listener: Listener | None = None
+        self.listener: Any = None
         self.opening: Future[TactileLearner] | None = None  # until the memory is let go
         self.error: Exception | None = None
         self.met: dict[str, int | bool] = {}
@@ -104,10 +96,12 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         self._served: list[Any] = []
         self._timer: Any = None
         self._faults = 0  # that /diagnostics spoke of
-        defaults = {"topic": topic, "field": field, "memory": "" if self._own else str(memory or "")} | parameters
+        path = str(memory or "") if self._own is None else ""
+        defaults = {"memory": path, "topic": topic, "field": field} | parameters
         for name, each in PARAMETERS.items():
+            default = defaults.get(name, each.default)
             try:
-                self.declare_parameter(name, _listed(defaults.get(name, each.default)), each.descriptor(name))
+                self.declare_parameter(name, default or type(each.default)(), each.descriptor(name))
             except Exception as error:  # rclpy's own, whose place has changed from release to release
                 raise InputError(f"parameter {name}: {error}") from error
             if why := each.refused(name, self.value(name)):
@@ -121,8 +115,6 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
     def value(self, name: str) -> Any:
         """A parameter's value."""
         return self.get_parameter(name).value
-
-    # States
 
     def start(self, running: Callable[[], bool] | None = None) -> None:
         """Configure and activate, and hear the topic while the memory is opened. Raises what hinders it.
@@ -177,17 +169,41 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         return TransitionCallbackReturn.SUCCESS if self.error is None else TransitionCallbackReturn.FAILURE
 
     def listen(self) -> str:
-        """Check the parameters, and hear the topic: what comes waits. Returns the field.
+        """Check the parameters, and hear the topic: what comes waits. Returns the path to the numbers in a message.
 
         Raises InputError and FieldError for parameters that cannot be, MissingLibraryError for an absent type.
         """
-        topic, field = _place(self.value("topic").strip(), self.value("field").strip(), self.value("preset"))
+        preset = self.value("preset")
+        known = presets.find(preset) if preset else None
+        found = {name: self.value(name).strip() or getattr(known, name, None) for name in ("topic", "field")}
+        if missing := " and ".join(f"{name}=" for name, given in found.items() if not given):
+            raise InputError(
+                f"expected {missing}: where the readings are, such as topic='/rh/tactile' "
+                "field='tactiles[0].electrodes'"
+                + (f". Preset {preset!r} leaves the topic to the robot" if known else "; or preset= of a known sensor"),
+                argument="topic field preset",
+            )
+        FieldPath(found["field"])
         if self._own is None:
             self._new_sensor()
         if self.listener is None:
-            quality = Quality(*(self.value(f"qos.{name}") for name in Quality._fields))
-            self.listener = Listener(self, topic, self.value("type") or None, quality)
-        return field
+            asked = tuple(self.value(f"qos.{name}") for name in ("reliability", "durability", "depth"))
+            self.listener = Listener(self, found["topic"], self.value("type") or None, asked)
+        return str(found["field"])
+
+    def _new_sensor(self) -> Sensor | None:
+        """The sensor that is named, if any; without a memory also that of a preset, or raises InputError."""
+        memory, sensor, preset = (self.value(name) for name in ("memory", "sensor", "preset"))
+        if not memory:
+            raise InputError("expected memory=: the folder of the memory", argument="memory")
+        if sensor or Path(memory).exists():
+            return read_sensor(sensor) if sensor else None
+        if preset:
+            return presets.find(preset).sensor
+        raise InputError(
+            f"there is no memory in {memory}; to make one, say which sensor it is for: sensor= or preset=",
+            argument="sensor preset",
+        )
 
     def open(self) -> Future[TactileLearner]:
         """Have a thread open the memory, and do what takes seconds the first time, unless one does or did."""
@@ -200,9 +216,8 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
     def _opened(self) -> TactileLearner:
         learner = self._own
         if learner is None:
-            learner = TactileLearner.open(
-                Path(self.value("memory")), sensor=self._new_sensor(), mode=self.value("mode")
-            )
+            sensor = self._new_sensor()
+            learner = TactileLearner.open(Path(self.value("memory")), sensor=sensor, mode=self.value("mode"))
         try:
             learner.live(risk=self.value("risk"), contact="manual", of=self.value("of") or None).close()
             self._changed(learner)  # reads a whole journal the first time
@@ -211,9 +226,6 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
                 learner.close()
             raise
         return learner
-
-    def _new_sensor(self) -> Sensor | None:
-        return _new_sensor(self.value("memory"), self.value("sensor"), self.value("preset"))
 
     def configure(self) -> None:
         """Open the memory, or wait until it is open, and offer topics and services. Raises what hinders it."""
@@ -279,8 +291,6 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         except FieldError as error:
             raise FieldError(f"topic {self.listener.topic!r}, {self.listener.kind}: {error}") from error
 
-    # Topics
-
     def _send(self, name: str, **fields: Any) -> None:
         kind, publisher = self._sent[name]
         publisher.publish(kind(**fields))
@@ -291,7 +301,9 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
             header = interface("std_msgs/msg/Header")(stamp=_time_of(answer["stamp"]))
             material = answer.get("material")
             self._send("~/answer", data=json.dumps(answer))
-            self._send("~/status", header=header, status=[self._status(*_standing(answer), _by_key(answer))])
+            new = material is not None and answer["known"] is False
+            standing = ("WARN", "something new") if new else ("OK", str(material or answer["event"]))
+            self._send("~/status", header=header, status=[self._status(*standing, _by_key(answer))])
             if "~/tactile_answer" in self._sent:
                 self._send("~/tactile_answer", header=header, **_typed(answer))
             if material is not None:
@@ -339,8 +351,6 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
             return None
         what = advice(found).replace("--after", "parameter health_after")
         return "ERROR" if found.kind == "dead" else "WARN", f"{in_words(found)}: {what}"
-
-    # Services and parameters
 
     def _reply(self, call: Callable[..., str], argument: str, request: Any, response: Any) -> Any:
         """Serve a call: success, and what was done or why not. argument: the request's field that has it, or ""."""
@@ -392,64 +402,12 @@ def _built(name: str) -> Any:
         raise
 
 
-def _place(topic: str, field: str, preset: str) -> tuple[str, str]:
-    """The topic, and the path to the numbers in its messages; a preset gives what is empty.
-
-    Raises InputError where one is missing; FieldError for an unknown preset, and for a field that is no path.
-    """
-    known = presets.find(preset) if preset else None
-    if known is not None:
-        topic, field = topic or known.topic or "", field or known.field
-    if missing := " and ".join(f"{name}=" for name, given in {"topic": topic, "field": field}.items() if not given):
-        raise InputError(
-            f"expected {missing}: where the readings are, such as topic='/rh/tactile' field='tactiles[0].electrodes'"
-            + (f". Preset {preset!r} leaves the topic to the robot" if known else "; or preset= of a known sensor"),
-            argument="topic field preset",
-        )
-    FieldPath(field)
-    return topic, field
-
-
-def _new_sensor(memory: str, sensor: str, preset: str) -> Sensor | None:
-    """The sensor that is named, "" for none; where there is no memory yet also that of a preset.
-
-    Raises InputError for an unknown sensor, and where there is neither a memory nor a sensor to make one for.
-    """
-    if not memory:
-        raise InputError("expected memory=: the folder of the memory", argument="memory")
-    if sensor:
-        return read_sensor(sensor)
-    if Path(memory).exists():
-        return None
-    if preset:
-        return presets.find(preset).sensor
-    raise InputError(
-        f"there is no memory in {memory}; to make one, say which sensor it is for: sensor= or preset=",
-        argument="sensor preset",
-    )
-
-
-def _listed(value: object) -> object:
-    """A parameter's default as ROS has it."""
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [str(each) for each in value] or ""
-    return "" if value is None else value
-
-
 def _time_of(seconds: float) -> Any:
     """A time as builtin_interfaces/msg/Time has it, whose seconds are 32 bits."""
     whole = math.floor(seconds)
     if not 0 <= whole < 2**31:
         return interface("builtin_interfaces/msg/Time")()
     return interface("builtin_interfaces/msg/Time")(sec=whole, nanosec=min(round((seconds - whole) * 1e9), 10**9 - 1))
-
-
-def _standing(answer: Answer) -> tuple[str, str]:
-    """An answer's level and its text, in ~/status."""
-    material = answer.get("material")
-    if answer.get("known") is False and material is not None:
-        return "WARN", "something new"
-    return "OK", str(material or answer["event"])
 
 
 def _by_key(answer: Answer) -> dict[str, str]:
@@ -516,19 +474,16 @@ def serve(
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    context, node = rclpy.Context(), None
+    context = rclpy.Context()
+    node: Any = None
     with _interruptible() as ended:
         try:
-            rclpy.init(args=list(arguments), context=context, signal_handler_options=SignalHandlerOptions.NO)
-            node = TactileNode(memory, topic, field, context=context, **parameters)
-        except ScrollTactileError:
-            raise
-        except Exception as error:  # one of rclpy's own, whose place has changed from release to release
-            raise InputError(f"ROS refuses to start with {' '.join(arguments) or 'no arguments'}: {error}") from error
-        finally:
-            if node is None:
-                rclpy.try_shutdown(context=context)
-        try:
+            try:
+                rclpy.init(args=list(arguments), context=context, signal_handler_options=SignalHandlerOptions.NO)
+                node = TactileNode(memory, topic, field, context=context, **parameters)
+            except RuntimeError as error:  # rclpy's own, or one that its C library raises
+                how = " ".join(arguments) or "no arguments"
+                raise InputError(f"ROS refuses to start with {how}: {error}") from error
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(node)
 
@@ -544,9 +499,10 @@ def serve(
         except ExternalShutdownException:
             pass
         finally:
-            node.clean_up()
+            if node is not None:
+                node.clean_up()
             rclpy.try_shutdown(context=context)
-        return node.met
+    return dict(node.met)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from live_touches import learner, shift, slide
-from robot import Bare, stamped, taught
+from robot import Bare, ended, stamped, taught
 from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner, errors
@@ -32,10 +32,6 @@ def bridge(field="values", source=None, **how):
     return made, answers, warnings
 
 
-def ended(answers):
-    return [answer["material"] for answer in answers if answer["event"] == "ended"]
-
-
 def run(made, rows=ROWS, start=1000.0, rate=50.0):
     for i, row in enumerate(rows):
         made.receive(stamped(row, start + i / rate), 5.0 + i / rate)
@@ -45,12 +41,14 @@ def test_answers_are_those_of_a_live_session():
     made, answers, warnings = bridge()
     run(made)
     session = learner().live()
-    ended = [touch for i, row in enumerate(ROWS) for touch in session.push(row, 1000 + i / 50).touches]
+    touches = [touch for i, row in enumerate(ROWS) for touch in session.push(row, 1000 + i / 50).touches]
     told = [answer for answer in answers if answer["event"] == "ended"]
-    assert [answer["material"] for answer in told] == ["a", "b"] == [touch.prediction.material for touch in ended]
-    assert [answer["probability"] for answer in told] == [touch.prediction.as_json()["probability"] for touch in ended]
-    assert [answer["candidates"] for answer in told] == [touch.prediction.candidates() for touch in ended]
-    assert [answer["seconds"] for answer in told] == [touch.stream.seconds for touch in ended]
+    assert [answer["material"] for answer in told] == ["a", "b"] == [touch.prediction.material for touch in touches]
+    assert [answer["probability"] for answer in told] == [
+        touch.prediction.as_json()["probability"] for touch in touches
+    ]
+    assert [answer["candidates"] for answer in told] == [touch.prediction.candidates() for touch in touches]
+    assert [answer["seconds"] for answer in told] == [touch.stream.seconds for touch in touches]
     assert not warnings
     assert made.status()["messages"] == made.status()["readings"] == len(ROWS)
     json.dumps(answers, allow_nan=False)

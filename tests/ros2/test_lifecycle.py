@@ -10,7 +10,7 @@ import pytest
 from commands import refused
 from launching import launched
 from readme import command_lines
-from robot import EXAMPLES, TOPIC, command, ended_by_ctrl_c, publishing
+from robot import EXAMPLES, TOPIC, command, ended, ended_by_ctrl_c, publishing
 from scroll_tactile_store import DamageError
 
 from scroll_tactile import TactileLearner, errors
@@ -60,7 +60,7 @@ class Remote:
         return "" if result.successful else result.reason or "no reason"
 
     def ended(self):
-        return [answer["material"] for answer in self.answers if answer["event"] == "ended"]
+        return ended(self.answers)
 
 
 def node_command(memory, *words, **more):

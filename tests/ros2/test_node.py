@@ -5,7 +5,7 @@ import re
 
 import pytest
 from live_touches import shift
-from robot import ASKED, KIND, TOPIC, publishing
+from robot import ASKED, KIND, TOPIC, ended, publishing
 from touches import PAD
 
 from scroll_tactile import Health, TactileLearner, errors
@@ -41,8 +41,7 @@ def test_every_reading_of_a_burst_arrives_and_is_answered(spinning, tactile, lea
         spinning.until(lambda: served.bridge.report.messages == count, 120)
     status = served.bridge.status()
     assert (status["readings"], status["ticks"], status["lost"], status["dropped"]) == (count, count, 0, 0)
-    ended = [answer for answer in served.answers if answer["event"] == "ended"]
-    assert [answer["material"] for answer in ended][:5] == list("abcab")
+    assert ended(served.answers)[:5] == list("abcab")
     spinning.until(lambda: len(texts) == len(served.answers))
     assert texts == json.loads(json.dumps(served.answers))
 
@@ -143,14 +142,6 @@ def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning,
         spinning.until(refusing)
 
 
-def test_messages_that_were_lost_on_their_way_are_counted(tactile, learner):
-    served = tactile(learner)
-    for publisher, number in ((b"a", 7), (b"a", 8), (b"b", 1), (b"a", 11), (b"b", 2), (b"a", 12)):
-        about = {"publication_sequence_number": number, "publisher_gid": {"data": publisher}}
-        served.listener.receive(JointState(position=[0.1, 0.1]), about)
-    assert served.bridge.report.dropped == 2
-
-
 def test_a_topic_that_never_comes_is_said_with_those_nearest_of_others(spinning, tactile, learner):
     node = tactile(learner, topic="/finger/tactil")
     assert "nobody publishes /finger/tactil" in node.listener.absent()
@@ -198,6 +189,13 @@ def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkey
     listener.give(take)
     receive(7)
     assert taken == [(3, 3.0, 2), (5, 5.0, 1), (6, 6.0, 0), (7, 7.0, 0)]
+    other = {"source_timestamp": 10**9, "publisher_gid": {"data": b"b"}}
+    for number in (1, 4):  # of another publisher
+        listener.receive(number, other | {"publication_sequence_number": number})
+    receive(8)
+    listener.stop()
+    receive(10)  # nobody hears it
+    assert taken[4:] == [(1, 1.0, 0), (4, 1.0, 2), (8, 8.0, 0)]
 
 
 def test_a_node_that_is_cleaned_up_or_not_configured_offers_what_it_did_before(spinning, tactile, learner):

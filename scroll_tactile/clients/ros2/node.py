@@ -89,6 +89,7 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         self.bridge: Any = None
         self.active = False
         self.listener: Any = None
+        self._kind: str | None = None  # of the topic when it was last heard: a publisher may be gone meanwhile
         self.opening: Future[TactileLearner] | None = None  # until the memory is let go
         self.error: Exception | None = None
         self.met: dict[str, int | bool] = {}
@@ -175,21 +176,22 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         """
         preset = self.value("preset")
         known = presets.find(preset) if preset else None
-        found = {name: self.value(name).strip() or getattr(known, name, None) for name in ("topic", "field")}
-        if missing := " and ".join(f"{name}=" for name, given in found.items() if not given):
+        topic = self.value("topic").strip() or getattr(known, "topic", None) or ""
+        field = self.value("field").strip() or getattr(known, "field", "")
+        if missing := " and ".join(f"{name}=" for name, given in (("topic", topic), ("field", field)) if not given):
             raise InputError(
                 f"expected {missing}: where the readings are, such as topic='/rh/tactile' "
                 "field='tactiles[0].electrodes'"
                 + (f". Preset {preset!r} leaves the topic to the robot" if known else "; or preset= of a known sensor"),
                 argument="topic field preset",
             )
-        FieldPath(found["field"])
+        FieldPath(field)
         if self._own is None:
             self._new_sensor()
         if self.listener is None:
             asked = tuple(self.value(f"qos.{name}") for name in ("reliability", "durability", "depth"))
-            self.listener = Listener(self, found["topic"], self.value("type") or None, asked)
-        return str(found["field"])
+            self.listener = Listener(self, topic, self.value("type") or self._kind, asked)
+        return field
 
     def _new_sensor(self) -> Sensor | None:
         """The sensor that is named, if any; without a memory also that of a preset, or raises InputError."""
@@ -259,7 +261,7 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         self.active = False
         if self.listener is not None:
             self.listener.stop()
-            self.listener = None
+            self.listener, self._kind = None, self.listener.kind
         if self.bridge is not None and not self.bridge.paused:
             self.bridge.pause()
 
@@ -276,7 +278,7 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
             self.destroy_service(service)
         for _, publisher in self._sent.values():
             self.destroy_publisher(publisher)
-        self.bridge, self._timer, self._served, self._sent = None, None, [], {}
+        self.bridge, self._timer, self._kind, self._served, self._sent = None, None, None, [], {}
         opening, self.opening = self.opening, None
         if opening is not None and opening.exception() is None:  # waits for it
             self.met["materials"] = len(opening.result().materials)

@@ -177,7 +177,7 @@ class TactileNode(LifecycleNode):  # type: ignore[misc]  # rclpy's, which may no
         preset = self.value("preset")
         known = presets.find(preset) if preset else None
         topic = self.value("topic").strip() or getattr(known, "topic", None) or ""
-        field = self.value("field").strip() or getattr(known, "field", "")
+        field: str = self.value("field").strip() or getattr(known, "field", "")
         if missing := " and ".join(f"{name}=" for name, given in (("topic", topic), ("field", field)) if not given):
             raise InputError(
                 f"expected {missing}: where the readings are, such as topic='/rh/tactile' "

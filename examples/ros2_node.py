@@ -1,29 +1,23 @@
-"""An arm that acts on what its finger feels: the memory, the sensor's topic and the arm in one ROS 2 node.
+"""An arm that acts on what its finger feels: the memory and the sensor's topic in a ROS 2 node, the arm in another.
 
 With ROS 2 sourced:  python examples/ros2_node.py MEMORY /rh/tactile 'tactiles[0].electrodes'
 
 It waits for the topic. To tell it what it touched last:
-    ros2 service call /hand/learn diagnostic_msgs/srv/AddDiagnostics "{load_namespace: silk}"
+    ros2 service call /scroll_tactile/learn diagnostic_msgs/srv/AddDiagnostics "{load_namespace: silk}"
 """
 
 import sys
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-from scroll_tactile import TactileLearner
 from scroll_tactile.clients.ros2 import Answer, TactileNode
 
 
-class Hand(Node):  # type: ignore[misc]  # of ROS 2, which may not be here
-    """A node of one's own with a memory in it."""
+class Hand(TactileNode):
+    """The memory's node, which acts in the same process."""
 
-    def __init__(self, learner: TactileLearner, topic: str, field: str) -> None:
-        super().__init__("hand")
-        self.touch = TactileNode(self, learner, topic, field, risk=0.05, answered=self.act)
-
-    def act(self, answer: Answer) -> None:
+    def answered(self, answer: Answer) -> None:
         """Where an arm would move: as soon as it is safe to, not when the touch is over."""
         if answer["event"] == "decided":
             felt = "something new" if answer["known"] is False else answer["material"]
@@ -33,18 +27,19 @@ class Hand(Node):  # type: ignore[misc]  # of ROS 2, which may not be here
 
 
 def main() -> None:
-    """Run the hand until ctrl-C."""
-    memory, topic, field = sys.argv[1:]
+    """Run the hand, and what else is in the executor, until ctrl-C."""
     rclpy.init()
-    with TactileLearner.open(memory) as learner:
-        hand = Hand(learner, topic, field)
-        try:
-            rclpy.spin(hand)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            pass
-        finally:
-            hand.touch.close()
-            rclpy.try_shutdown()
+    hand = Hand(*sys.argv[1:], risk=0.05)
+    executor = SingleThreadedExecutor()
+    executor.add_node(hand)  # and the arm's own node
+    try:
+        hand.start()
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        hand.clean_up()
+        rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from examples.paper.runs.options import Json
 from examples.paper.runs.results import show, write
 from scroll_tactile import TactileLearner, sensors
 from scroll_tactile.clients.cli.terminal import progress_bar
-from scroll_tactile.clients.ros2 import Listener, TactileNode
+from scroll_tactile.clients.ros2 import TactileNode
 from scroll_tactile.clients.ros2.inputs import interface, require_rclpy
 from scroll_tactile.errors import InputError
 from scroll_tactile.simulation.scene import Scene
@@ -71,13 +71,13 @@ def run_node(seconds: float, note: Callable[[str], None]) -> Record:
     return {"bench": "ros2", "records": [record]}
 
 
-class _Timed(Listener):
-    """A listener that notes when what takes its messages knows each state."""
+class _Timed(TactileNode):
+    """A node that notes how long after its message each state is known."""
 
     latencies: list[float]
 
-    def receive(self, message: Any, about: Mapping[str, Any]) -> None:
-        super().receive(message, about)
+    def take(self, message: Any, published: float, lost: int) -> None:
+        super().take(message, published, lost)
         self.latencies.append(time.time() - message.effort[0])
 
 
@@ -88,17 +88,16 @@ def _received(learner: TactileLearner, count: int) -> tuple[list[float], Mapping
     context = rclpy.Context()
     rclpy.init(context=context)
     try:
-        node = rclpy.create_node("scroll_tactile", context=context)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        timed = _Timed(node, TOPIC)
+        timed = _Timed(learner, TOPIC, "position", context=context)
         timed.latencies = []
-        served = TactileNode(node, learner, TOPIC, "position", listener=timed)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(timed)
+        timed.start()
         end = time.monotonic() + WAITED + count / sensors.BIOTAC.rate
         while len(timed.latencies) < count and time.monotonic() < end:
             executor.spin_once(timeout_sec=0.1)
-        served.close()
-        return timed.latencies, served.bridge.status()
+        timed.clean_up()
+        return timed.latencies, timed.met
     finally:
         rclpy.try_shutdown(context=context)
 

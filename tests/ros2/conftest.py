@@ -4,10 +4,11 @@ import os
 import time
 
 import pytest
-from robot import taught
+from robot import KIND, TOPIC, taught
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner
+from scroll_tactile.clients.ros2 import TactileNode
 
 
 @pytest.fixture(autouse=True)
@@ -53,10 +54,13 @@ def spinning(alone):
     executor = SingleThreadedExecutor(context=context)
 
     class Nodes:
-        def node(self, name, make=rclpy.create_node):
-            made = make(name, context=context)
+        def add(self, make, *given, **how):
+            made = make(*given, context=context, **how)
             executor.add_node(made)
             return made
+
+        def node(self, name):
+            return self.add(rclpy.create_node, name)
 
         def until(self, there, seconds=60.0):
             end = time.monotonic() + seconds
@@ -86,4 +90,30 @@ def spinning(alone):
             return self.ask(node, AddDiagnostics, name, load_namespace=argument)
 
     yield Nodes()
+    for node in executor.get_nodes():  # the next test would still hear its publishers
+        node.destroy_node()
     rclpy.try_shutdown(context=context)
+
+
+class Answering(TactileNode):
+    """A node that keeps its answers."""
+
+    def answered(self, answer):
+        vars(self).setdefault("answers", []).append(answer)
+
+
+@pytest.fixture
+def tactile(spinning):
+    """Makes the node, and starts it unless it is told not to; it is cleaned up at the end."""
+    made = []
+
+    def node(memory, *, topic=TOPIC, field="position", start=True, **parameters):
+        one = spinning.add(Answering, memory, topic, field, **{"type": KIND} | parameters)
+        made.append(one)
+        if start:
+            one.start()
+        return one
+
+    yield node
+    for each in made:
+        each.clean_up()

@@ -7,47 +7,37 @@ dictionaries as files.
 """
 
 import json
+import re
 import runpy
 import sys
 from types import ModuleType, SimpleNamespace
 
 
-class Argument:
-    def __init__(self, name, default_value=None, description=""):
-        assert description
-        self.name, self.default = name, default_value
-
-
-class Value:
-    def __init__(self, name):
-        self.name = name
-
-
-class Node(SimpleNamespace):
-    pass
+def argument(name, default_value=None, *, description):
+    return name, default_value
 
 
 def launched(monkeypatch, file, folder, **given):
     """The words of the command that each node of a launch file is, with these launch arguments."""
     names = {
         "launch": {"LaunchDescription": list},
-        "launch.actions": {"DeclareLaunchArgument": Argument},
-        "launch.substitutions": {"LaunchConfiguration": Value},
+        "launch.actions": {"DeclareLaunchArgument": argument},
+        "launch.substitutions": {"LaunchConfiguration": "<{}>".format},
         "launch_ros": {},
-        "launch_ros.actions": {"Node": Node},
+        "launch_ros.actions": {"Node": SimpleNamespace},
     }
     for name, found in names.items():
         module = ModuleType(name)
         vars(module).update(found)
         monkeypatch.setitem(sys.modules, name, module)
     entities = runpy.run_path(str(file))["generate_launch_description"]()
-    arguments = {each.name: given.get(each.name, each.default) for each in entities if isinstance(each, Argument)}
-    assert given.keys() <= arguments.keys() and None not in arguments.values()
+    defaults = dict(each for each in entities if isinstance(each, tuple))
+    arguments = defaults | given
+    assert defaults.keys() == arguments.keys() and None not in arguments.values()
 
     def of(value):
-        if isinstance(value, list):
-            return "".join(map(of, value))
-        return arguments[value.name] if isinstance(value, Value) else value
+        text = "".join(value) if isinstance(value, list) else value
+        return re.sub("<(.+?)>", lambda found: arguments[found[1]], text) if isinstance(text, str) else text
 
     def words(number, node):
         made = [node.executable, *node.arguments, "--ros-args", "-r", f"__node:={node.name}"]
@@ -60,4 +50,5 @@ def launched(monkeypatch, file, folder, **given):
             made += ["--params-file", str(place)]
         return made
 
-    return [words(i, node) for i, node in enumerate(each for each in entities if isinstance(each, Node))]
+    nodes = [each for each in entities if not isinstance(each, tuple)]
+    return [words(i, node) for i, node in enumerate(nodes)]

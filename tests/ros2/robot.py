@@ -1,6 +1,5 @@
 """A small robot: a memory of a pad, messages of its readings, and a process that publishes them."""
 
-import io
 import os
 import signal
 import subprocess
@@ -16,6 +15,8 @@ from live_touches import GEL, frames, shift, slide
 from scroll_tactile import TactileLearner
 
 TOPIC = "/finger/tactile"
+ASKED = ("best_effort", "volatile", 0)  # of publishers
+KIND = "sensor_msgs/msg/JointState"
 ROBOT = Path(__file__)
 EXAMPLES = ROBOT.parents[2] / "examples"
 
@@ -58,7 +59,7 @@ def taught(path, sensor, embedding):
 
 def stream(kind, count):
     """What a finger's driver sends as a message of a kind: rests and touches, or of a camera one of the gel's."""
-    if kind in ("Image", "CompressedImage"):
+    if kind == "Image":
         return [np.asarray(frame) for frame in frames(GEL.materials[1], 5, 8)]
     rows, _ = shift("abcab", seed=3)
     return np.resize(rows, (count, rows.shape[1]))
@@ -66,7 +67,7 @@ def stream(kind, count):
 
 def message_of(kind, reading, stamp):
     """A reading as a message of a kind that there are wheels of."""
-    from sensor_msgs.msg import CompressedImage, Image, JointState
+    from sensor_msgs.msg import Image, JointState
     from std_msgs.msg import Float32MultiArray
 
     if kind == "Float32MultiArray":
@@ -76,16 +77,9 @@ def message_of(kind, reading, stamp):
     else:
         high = GEL.sensor.limits[1].max()
         pixels = np.round(reading * (255 / high)).astype(np.uint8)
-        if kind == "Image":
-            height, width, _ = pixels.shape
-            pixels = np.ascontiguousarray(pixels[..., ::-1])
-            message = Image(height=height, width=width, step=3 * width, encoding="bgr8", data=pixels.tobytes())
-        else:
-            from PIL import Image as Picture
-
-            file = io.BytesIO()
-            Picture.fromarray(pixels).save(file, "PNG")
-            message = CompressedImage(format="png", data=file.getvalue())
+        height, width, _ = pixels.shape
+        pixels = np.ascontiguousarray(pixels[..., ::-1])
+        message = Image(height=height, width=width, step=3 * width, encoding="bgr8", data=pixels.tobytes())
     message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
     return message
 
@@ -103,25 +97,12 @@ def publish(topic, count, rate, every, kind="JointState"):
         time.sleep(0.02)
     time.sleep(0.5)  # the other side may not have matched yet
     begin = time.time()
-    clock = GEL.sensor.rate if "Image" in kind else 50.0  # the sensor's own, whose rate is the pad's
+    clock = GEL.sensor.rate if kind == "Image" else 50.0  # the sensor's own, whose rate is the pad's
     for i, reading in enumerate(readings):
         time.sleep(max(0.0, begin + i // every * every / rate - time.time()))
         publisher.publish(message_of(kind, reading, 1000 + i / clock))
     time.sleep(0.5)
     rclpy.shutdown()
-
-
-@contextmanager
-def publishing(count, rate, every=1, kind="JointState", topic=TOPIC):
-    words = [sys.executable, ROBOT, topic, str(count), str(rate), str(every), kind]
-    paths = os.pathsep.join([str(ROBOT.parents[1]), *sys.path])
-    with subprocess.Popen(list(map(str, words)), env=os.environ | {"PYTHONPATH": paths}) as process:
-        try:
-            yield process
-            process.wait(120)
-        finally:  # it waits for a listener for ever
-            process.kill()
-    assert process.returncode == 0
 
 
 @contextmanager
@@ -134,6 +115,18 @@ def command(*words, **options):
             yield process
         finally:
             process.kill()
+
+
+@contextmanager
+def publishing(count, rate, every=1, kind="JointState", topic=TOPIC):
+    with command(ROBOT, topic, count, rate, every, kind) as process:
+        yield process
+        assert process.wait(120) == 0
+
+
+def ended(answers):
+    """The materials of the touches that ended."""
+    return [answer["material"] for answer in answers if answer["event"] == "ended"]
 
 
 def ended_by_ctrl_c(process):

@@ -5,13 +5,11 @@ import copy
 import itertools
 import json
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from live_touches import GEL, frames, gel_learner, learner, shift, slide
-from robot import Bare, stamped, taught
-from scroll_tactile_store import StoreFullError
+from live_touches import learner, shift, slide
+from robot import Bare, ended, stamped, taught
 from touches import PAD, SMALL
 
 from scroll_tactile import Quantity, TactileLearner, errors
@@ -43,29 +41,17 @@ def test_answers_are_those_of_a_live_session():
     made, answers, warnings = bridge()
     run(made)
     session = learner().live()
-    ended = [touch for i, row in enumerate(ROWS) for touch in session.push(row, 1000 + i / 50).touches]
+    touches = [touch for i, row in enumerate(ROWS) for touch in session.push(row, 1000 + i / 50).touches]
     told = [answer for answer in answers if answer["event"] == "ended"]
-    assert [answer["material"] for answer in told] == ["a", "b"] == [touch.prediction.material for touch in ended]
-    assert [answer["probability"] for answer in told] == [touch.prediction.as_json()["probability"] for touch in ended]
-    assert [answer["candidates"] for answer in told] == [touch.prediction.candidates() for touch in ended]
-    assert [answer["seconds"] for answer in told] == [touch.stream.seconds for touch in ended]
+    assert [answer["material"] for answer in told] == ["a", "b"] == [touch.prediction.material for touch in touches]
+    assert [answer["probability"] for answer in told] == [
+        touch.prediction.as_json()["probability"] for touch in touches
+    ]
+    assert [answer["candidates"] for answer in told] == [touch.prediction.candidates() for touch in touches]
+    assert [answer["seconds"] for answer in told] == [touch.stream.seconds for touch in touches]
     assert not warnings
     assert made.status()["messages"] == made.status()["readings"] == len(ROWS)
     json.dumps(answers, allow_nan=False)
-
-
-def test_an_answer_is_given_only_when_something_changed():
-    made, answers, _ = bridge()
-    run(made)
-    assert answers[0]["event"] == "began" and answers[0]["contact"]
-    assert len(answers) < len(ROWS) / 10
-    for answer, after in itertools.pairwise(answers):
-        changing = [
-            {key: value for key, value in said.items() if key not in ("stamp", "seconds")} for said in (answer, after)
-        ]
-        assert changing[0] != changing[1]
-    for event in ("began", "ended"):
-        assert sum(answer["event"] == event for answer in answers) + (event == "began") >= 2
 
 
 def test_a_watched_sensor_is_noted_at_rest_and_in_known_touches_that_nobody_learns(tmp_path):
@@ -94,17 +80,13 @@ def test_a_watched_sensor_is_noted_at_rest_and_in_known_touches_that_nobody_lear
         assert noted() == {"": 4, "a": 2}  # the second touch has the readings of the one that was learned
 
 
-def test_a_full_disk_keeps_a_watched_sensor_from_being_noted_and_nothing_else(tmp_path, monkeypatch):
-    def full(*_):
-        raise StoreFullError("no space left on the disk")
-
-    with TactileLearner.open(taught(tmp_path / "m", PAD, SMALL)) as own:
-        made, answers, warnings = bridge(source=own, watch=True)
-        monkeypatch.setattr(TactileLearner, "sense", full)
-        run(made)
-        made.close()
-        assert [answer["event"] for answer in answers].count("ended") == 2
-        assert len(warnings) == 1 and "health of the sensor" in warnings[0] and "no space left" in warnings[0]
+def test_an_answer_is_given_only_when_something_changed():
+    made, answers, _ = bridge()
+    run(made)
+    assert answers[0]["event"] == "began" and answers[0]["contact"]
+    assert len(answers) < len(ROWS) / 10
+    told = [{name: value for name, value in each.items() if name not in ("stamp", "seconds")} for each in answers]
+    assert all(one != after for one, after in itertools.pairwise(told))
 
 
 @pytest.mark.parametrize(("field", "said"), [("value", "nearest is 'values'"), ("header", "leads to a message")])
@@ -114,14 +96,6 @@ def test_the_first_message_without_the_field_says_what_there_is(field, said):
         made.receive(stamped(ROWS[0], 1.0), 1.0)
 
 
-def test_later_messages_without_the_field_are_counted_and_said_once():
-    made, _, warnings = bridge("data[0:2]")
-    made.receive(Bare([0.1, 0.1]), 1.0)
-    for i in range(3):
-        made.receive(stamped(ROWS[0], 2.0), 1.02 + i / 50)
-    assert made.report.refused == 3 and len(warnings) == 1
-
-
 @pytest.mark.parametrize("values", [[0.1], [0.1] * 3, [], [np.nan, 0.1], [np.inf, 0.1]], ids=str)
 def test_messages_without_a_reading_are_left_out_and_said_once(values):
     made, answers, warnings = bridge()
@@ -129,38 +103,7 @@ def test_messages_without_a_reading_are_left_out_and_said_once(values):
         made.receive(stamped(row, 1000 + i / 50), i / 50)
         made.receive(stamped(values, 1000 + i / 50), i / 50)
     assert made.report.refused == len(ROWS) and len(warnings) == 1
-    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
-
-
-def test_without_a_stamp_the_time_of_publishing_counts():
-    bare, answers, _ = bridge("data")
-    for i, row in enumerate(ROWS):
-        bare.receive(Bare(array.array("d", row)), i / 50)
-    zero, others, _ = bridge()
-    for i, row in enumerate(ROWS):
-        zero.receive(stamped(row, 0), i / 50)
-    assert zero.report.unstamped == len(ROWS)
-    assert answers == others
-    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
-
-
-def test_a_stamp_of_zero_between_others_breaks_nothing():
-    made, answers, _ = bridge()
-    for i, row in enumerate(ROWS):
-        made.receive(stamped(row, 0 if i % 10 == 7 else 1000 + i / 50), 5 + i / 50)
-    status = made.status()
-    assert status["unstamped"] == sum(i % 10 == 7 for i in range(len(ROWS)))
-    assert status["gaps"] == status["steps_back"] == status["lost"] == 0
-    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
-
-
-def test_time_that_goes_back_ends_a_touch():
-    made, answers, _ = bridge()
-    middle = sum(PLACES[0]) // 2
-    run(made, ROWS[:middle])
-    run(made, ROWS[middle:], start=10.0)
-    assert next(answer["end"] for answer in answers if answer["event"] == "ended") == "time went back"
-    assert made.status()["steps_back"] == 1
+    assert ended(answers) == ["a", "b"]
 
 
 def test_a_touch_is_learned_once_and_forgotten(own):
@@ -182,18 +125,6 @@ def test_a_touch_is_learned_once_and_forgotten(own):
         made.forget("felt")
     with pytest.raises(errors.InputError, match="manual"):
         made.begin()
-
-
-def test_what_was_learned_last_is_taken_back_first_and_once(own):
-    made, _, _ = bridge(source=own)
-    for start, name in ((1000.0, "felt"), (2000.0, "cork"), (3000.0, "silk")):
-        run(made, ROWS + 0.001 * start / 1000, start=start)
-        made.learn(name)
-    made.retract(str(made.learned.sequence))
-    assert made.undo().startswith("cork: ") and made.undo().startswith("felt: ")
-    with pytest.raises(errors.InputError, match="there is none"):
-        made.undo()
-    assert set(own.materials) == {*"abc"}
 
 
 def test_paused_a_touch_can_be_learned_and_resumed_it_answers_as_it_was_adjusted(own):
@@ -223,54 +154,6 @@ def test_touches_that_somebody_else_begins_and_ends():
     assert answers[-1]["event"] == "ended" and answers[-1]["end"] == "end"
 
 
-def test_touches_of_one_thing_add_up():
-    made, answers, _ = bridge(contact="manual")
-    rows = ROWS[slice(*PLACES[1])]
-    parts = [rows[:40], rows[10:40]]
-    with pytest.raises(errors.InputError, match="between two touches"):
-        made.again()
-    for i, part in enumerate(parts):
-        made.begin()
-        run(made, part, start=2000.0 + 10 * i)
-        made.end()
-        assert "adds up" in made.again()
-    one, two = [answer for answer in answers if answer["event"] == "ended"]
-    assert (one["touches"], two["touches"]) == (1, 2)
-    assert two["probability"] == learner().predict(*parts).as_json()["probability"]
-
-
-def test_pictures_are_readings_of_a_camera():
-
-    @dataclass
-    class Image:
-        height: int
-        width: int
-        step: int
-        encoding: str
-        data: object
-
-    made, answers, _ = bridge("data", gel_learner())
-    sensor = gel_learner().sensor
-    for i, frame in enumerate(frames(GEL.materials[1], 5, 8)):
-        pixels = np.round(np.asarray(frame) * (255 / sensor.limits[1]).max()).astype(np.uint8)[..., ::-1]
-        height, width, _ = pixels.shape
-        made.receive(Image(height, width, 3 * width, "bgr8", array.array("B", pixels.tobytes())), i / sensor.rate)
-    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == [GEL.materials[1]]
-
-
-def test_answers_carry_estimates_where_a_quantity_was_declared():
-    source = copy.deepcopy(learner())
-    source.declare(Quantity(name="force", unit="N", low=0.0, high=2.0, resolution=0.01))
-    made, answers, _ = bridge(source=source)
-    run(made)
-    [first, *_] = [answer for answer in answers if answer["event"] == "ended"]
-    assert first["estimates"]["force"]["value"] is None and "0 sampled" in first["estimates"]["force"]["missing"]
-    json.dumps(answers, allow_nan=False)
-    made, answers, _ = bridge()
-    run(made)
-    assert not any("estimates" in answer for answer in answers)
-
-
 def test_answers_are_by_an_axis_of_labels_where_one_is_named():
     source = TactileLearner(sensor=PAD, embedding=SMALL, exemplars=0)
     for i in range(8):
@@ -279,19 +162,9 @@ def test_answers_are_by_an_axis_of_labels_where_one_is_named():
     made, answers, _ = bridge(source=source, of="slip")
     run(made)
     assert {answer["of"] for answer in answers} == {"slip"}
-    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["north", "south"]
+    assert ended(answers) == ["north", "south"]
     with pytest.raises(errors.AnnotationError, match="expected an axis that touches have labels on"):
         bridge(source=source, of="way")
-
-
-def learned(made, names):
-    """Learn a touch under each name; their numbers."""
-    numbers = []
-    for i, name in enumerate(names):
-        run(made, shift("b", seed=i)[0], start=1000.0 + 100 * i)
-        made.learn(name)
-        numbers.append(made.learned.sequence)
-    return numbers
 
 
 @pytest.mark.parametrize("text", ["", "-1", "1.0", " 7", "٣", "1" * 20, "1" * 5000], ids=lambda text: text[:20])
@@ -303,40 +176,12 @@ def test_what_is_no_number_of_an_observation_is_refused(own, text):
         made.retract("9" * 19)
 
 
-def test_undo_passes_over_what_somebody_took_back_already(own):
-    made, *_ = bridge(source=own)
-    wool, lace, silk, _ = learned(made, ["wool", "lace", "silk", "felt"])
-    made.forget("felt")
-    assert made.learned.sequence == silk
-    made.retract(str(silk))
-    own.retract(lace)
-    assert made.undo().startswith(f"wool: observation {wool} was taken back")
-    assert made.learned is None and own.materials == {"a": 6, "b": 6, "c": 6}
-    with pytest.raises(errors.InputError, match="there is none"):
-        made.undo()
-
-
 def test_an_adaptation_is_not_taken_back_as_an_observation(own):
     row = own._ledger.adapt(Correction.none(PAD.channels))
     made, *_ = bridge(source=own)
     with pytest.raises(errors.InputError, match=r"an adaptation to a changed skin.*scroll-tactile memory retract"):
         made.retract(str(row))
     assert own.memory.correction is not None
-
-
-def test_what_was_met_adds_up_over_pauses():
-    made, *_ = bridge()
-    run(made)
-    made.pause()
-    once = made.status()
-    assert once["touches"] == 2
-    made.resume()
-    assert made.status() == once | {"learning": True}
-    run(made, start=2000.0)
-    made.pause()
-    both = made.status()
-    assert both["touches"] == 4 and both["readings"] == both["messages"] == 2 * len(ROWS)
-    assert both["learning"] is False
 
 
 def test_a_session_that_begins_anew_says_nothing_of_the_rest_before():
@@ -357,3 +202,63 @@ def test_a_paused_bridge_says_how_touches_can_begin_again():
             call()
     made.resume()
     assert made.begin()
+
+
+@pytest.mark.parametrize(
+    ("stamp", "unstamped"),
+    [
+        (lambda i: None, 0),  # a message without a header
+        (lambda i: 0, len(ROWS)),
+        (lambda i: 0 if i % 10 == 7 else 1000 + i / 50, len(ROWS[7::10])),
+    ],
+    ids=["none", "zero", "some"],
+)
+def test_without_a_stamp_the_time_of_publishing_counts_on_the_stamps_clock(stamp, unstamped):
+    made, answers, _ = bridge("values" if unstamped else "data")
+    for i, row in enumerate(ROWS):
+        message = stamped(row, stamp(i)) if unstamped else Bare(array.array("d", row))
+        made.receive(message, 5 + i / 50)
+    status = made.status()
+    assert status["unstamped"] == unstamped
+    assert status["gaps"] == status["steps_back"] == status["lost"] == 0
+    assert ended(answers) == ["a", "b"]
+
+
+def test_answers_carry_estimates_where_a_quantity_was_declared():
+    source = copy.deepcopy(learner())
+    source.declare(Quantity(name="force", unit="N", low=0.0, high=2.0, resolution=0.01))
+    made, answers, _ = bridge(source=source)
+    run(made)
+    first = next(answer for answer in answers if answer["event"] == "ended")
+    assert first["estimates"]["force"]["value"] is None and "0 sampled" in first["estimates"]["force"]["missing"]
+
+
+def test_what_was_learned_last_is_taken_back_first_once_and_not_after_somebody_else_did(own):
+    made, _, _ = bridge(source=own)
+    numbers = []
+    for i, name in enumerate(["wool", "felt", "lace", "silk", "cork"]):
+        run(made, shift("b", seed=i)[0], start=1000.0 + 100 * i)
+        made.learn(name)
+        numbers.append(made.learned.sequence)
+    made.forget("cork")
+    assert made.learned.sequence == numbers[3]
+    made.retract(str(numbers[3]))
+    own.retract(numbers[2])
+    for name, number in (("felt", numbers[1]), ("wool", numbers[0])):
+        assert made.undo().startswith(f"{name}: observation {number} was taken back")
+    assert made.learned is None and own.materials == {"a": 6, "b": 6, "c": 6}
+    with pytest.raises(errors.InputError, match="there is none"):
+        made.undo()
+
+
+def test_what_was_met_adds_up_over_pauses():
+    made, *_ = bridge()
+    run(made)
+    made.pause()
+    once = made.status()
+    made.resume()
+    assert made.status() == once | {"learning": True}
+    run(made, start=2000.0)
+    both = made.status()
+    assert (once["touches"], both["touches"]) == (2, 4)
+    assert both["readings"] == both["messages"] == 2 * len(ROWS)

@@ -10,13 +10,12 @@ import pytest
 from commands import refused
 from launching import launched
 from readme import command_lines
-from robot import EXAMPLES, TOPIC, command, ended_by_ctrl_c, publishing
+from robot import EXAMPLES, TOPIC, command, ended, ended_by_ctrl_c, publishing
 from scroll_tactile_store import DamageError
 
 from scroll_tactile import TactileLearner, errors
+from scroll_tactile.clients.ros2 import Bridge, TactileNode, serve
 from scroll_tactile.clients.ros2.inputs import interface, names_in, require_rclpy
-from scroll_tactile.clients.ros2.node import TactileNode
-from scroll_tactile.clients.ros2.serving import _new_sensor, _node, _place, _start, serve
 from scroll_tactile.recordings import PRESETS
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
@@ -61,7 +60,7 @@ class Remote:
         return "" if result.successful else result.reason or "no reason"
 
     def ended(self):
-        return [answer["material"] for answer in self.answers if answer["event"] == "ended"]
+        return ended(self.answers)
 
 
 def node_command(memory, *words, **more):
@@ -155,25 +154,8 @@ def opening(own, monkeypatch):
     TactileLearner.open(own).close()  # it was let go
 
 
-@pytest.fixture
-def prepared(spinning, own):
-    """Makes a lifecycle node here, with these values of parameters; it is cleaned up at the end."""
-    made = []
-
-    def node(**values):
-        node = spinning.node("scroll_tactile", _node)
-        given = {"memory": str(own), "topic": TOPIC, "field": "position", "type": "sensor_msgs/msg/JointState"}
-        node.prepare(None, given | values)
-        made.append(node)
-        return node
-
-    yield node
-    for each in made:
-        each.clean_up()
-
-
-def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, prepared, opening):
-    node, (go, paths) = prepared(), opening
+def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, tactile, opening):
+    node, (go, paths) = tactile(own, start=False), opening
 
     def running():
         """What else the node is asked meanwhile."""
@@ -184,44 +166,44 @@ def test_a_manager_that_configures_while_the_memory_opens_waits_for_it(own, prep
             assert node.trigger_configure() and node.error is None
         return True
 
-    _start(node, running)
-    assert paths == [own] and not node.finger.active
+    node.start(running)
+    assert paths == [own] and node.bridge is not None and not node.active
     node.clean_up()
 
 
-def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(prepared, opening):
-    node = prepared()
-    _start(node, lambda: False)
+def test_a_node_that_is_ended_while_the_memory_opens_lets_it_go(own, tactile, opening):
+    node = tactile(own, start=False)
+    node.start(lambda: False)
     opening[0].set()
     node.clean_up()
-    assert node.met["materials"] == 3 and node.finger is None
+    assert node.met["materials"] == 3 and node.bridge is None
 
 
-@pytest.mark.parametrize("step", ["__init__", "activate"])
-def test_whatever_hinders_a_transition_ends_the_start(step, prepared, monkeypatch):
+@pytest.mark.parametrize(("what", "step"), [(Bridge, "__init__"), (TactileNode, "activate")])
+def test_whatever_hinders_a_transition_ends_the_start(what, step, own, tactile, monkeypatch):
     """rclpy makes a result of an exception, without a word."""
-    node, logged = prepared(), []
+    node, logged = tactile(own, start=False), []
 
     def fail(self, *_, **__):
         raise ZeroDivisionError("of all things")
 
     monkeypatch.setattr(node.get_logger(), "error", logged.append)
     with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-        patched.setattr(TactileNode, step, fail)
-        _start(node, lambda: True)
+        patched.setattr(what, step, fail)
+        node.start()
     assert "of all things" in logged[0] and "Traceback" in logged[0]
 
 
-def test_a_transition_that_ros_refuses_ends_the_start(prepared, monkeypatch):
+def test_a_transition_that_ros_refuses_ends_the_start(own, tactile, monkeypatch):
     from rclpy.lifecycle import TransitionCallbackReturn
 
-    node = prepared()
+    node = tactile(own, start=False)
     monkeypatch.setattr(node, "trigger_activate", lambda: TransitionCallbackReturn.ERROR)
     with pytest.raises(errors.ScrollTactileError, match="did not activate the node"):
-        _start(node, lambda: True)
+        node.start()
 
 
-def test_a_damaged_row_is_no_reason_not_to_start(prepared, monkeypatch):
+def test_a_damaged_row_is_no_reason_not_to_start(own, tactile, monkeypatch):
     asked = []
 
     def health(self, *, after=0):
@@ -229,9 +211,8 @@ def test_a_damaged_row_is_no_reason_not_to_start(prepared, monkeypatch):
         raise DamageError("row 7 is damaged", path=self.path)
 
     monkeypatch.setattr(TactileLearner, "health", health)
-    node = prepared(health_after=5)
-    node.configure()
-    assert node.finger is not None and set(asked) == {5}
+    node = tactile(own, health_after=5)
+    assert node.active and set(asked) == {5}
 
 
 @pytest.mark.parametrize("name", ["finger", "hand"])
@@ -290,11 +271,15 @@ def test_the_example_acts_on_what_it_feels(own):
     assert len(said) == 2
 
 
-def test_where_readings_are_and_whose_they_are(memory, tmp_path):
-    assert _place("/t", "a", "biotac") == ("/t", "a")
-    assert _place("", "", "biotac") == ("/rh/tactile", "tactiles[0].electrodes")
-    assert _new_sensor(str(memory), "", "biotac") is None  # a preset may give topic and field alone
-    assert _new_sensor(str(tmp_path / "none"), "", "biotac") == PRESETS["biotac"].sensor
+@pytest.mark.parametrize(("topic", "field"), [("/t", "a"), ("", "")])
+def test_a_preset_says_where_readings_are_and_whose_where_nothing_else_does(topic, field, tactile, tmp_path):
+    node = tactile(tmp_path / "none", topic=topic, field=field, preset="biotac", start=False)
+    assert node.listen() == (field or "tactiles[0].electrodes")
+    assert node.listener.topic == (topic or "/rh/tactile")
+    assert node.open().result().sensor == PRESETS["biotac"].sensor
+
+
+def test_names_are_a_list_or_a_text_with_commas():
     assert names_in([" a", "", "  ", "b, c"]) == ["a", "b", "c"] and names_in(" ") == []
 
 

@@ -1,4 +1,4 @@
-"""What comes in and goes out: drivers' messages, the examples' package, rosbridge, and sessions that were recorded."""
+"""What comes in and goes out: messages, the examples' package, rosbridge, and sessions that were recorded."""
 
 import json
 import math
@@ -11,19 +11,16 @@ import bags
 import numpy as np
 import pytest
 from commands import run
-from live_touches import GEL, gel_learner, learner, shift, slide
-from robot import TOPIC, publishing
+from live_touches import GEL, gel_learner, learner, shift
+from robot import ASKED, TOPIC, ended, publishing
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg
-from touches import SMALL
 
-from scroll_tactile import Sensor, TactileLearner
-from scroll_tactile.clients.ros2 import Bridge, Quality, TactileNode
-from scroll_tactile.recordings import PRESETS, read
+from scroll_tactile import TactileLearner
+from scroll_tactile.clients.ros2.inputs import quality
 
 MESSAGES = Path(__file__).parents[2] / "examples" / "ros2" / "scroll_tactile_msgs"
 ROS2 = bags.typestore(2)
-COUNTS = Sensor(name="counts", channels=2, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 
 # Of the parser that rosidl imports with the first message.
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
@@ -33,73 +30,19 @@ def definition(folder, name):
     return (MESSAGES / folder / f"{name}.{folder}").read_text()
 
 
-def taxels(values, stamp):
-    kind = ROS2.types["sensor_msgs/msg/ChannelFloat32"]
-    channels = [kind(name="tip", values=values.astype(np.float32))]
-    return ROS2.types["tactile_msgs/msg/TactileState"](header=bags.header(ROS2, stamp), sensors=channels)
-
-
-def static_data(values, stamp):
-    kind = ROS2.types["robotiq_tsf/msg/Taxels"]
-    sides = [kind(values=np.resize(values, 28).astype(np.uint16)) for _ in range(2)]
-    return ROS2.types["robotiq_tsf/msg/StaticData"](taxels=sides)
-
-
-DRIVERS = {
-    "BioTac": (PRESETS["biotac"].field, lambda values, t: bags.biotac(ROS2, values.astype(np.int16), t)),
-    "TactileState": ("sensors[*].values", taxels),
-    "uSkin": (
-        "sensors[0].taxels[*].{x,y}",
-        lambda values, t: bags.uskin(ROS2, np.array([[*values, 0]]), round(50 * t), t),
-    ),
-    "PapillArray": (
-        "pillars[*].{fX,fY}",
-        lambda values, t: bags.papillarray(ROS2, np.array([[*values, 0.0]]), round(1e6 * t), t),
-    ),
-    "Robotiq": ("taxels[0].values[0:2]", static_data),
-    "AnySkin": ("data", lambda values, t: bags.array(ROS2, values)),
-}
-
-
-@pytest.fixture(scope="module")
-def counting():
-    own = TactileLearner(sensor=COUNTS, embedding=SMALL)
-    random = np.random.default_rng(1)
-    for _ in range(6):
-        for material in "abc":
-            own.observe(material, 1000 * slide(material, 50, random))
-    own.settle()
-    return own
-
-
-@pytest.mark.parametrize("driver", DRIVERS)
-def test_messages_of_drivers_are_answered_as_they_were_serialized(driver, counting):
-    """Of each driver in the table of messages; there are no wheels of these types but AnySkin's."""
-    field, made = DRIVERS[driver]
-    answers, warnings = [], []
-    bridge = Bridge(counting, field, answer=answers.append, warn=warnings.append)
-    for i, row in enumerate(shift("ab", seed=4)[0]):
-        message = made(np.round(1000 * row), 100 + i / 50)
-        sent = ROS2.deserialize_cdr(ROS2.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
-        bridge.receive(sent, 100 + i / 50)
-    assert [answer["material"] for answer in answers if answer["event"] == "ended"] == ["a", "b"]
-    assert not warnings and bridge.report.refused == 0
-
-
-@pytest.mark.parametrize("kind", ["Float32MultiArray", "Image", "CompressedImage"])
-def test_a_drivers_process_is_heard_in_each_type_that_there_are_wheels_of(kind, spinning):
-    answers = []
-    source = gel_learner() if "Image" in kind else learner()
-    served = TactileNode(spinning.node("scroll_tactile"), source, TOPIC, "data", answered=answers.append)
-    count = 16 if "Image" in kind else 300
+@pytest.mark.parametrize("kind", ["Float32MultiArray", "Image"])
+def test_a_drivers_process_is_heard_in_each_type_that_there_are_wheels_of(kind, spinning, tactile):
+    source = gel_learner() if kind == "Image" else learner()
+    served = tactile(source, field="data", type="")
+    count = 16 if kind == "Image" else 300
     with publishing(count, 50, kind=kind):
         spinning.until(lambda: served.bridge.report.messages == count, 120)
     assert served.bridge.status() | {"refused": 0, "dropped": 0, "messages": count} == served.bridge.status()
-    if "Image" in kind:  # the others have no stamps, and their places in time are those of a busy machine
-        assert [answer["material"] for answer in answers if answer["event"] == "ended"] == [GEL.materials[1]]
+    if kind == "Image":  # the others have no stamps, and their places in time are those of a busy machine
+        assert ended(served.answers) == [GEL.materials[1]]
 
 
-def test_answers_fill_the_message_package_of_the_examples(spinning, monkeypatch):
+def test_answers_fill_the_message_package_of_the_examples(tactile, monkeypatch):
     """Of the package's text, by another's parser: each field is one that the node fills, with values of its type."""
     name = "scroll_tactile_msgs/msg/TactileAnswer"
     store, sent = bags.typestore(2), []
@@ -109,11 +52,11 @@ def test_answers_fill_the_message_package_of_the_examples(spinning, monkeypatch)
     messages.TactileAnswer = kind
     monkeypatch.setitem(sys.modules, "scroll_tactile_msgs", package)
     monkeypatch.setitem(sys.modules, "scroll_tactile_msgs.msg", messages)
-    node = spinning.node("scroll_tactile")
-    create = node.create_publisher
+    served = tactile(learner(), field="data", type="std_msgs/msg/Float32MultiArray", start=False)
+    create = served.create_publisher
     double = SimpleNamespace(publish=sent.append)
-    monkeypatch.setattr(node, "create_publisher", lambda of, *how: double if of is kind else create(of, *how))
-    served = TactileNode(node, learner(), TOPIC, "data", kind="std_msgs/msg/Float32MultiArray")
+    monkeypatch.setattr(served, "create_publisher", lambda of, *how: double if of is kind else create(of, *how))
+    served.start()
     bare = {"event": "began", "stamp": 3.25, "contact": True, "seconds": 0.0, "decided": False}
     estimate = {"value": 1.5, "low": None, "high": 2.0, "unit": "N"}
     full = bare | {"event": "ended", "end": "released", "touches": 2, "material": "oak", "probability": 0.9}
@@ -172,7 +115,7 @@ def test_over_rosbridge_a_process_of_another_python_answers_and_learns(own, monk
             stamp = {"sec": 1000 + i // 50, "nanosec": (i % 50) * 20_000_000}
             places[TOPIC].call({"header": {"stamp": stamp, "frame_id": ""}, "position": row.tolist(), "name": []})
         sent = places["/scroll_tactile/answer"].sent
-        assert [answer["material"] for answer in sent if answer["event"] == "ended"] == ["a", "b"]
+        assert ended(sent) == ["a", "b"]
         places["/scroll_tactile/learn"].call({"load_namespace": "felt"}, done := {})
         assert done["success"] and source.materials["felt"] == 1
 
@@ -190,7 +133,7 @@ def test_a_session_that_was_recorded_is_learned_from_again(spinning, own, tmp_pa
             count += 1
             writer.write(connection, about["received_timestamp"], data)
 
-        recorder.create_subscription(JointState, TOPIC, record, Quality().profile(""), raw=True)
+        recorder.create_subscription(JointState, TOPIC, record, quality("", *ASKED), raw=True)
         with publishing(460, 100):
             spinning.until(lambda: count >= 455, 120)
     words = ("--topic", TOPIC, "--field", "position", "--cut", "contact", "--label", "session")
@@ -198,26 +141,3 @@ def test_a_session_that_was_recorded_is_learned_from_again(spinning, own, tmp_pa
     assert done.exit_code == 0, done.output
     with TactileLearner.open(own, mode="read") as learned:
         assert learned.materials["session"] == 2
-
-
-def test_messages_that_a_node_serialized_are_read_from_a_bag(tmp_path):
-    """Lists of any lengths, empty ones among them; the truth is what was put into the messages."""
-    from rclpy.serialization import serialize_message
-    from sensor_msgs.msg import JointState
-
-    random = np.random.default_rng(4)
-    store, kind = ROS2, "sensor_msgs/msg/JointState"
-    truth = []
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/joints", kind, typestore=store)
-        for i in range(60):
-            names = ["x" * length for length in random.integers(0, 9, random.integers(0, 4)).tolist()]
-            lists = [random.standard_normal(count).tolist() for count in (2, *random.integers(0, 3, 2).tolist())]
-            message = JointState(name=names, position=lists[0], velocity=lists[1], effort=lists[2])
-            message.header.stamp.sec, message.header.frame_id = 100 + i, "f" * (i % 9)
-            writer.write(connection, 10**9 * i, serialize_message(message))
-            truth.append(lists[0])
-    recording = read(tmp_path / "bag", topic="/joints", field="position")
-    assert recording.readings.tolist() == truth
-    assert recording.times.tolist() == [100.0 + i for i in range(60)]
-    assert not recording.report.notes

@@ -5,11 +5,12 @@ import re
 
 import pytest
 from live_touches import shift
-from robot import TOPIC, publishing
+from robot import ASKED, KIND, TOPIC, ended, publishing
 from touches import PAD
 
 from scroll_tactile import Health, TactileLearner, errors
-from scroll_tactile.clients.ros2 import Listener, Quality, TactileNode, inputs
+from scroll_tactile.clients.ros2 import inputs
+from scroll_tactile.clients.ros2.inputs import Listener
 
 rclpy = pytest.importorskip("rclpy", reason="no ROS 2 here: its wheels are for Linux on x86_64")
 
@@ -21,53 +22,48 @@ from std_msgs.msg import Float32MultiArray, String  # noqa: E402
 pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
 
 
-KIND = "sensor_msgs/msg/JointState"
-
-
 def feed(node, rows, start=0.0):
     for i, row in enumerate(rows):
         stamp = 1000 + start + i / PAD.rate
         message = JointState(position=row.tolist())
         message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(stamp % 1 * 1e9)
-        node.receive(message, {})
+        node.listener.receive(message, {})
 
 
-def test_every_reading_of_a_burst_arrives_and_is_answered(spinning, learner):
+def test_every_reading_of_a_burst_arrives_and_is_answered(spinning, tactile, learner):
     """250 readings a second and, at its worst, 50 at once; all of them count."""
     count = 1000
-    answers, texts = [], []
-    served = TactileNode(spinning.node("scroll_tactile"), learner, TOPIC, "position", answered=answers.append)
+    texts = []
+    served = tactile(learner, type="")
     listener = spinning.node("arm")
     listener.create_subscription(String, "/scroll_tactile/answer", lambda text: texts.append(json.loads(text.data)), 50)
     with publishing(count, 250, every=50):
         spinning.until(lambda: served.bridge.report.messages == count, 120)
     status = served.bridge.status()
     assert (status["readings"], status["ticks"], status["lost"], status["dropped"]) == (count, count, 0, 0)
-    ended = [answer for answer in answers if answer["event"] == "ended"]
-    assert [answer["material"] for answer in ended][:5] == list("abcab")
-    spinning.until(lambda: len(texts) == len(answers))
-    assert texts == json.loads(json.dumps(answers))
+    assert ended(served.answers)[:5] == list("abcab")
+    spinning.until(lambda: len(texts) == len(served.answers))
+    assert texts == json.loads(json.dumps(served.answers))
 
 
-def test_a_touch_between_the_services_begin_and_end(spinning, learner):
-    node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, TOPIC, "position", kind=KIND, contact="manual")
+def test_a_touch_between_the_services_begin_and_end(spinning, tactile, learner):
+    node = tactile(learner, contact="manual")
     rows, [place] = shift("b")
     assert spinning.call(node, "/scroll_tactile/begin").success
-    feed(served, rows[slice(*place)])
+    feed(node, rows[slice(*place)])
     reply = spinning.call(node, "/scroll_tactile/end")
     assert reply.success and reply.message.endswith(": b")
     assert spinning.call(node, "/scroll_tactile/again").success
 
 
-def test_who_comes_late_is_told_the_last_answer_in_each_form_and_what_was_learned_is_taken_back(spinning, learner):
+def test_who_comes_late_is_told_the_last_answer_in_each_form_and_what_was_learned_is_taken_back(
+    spinning, tactile, learner
+):
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from std_msgs.msg import Bool, Float64
 
-    node = spinning.node("scroll_tactile")
-    answers = []
-    served = TactileNode(node, learner, TOPIC, "position", kind=KIND, answered=answers.append)
-    feed(served, shift("b", seed=8)[0])
+    node = tactile(learner)
+    feed(node, shift("b", seed=8)[0])
     late, told = spinning.node("late"), {}
     profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     kinds = {"answer": String, "material": String, "probability": Float64, "known": Bool, "status": DiagnosticArray}
@@ -75,7 +71,7 @@ def test_who_comes_late_is_told_the_last_answer_in_each_form_and_what_was_learne
         place = f"/scroll_tactile/{name}"
         late.create_subscription(of, place, lambda got, name=name: told.update({name: got}), profile)
     spinning.until(lambda: len(told) == 5 and '"ended"' in told["answer"].data)
-    last = answers[-1]
+    last = node.answers[-1]
     assert told["material"].data == last["material"] and told["probability"].data == last["probability"]
     assert told["known"].data is bool(last["known"])
     assert json.loads(told["answer"].data) == json.loads(json.dumps(last))
@@ -96,13 +92,12 @@ def test_who_comes_late_is_told_the_last_answer_in_each_form_and_what_was_learne
     assert json.loads(spinning.call(node, "/scroll_tactile/materials").message) == learner.materials
 
 
-def test_diagnostics_say_what_was_met(spinning, learner):
-    node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, TOPIC, "position", kind=KIND)
+def test_diagnostics_say_what_was_met(spinning, tactile, learner):
+    node = tactile(learner)
     heard = []
     spinning.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
-    feed(served, shift("a")[0])
-    served.receive(JointState(position=[1.0]), {})
+    feed(node, shift("a")[0])
+    node.listener.receive(JointState(position=[1.0]), {})
     spinning.until(lambda: any(array.status[0].level == DiagnosticStatus.STALE for array in heard))
     last = {pair.key: pair.value for pair in heard[-1].status[0].values}
     assert last["refused"] == "1" and last["readings"] == str(len(shift("a")[0]))
@@ -110,7 +105,7 @@ def test_diagnostics_say_what_was_met(spinning, learner):
     assert heard[-1].header.stamp.sec > 0
 
 
-def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spinning, learner, monkeypatch):
+def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spinning, tactile, learner, monkeypatch):
     asked = []
 
     def health(self, *, after):
@@ -120,11 +115,10 @@ def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spin
         return Health(7, 0.0, (3,), "dead", 200.0, 0.01, 40, 12, ("a",), ((12, 2.3),))
 
     monkeypatch.setattr(TactileLearner, "health", health)
-    node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, TOPIC, "position", kind=KIND)
+    node = tactile(learner)
     heard = []
     spinning.node("monitor").create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
-    feed(served, shift("a")[0])
+    feed(node, shift("a")[0])
     spinning.until(lambda: any(array.status[0].level == DiagnosticStatus.ERROR for array in heard))
     told = next(array for array in heard if array.status[0].level == DiagnosticStatus.ERROR).status[0].message
     assert "channels 3" not in told and "channel 3: says nothing any more" in told
@@ -133,11 +127,10 @@ def test_diagnostics_name_a_changed_channel_until_later_touches_alone_count(spin
     spinning.until(lambda: 12 in asked)
 
 
-def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning, learner):
-    node = spinning.node("scroll_tactile")
+def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning, tactile, learner):
     with pytest.raises(errors.MissingLibraryError, match="sr-robot-msgs"):
-        TactileNode(node, learner, TOPIC, "position", kind="sr_robot_msgs/msg/BiotacAll")
-    TactileNode(node, learner, "/other", "position")
+        tactile(learner, type="sr_robot_msgs/msg/BiotacAll")
+    tactile(learner, topic="/other", type="")
     other = spinning.node("other")
     publisher = other.create_publisher(Float32MultiArray, "/other", 10)
 
@@ -149,23 +142,14 @@ def test_a_type_of_no_installed_package_and_a_topic_that_sends_another(spinning,
         spinning.until(refusing)
 
 
-def test_messages_that_were_lost_on_their_way_are_counted(spinning, learner):
-    served = TactileNode(spinning.node("scroll_tactile"), learner, TOPIC, "position", kind=KIND)
-    for publisher, number in ((b"a", 7), (b"a", 8), (b"b", 1), (b"a", 11), (b"b", 2), (b"a", 12)):
-        about = {"publication_sequence_number": number, "publisher_gid": {"data": publisher}}
-        served.receive(JointState(position=[0.1, 0.1]), about)
-    assert served.bridge.report.dropped == 2
-
-
-def test_a_topic_that_never_comes_is_said_with_those_nearest_of_others(spinning, learner):
-    node = spinning.node("scroll_tactile")
-    served = TactileNode(node, learner, "/finger/tactil", "position", kind=KIND)
-    assert "nobody publishes /finger/tactil" in served.listener.absent()
-    assert "nearest" not in served.listener.absent()  # what is heard here is a topic, too
+def test_a_topic_that_never_comes_is_said_with_those_nearest_of_others(spinning, tactile, learner):
+    node = tactile(learner, topic="/finger/tactil")
+    assert "nobody publishes /finger/tactil" in node.listener.absent()
+    assert "nearest" not in node.listener.absent()  # what is heard here is a topic, too
     spinning.until(lambda: "/scroll_tactile/known" in dict(node.get_topic_names_and_types()))
-    assert "/scroll_tactile/" not in served.listener.absent()
+    assert "/scroll_tactile/" not in node.listener.absent()
     spinning.node("finger").create_publisher(JointState, TOPIC, 10)
-    spinning.until(lambda: f"nearest is {TOPIC!r}" in served.listener.absent())
+    spinning.until(lambda: f"nearest is {TOPIC!r}" in node.listener.absent())
 
 
 def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_cannot_be_read_is_said_once(
@@ -175,7 +159,7 @@ def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_c
     node, kinds, warned, looks = spinning.node("hand"), [], [], []
     monkeypatch.setattr(node, "get_topic_names_and_types", lambda: looks.append(1) or [(TOPIC, kinds)])
     monkeypatch.setattr(node.get_logger(), "warning", warned.append)
-    listener = Listener(node, TOPIC)
+    listener = Listener(node, TOPIC, None, ASKED)
     listener.received -= 100  # it waited that long
     for kinds[:] in (["std_msgs/msg/String", KIND], ["sr_robot_msgs/msg/BiotacAll"]):
         looks.clear()
@@ -187,12 +171,12 @@ def test_a_topic_that_comes_late_is_silent_from_then_on_and_one_in_a_type_that_c
     spinning.until(lambda: listener.subscription is not None)
     assert listener.kind == KIND and listener.subscription.msg_type is JointState
     spinning.node("finger").create_publisher(JointState, TOPIC, 10)
-    spinning.until(lambda: re.match(f"no reading for . s from the publisher of {TOPIC}", listener.absent()))
+    spinning.until(lambda: re.match(f"no reading for [0-9]+ s from the publisher of {TOPIC}", listener.absent()))
 
 
 def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkeypatch):
     monkeypatch.setattr(inputs, "WAITING", 3)
-    listener, taken = Listener(spinning.node("hand"), TOPIC, KIND), []
+    listener, taken = Listener(spinning.node("hand"), TOPIC, KIND, ASKED), []
 
     def take(*message):
         taken.append(message)
@@ -202,41 +186,30 @@ def test_messages_wait_for_their_taker_and_the_oldest_make_room(spinning, monkey
             listener.receive(i, {"source_timestamp": i * 10**9, "publication_sequence_number": i})
 
     receive(1, 2, 3, 5, 6)  # 4 was lost on its way, 1 and 2 had to make room
-    listener.start(take)
+    listener.give(take)
     receive(7)
     assert taken == [(3, 3.0, 2), (5, 5.0, 1), (6, 6.0, 0), (7, 7.0, 0)]
+    other = {"source_timestamp": 10**9, "publisher_gid": {"data": b"b"}}
+    for number in (1, 4):  # of another publisher
+        listener.receive(number, other | {"publication_sequence_number": number})
+    receive(8)
     listener.stop()
-    receive(8)  # nobody hears it
-    listener.start()
-    receive(9)  # it is heard anew, and what comes waits again
-    listener.start(take)
-    assert taken[4:] == [(9, 9.0, 0)]
+    receive(10)  # nobody hears it
+    assert taken[4:] == [(1, 1.0, 0), (4, 1.0, 2), (8, 8.0, 0)]
 
 
-@pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning")  # rclpy's own
-def test_a_quality_that_publishers_do_not_promise_is_named(spinning):
-    from rclpy.qos import qos_profile_sensor_data
-
-    node = spinning.node("hand")
-    with pytest.raises(errors.InputError, match="reliability as best_effort or reliable"):
-        Listener(node, TOPIC, quality=Quality(reliability="perfect"))
-    listener = Listener(node, TOPIC, KIND, Quality(reliability="reliable", depth=7))
-    spinning.node("driver").create_publisher(JointState, TOPIC, qos_profile_sensor_data)
-    spinning.until(lambda: "qos asks for reliability reliable, and less is promised" in listener.absent())
-
-
-def test_a_finger_that_is_taken_off_leaves_its_node_as_it_was(spinning, learner):
-    node = spinning.node("arm")
+def test_a_node_that_is_cleaned_up_or_not_configured_offers_what_it_did_before(tactile, learner):
+    node = tactile(learner, start=False, scene=["zinc"], risk=0.02)
 
     def stands():
-        services = {name for name, _ in node.get_service_names_and_types_by_node("arm", "/")}
-        return services, {each.topic_name for each in node.publishers}, set(node._parameters)
+        return {each.srv_name for each in node.services}, {each.topic_name for each in node.publishers}
 
     before = stands()
     with pytest.raises(errors.InputError, match="never observed"):
-        TactileNode(node, learner, TOPIC, "position", kind=KIND, scene=["zinc"], active=False)
+        node.start()
     assert stands() == before
-    served = TactileNode(node, learner, TOPIC, "position", kind=KIND, risk=0.02, scene=["a", "b"], active=False)
+    node.set_parameters([rclpy.parameter.Parameter("scene", value=["a", "b"])])
+    node.start()
     assert node.get_parameter("risk").value == 0.02 and stands() != before
-    served.close()
-    spinning.until(lambda: stands() == before)
+    node.clean_up()
+    assert stands() == before

@@ -412,7 +412,7 @@ def ros2(
     if context.args and (first := context.args[0]) != "--ros-args":
         how = GONE.get(first.lstrip("-"), "see --help. Options of ROS follow --ros-args")
         raise InputError(f"there is no option {first!r}: {how}")
-    from scroll_tactile.clients.ros2.serving import serve
+    from scroll_tactile.clients.ros2.node import serve
 
     parameters: dict[str, Any] = {"preset": preset, "type": kind, "risk": risk, "scene": scene, "contact": contact}
     parameters |= {"of": of, "watch": watch, "sensor": sensor}

@@ -229,9 +229,8 @@ class Bridge:
     @property
     def learned(self) -> Receipt | None:
         """What this bridge learned last, and nobody took back."""
-        while self._learned and self.learner.memory.is_gone(self._learned[-1].sequence):
-            self._learned.pop()
-        return self._learned[-1] if self._learned else None
+        left = [receipt for receipt in self._learned if not self.learner.memory.is_gone(receipt.sequence)]
+        return left[-1] if left else None
 
     # What services ask for. Each says what was done, is durable when it returns, and raises what the learner raises.
 

@@ -7,7 +7,7 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,21 +15,10 @@ from scroll_tactile.errors import FieldError, InputError, MissingLibraryError
 from scroll_tactile.libraries import install_line
 from scroll_tactile.recordings.paths import nearest
 
-__all__ = [
-    "DYNAMIC",
-    "PARAMETERS",
-    "Listener",
-    "Quality",
-    "declare",
-    "interface",
-    "names_in",
-    "require_rclpy",
-    "verdict",
-]
+__all__ = ["DYNAMIC", "PARAMETERS", "Listener", "interface", "names_in", "quality", "require_rclpy"]
 
 LOOKED = 0.2  # seconds between looks for a topic that is not there yet
 MISSED = 5.0  # seconds until the first warning about a missing or silent topic; each next wait is twice as long
-LONGEST = 600.0
 PICTURES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 DEEP, FEW = 2000, 120  # readings and pictures in the subscription's queue: two seconds at 1 kHz and at 60 Hz
 WAITING = 10_000  # messages that wait for their taker: ten seconds at 1 kHz, some tens of MB; of pictures FEW
@@ -78,92 +67,63 @@ def interface(name: str) -> Any:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the node: name, default and what it is for, as ROS shows them.
+    """A parameter of the node: its default and what it is for, as ROS shows them.
 
     choices: the texts that it can be. bounds: of a number, both included.
     """
 
-    name: str
     default: Any
     about: str
     choices: tuple[str, ...] = ()
     bounds: tuple[float, float] | None = None
 
-    def descriptor(self) -> Any:
-        """What ROS shows."""
-        made = interface("rcl_interfaces/msg/ParameterDescriptor")(name=self.name, description=self.about)
-        made.read_only, made.dynamic_typing = self.name == "autostart", self.name == "scene"
+    def descriptor(self, name: str) -> Any:
+        """What ROS shows of it under this name."""
+        made = interface("rcl_interfaces/msg/ParameterDescriptor")(name=name, description=self.about)
+        made.read_only, made.dynamic_typing = name == "autostart", name == "scene"
         made.additional_constraints = f"one of {', '.join(self.choices)}" if self.choices else ""
         if self.bounds is not None:
-            short = "floating_point_range" if isinstance(self.default, float) else "integer_range"
-            kind = interface(f"rcl_interfaces/msg/{short.title().replace('_', '')}")
-            low, high = (type(self.default)(bound) for bound in self.bounds)
-            setattr(made, short, [kind(from_value=low, to_value=high)])
+            short = "FloatingPoint" if isinstance(self.default, float) else "Integer"
+            bounds = interface(f"rcl_interfaces/msg/{short}Range")(from_value=self.bounds[0], to_value=self.bounds[1])
+            setattr(made, "floating_point_range" if short == "FloatingPoint" else "integer_range", [bounds])
         return made
 
-    def refused(self, value: object) -> str:
+    def refused(self, name: str, value: object) -> str:
         """Why it cannot have a value; "" where it can."""
         if self.choices and value not in self.choices:
-            return f"expected parameter {self.name} as {' or '.join(self.choices)}; came {value!r}"
-        if self.name == "risk" and not (isinstance(value, float) and 0 < value < 1):
+            return f"expected parameter {name} as {' or '.join(self.choices)}; came {value!r}"
+        if name == "risk" and not (isinstance(value, float) and 0 < value < 1):
             return f"expected parameter risk as a share of wrong answers between 0 and 1; came {value!r}"
-        try:
-            names_in(value if self.name == "scene" else "")
-        except InputError as error:
-            return f"parameter scene: {error}"
+        if name == "scene":
+            try:
+                names_in(value)
+            except InputError as error:
+                return f"parameter scene: {error}"
         return ""
 
 
-DYNAMIC = (
-    Parameter("risk", 0.05, "The share of wrong answers among those that are decided.", bounds=(0.0, 1.0)),
-    Parameter("scene", "", "The materials that can be here, a list of texts or one with commas; empty: all."),
-    Parameter("health_after", 0, "Count for the sensor's health only later observations.", bounds=(0, 2**62)),
-)
-"""Free to change at any time; risk and scene count from the next touch on."""
+DYNAMIC = ("risk", "scene", "health_after")
+"""The parameters that are free to change at any time; risk and scene count from the next touch on."""
 
-PARAMETERS = (
-    Parameter("memory", "", "The folder of the memory."),
-    Parameter("topic", "", "Where the readings are sent."),
-    Parameter("field", "", "The path to a message's numbers."),
-    Parameter("type", "", "The messages' type, as package/msg/Name; empty: what the topic says."),
-    Parameter("preset", "", "A known sensor, which gives sensor, topic and field: biotac, anyskin, digit …"),
-    Parameter("sensor", "", "Whose readings they are; needed only to make a new memory."),
-    Parameter("mode", "write", "Whether touches can be learned.", choices=("write", "read")),
-    Parameter("contact", "auto", "Who finds touches: auto, or the services begin and end.", choices=("auto", "manual")),
-    Parameter("of", "", "An axis of labels to answer by, in place of materials."),
-    Parameter("watch", False, "Note rest and known touches for the sensor's health, some hundred bytes each."),
-    *(
-        Parameter(f"qos.{name}", of[0], "What is asked of the publishers.", choices=of)
-        for name, of in QUALITIES.items()
-    ),
-    Parameter("qos.depth", 0, "Messages that may wait; 0: 2000, of pictures 120.", bounds=(0, 1_000_000)),
-    Parameter("autostart", True, "Configure and activate when the node starts."),
-    *DYNAMIC,
-)
-"""All of the node. Those that are not dynamic are read when it is configured; autostart once."""
-
-
-def declare(node: Any, parameters: Iterable[Parameter], values: Mapping[str, Any]) -> list[str]:
-    """Declare those that the node does not have yet, and return their names. values: defaults of this node, by name.
-
-    Raises InputError where ROS was started with a value of another type, or out of bounds.
-    """
-    new = [each for each in parameters if not node.has_parameter(each.name)]
-    for each in new:
-        try:
-            node.declare_parameter(each.name, values.get(each.name, each.default), each.descriptor())
-        except Exception as error:  # rclpy's own, whose place has changed from release to release
-            raise InputError(f"parameter {each.name}: {error}") from error
-        if why := each.refused(node.get_parameter(each.name).value):
-            raise InputError(why)
-    return [each.name for each in new]
-
-
-def verdict(parameters: Iterable[Parameter], values: Mapping[str, Any], why: str = "") -> Any:
-    """What ROS is told of values that are to be set, by name: why one of them cannot be, else `why`, or yes."""
-    reasons = [each.refused(values[each.name]) for each in parameters if each.name in values]
-    why = "; ".join(filter(None, reasons)) or why
-    return interface("rcl_interfaces/msg/SetParametersResult")(successful=not why, reason=why)
+PARAMETERS = {
+    "memory": Parameter("", "The folder of the memory."),
+    "topic": Parameter("", "Where the readings are sent."),
+    "field": Parameter("", "The path to a message's numbers."),
+    "type": Parameter("", "The messages' type, as package/msg/Name; empty: what the topic says."),
+    "preset": Parameter("", "A known sensor, which gives sensor, topic and field: biotac, anyskin, digit …"),
+    "sensor": Parameter("", "Whose readings they are; needed only to make a new memory."),
+    "mode": Parameter("write", "Whether touches can be learned.", choices=("write", "read")),
+    "contact": Parameter("auto", "Who finds touches: auto, or the services begin and end.", choices=("auto", "manual")),
+    "of": Parameter("", "An axis of labels to answer by, in place of materials."),
+    "watch": Parameter(False, "Note rest and known touches for the sensor's health, some hundred bytes each."),
+    **{f"qos.{name}": Parameter(of[0], "Asked of the publishers.", choices=of) for name, of in QUALITIES.items()},
+    "qos.depth": Parameter(0, "Messages that may wait; 0: 2000, of pictures 120.", bounds=(0, 1_000_000)),
+    "autostart": Parameter(True, "Configure and activate when the node starts."),
+    "risk": Parameter(0.05, "The share of wrong answers among those that are decided.", bounds=(0.0, 1.0)),
+    "scene": Parameter("", "The materials that can be here, a list of texts or one with commas; empty: all."),
+    "health_after": Parameter(0, "Count for the sensor's health only later observations.", bounds=(0, 2**62)),
+}
+"""All of the node, by name. Those that are not dynamic are read when it is configured; autostart once."""
 
 
 def names_in(value: object) -> list[str]:
@@ -174,31 +134,19 @@ def names_in(value: object) -> list[str]:
     return [name.strip() for text in found for name in text.split(",") if name.strip()]
 
 
-@dataclass(frozen=True)
-class Quality:
-    """The quality of service of a subscription.
+def quality(kind: str, reliability: str, durability: str, depth: int) -> Any:
+    """The quality of service of a subscription to messages of a kind, in rclpy's terms.
 
-    As it is, best effort and volatile, which any publisher can serve; but its queue holds two seconds of readings at
-    1 kHz, not five messages: while a touch is learned and its row reaches the disk no reading is taken, and a sensor at
-    1 kHz would overrun a queue of five in 5 ms. depth: messages that may wait; 0: 2000, or 120 pictures.
+    depth: messages that may wait; 0: 2000, or 120 pictures, two seconds of readings at 1 kHz and not five messages:
+    while a touch is learned and its row reaches the disk no reading is taken, and five are overrun in 5 ms.
     """
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-    reliability: str = "best_effort"
-    durability: str = "volatile"
-    depth: int = 0
-
-    def profile(self, kind: str) -> Any:
-        """The same in rclpy's terms, for messages of a kind. Raises InputError for a word that is none of them."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
-        for name, words in QUALITIES.items():
-            if getattr(self, name) not in words:
-                raise InputError(f"expected {name} as {' or '.join(words)}; came {getattr(self, name)!r}")
-        return QoSProfile(
-            depth=self.depth or (FEW if kind in PICTURES else DEEP),  # of the last that came
-            reliability=ReliabilityPolicy[self.reliability.upper()],
-            durability=DurabilityPolicy[self.durability.upper()],
-        )
+    return QoSProfile(
+        depth=depth or (FEW if kind in PICTURES else DEEP),  # of the last that came
+        reliability=ReliabilityPolicy[reliability.upper()],
+        durability=DurabilityPolicy[durability.upper()],
+    )
 
 
 class Listener:
@@ -209,17 +157,16 @@ class Listener:
     waits, the last 10 000 messages, or 120 pictures, so that a memory can be opened meanwhile.
 
     A topic that is not there, or silent, is named in a warning after 5, 10, 20 … seconds; one that appears later with
-    two types, or with one of a package that is missing, once.
+    two types, or with one of a package that is missing, once. asked: reliability, durability and depth, see `quality`.
 
-    Raises MissingLibraryError where a package of ROS is missing, InputError for a kind that is none, for a topic of two
-    types and for a quality that is none.
+    Raises MissingLibraryError where a package of ROS is missing, and InputError for a kind that is none and for a topic
+    of two types.
     """
 
-    def __init__(self, node: Any, topic: str, kind: str | None = None, quality: Quality | None = None) -> None:
-        self.node, self.kind, self._quality = node, kind, quality or Quality()
-        self._quality.profile("")  # or raises
+    def __init__(self, node: Any, topic: str, kind: str | None, asked: tuple[str, str, int]) -> None:
+        self.node, self.kind, self._asked = node, kind, asked
         self.topic = node.resolve_topic_name(topic)
-        self.received = self._reported = 0.0
+        self.received = time.monotonic()
         self.subscription: Any = None
         self._taker: Taker | None = None
         self._waiting: deque[tuple[Any, float, int]] = deque()
@@ -227,32 +174,24 @@ class Listener:
         self._numbers: dict[bytes, int] = {}  # of the last message of each publisher
         self._patience = MISSED
         self._said: set[str] = set()  # why there is no subscription yet
-        self._looking: Any = None
-        self._timer: Any = None
-        self.start()
+        self._look()
+        self._timer: Any = node.create_timer(LOOKED, self._look_again)
 
-    def start(self, taker: Taker | None = None) -> None:
-        """Hear the topic, anew after `stop`. A taker gets what waited, and from now on each message."""
-        if self._timer is None:
-            if not self._look():
-                self._looking = self.node.create_timer(LOOKED, self._look_again)
-            self.received, self._reported, self._numbers = time.monotonic(), time.monotonic(), {}
-            self._timer = self.node.create_timer(1.0, self._each_second)
-        self._taker = taker or self._taker
-        while self._waiting and self._taker is not None:  # a taker may stop it
+    def give(self, taker: Taker) -> None:
+        """Give a taker what waited, and from now on each message."""
+        self._taker = taker
+        while self._waiting:
             message, published, lost = self._waiting.popleft()
             lost, self._left_out = lost + self._left_out, 0
-            self._taker(message, published, lost)
+            taker(message, published, lost)
 
     def stop(self) -> None:
-        """Hear no more, and give no more; what waited is gone."""
-        for timer in filter(None, (self._looking, self._timer)):
-            self.node.destroy_timer(timer)
+        """Hear no more, and give no more: what is on its way is dropped."""
+        self._waiting.clear()
+        self._taker = lambda message, published, lost: None
+        self.node.destroy_timer(self._timer)
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
-        self._looking = self._timer = self.subscription = self._taker = None
-        self._waiting.clear()
-        self._left_out = 0
 
     def receive(self, message: Any, about: Mapping[str, Any]) -> None:
         """Take a message; about: what ROS says of it."""
@@ -261,10 +200,10 @@ class Listener:
         came = message, published / 1e9, self._lost(about)
         if self._taker is not None:
             self._taker(*came)
-        elif self._timer is not None:
-            self._waiting.append(came)
-            if len(self._waiting) > (FEW if self.kind in PICTURES else WAITING):
-                self._left_out += 1 + self._waiting.popleft()[2]
+            return
+        self._waiting.append(came)
+        if len(self._waiting) > (FEW if self.kind in PICTURES else WAITING):
+            self._left_out += 1 + self._waiting.popleft()[2]
 
     def _lost(self, about: Mapping[str, Any]) -> int:
         """How many messages were lost since the last of the same publisher, where the transport counts them."""
@@ -276,34 +215,29 @@ class Listener:
         self._numbers[publisher] = number
         return lost
 
-    def _look(self) -> bool:
-        """Subscribe, without a kind as soon as the topic is there; whether it is. Raises what the class does."""
+    def _look(self) -> None:
+        """Subscribe, without a kind as soon as the topic is there. Raises what the class does."""
         kinds = [self.kind] if self.kind else dict(self.node.get_topic_names_and_types()).get(self.topic, [])
         if len(kinds) > 1:
             raise InputError(f"topic {self.topic!r} is sent as {' and as '.join(kinds)}: say which, with --type")
         for kind in kinds:
             message, self.kind = interface(kind), kind
-            profile = self._quality.profile(kind)
+            profile = quality(kind, *self._asked)
             self.subscription = self.node.create_subscription(message, self.topic, self.receive, profile)
             self.node.get_logger().info(f"reading {self.topic}, {kind}")
             self.received = time.monotonic()  # it is silent from now on
-        return bool(kinds)
 
     def _look_again(self) -> None:
-        """Look from a timer, out of which an error would end the executor: warn of each once, and go on looking."""
-        try:
-            if self._look():
-                self.node.destroy_timer(self._looking)
-                self._looking = None
-        except InputError as error:
-            if str(error) not in self._said:
-                self._said.add(str(error))
-                self.node.get_logger().warning(f"{error}; it is not heard until then")
-
-    def _each_second(self) -> None:
-        now = time.monotonic()
-        if now - self.received > MISSED and now - self._reported > self._patience:
-            self._reported, self._patience = now, min(2 * self._patience, LONGEST)
+        """Look until the topic is there, and warn of what hinders it, once, and of silence."""
+        if self.subscription is None:
+            try:
+                self._look()
+            except InputError as error:  # out of a timer it would end the executor
+                if str(error) not in self._said:
+                    self._said.add(str(error))
+                    self.node.get_logger().warning(f"{error}; it is not heard until then")
+        if time.monotonic() - self.received > self._patience:
+            self._patience *= 2
             self.node.get_logger().warning(self.absent())
 
     def absent(self) -> str:
@@ -318,12 +252,4 @@ class Listener:
         kinds = sorted({each.topic_type for each in about})
         who, send = ("the publisher", "sends") if len(about) == 1 else (f"the {len(about)} publishers", "send")
         other = f", which {send} {' and '.join(kinds)} and not {self.kind}" * (self.kind not in kinds)
-        asked = self._quality.profile("")
-        less = [  # then nothing is ever delivered
-            f"{name} {strict}"
-            for name, (_, strict) in QUALITIES.items()
-            if getattr(self._quality, name) == strict
-            and all(getattr(each.qos_profile, name) != getattr(asked, name) for each in about)
-        ]
-        unfit = f": qos asks for {' and '.join(less)}, and less is promised" if less else ""
-        return f"{silent} from {who} of {self.topic}{other}{unfit}"
+        return f"{silent} from {who} of {self.topic}{other}"

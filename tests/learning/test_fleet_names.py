@@ -3,7 +3,6 @@
 import itertools
 import json
 import random
-import warnings
 
 import numpy as np
 import pytest
@@ -199,13 +198,6 @@ def test_it_is_of_the_first_source_whatever_the_workers_and_said_also_after_a_cu
     full(None)
     with pytest.warns(RangeWarning, match="91 % of the values"):
         run(tmp_path / "m", sources)
-
-
-def test_a_range_that_fits_is_not_spoken_of(tmp_path):
-    touch_files(tmp_path / "in", TOUCHES[:2])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert run(tmp_path / "m", [tmp_path / "in"]).range_problem is None
 
 
 def test_the_command_line_says_it_as_one_line(tmp_path, beyond):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from commands import run
 from forging import spoil_row
-from scroll_tactile.clients.learning.classification import observe_all
 from scroll_tactile_store import Store, StoreClosedError, StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
 from touches import SETTINGS, fed, filled, held, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.clients.learning.fleet import learn
+from scroll_tactile.clients.learning.metrics import observe_all
 from scroll_tactile.clients.learning.sources import SourceOptions
 from scroll_tactile.errors import AnnotationError
 from scroll_tactile.quantities import Quantity

@@ -393,6 +393,6 @@ class TestProcesses:
         monkeypatch.setattr(steps, "MOST_TRIES", 1)
         touch_files(tmp_path / "in", TOUCHES[:2])
         os.mkfifo(tmp_path / "in" / "a" / "stuck.csv")  # nobody ever writes it
-        done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=6.0, **SETTINGS)
+        done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=12.0, **SETTINGS)
         assert [each.source for each in done.refused] == [str(tmp_path / "in" / "a" / "stuck.csv")]
         assert done.observations == 2

@@ -64,8 +64,8 @@ def test_it_is_what_one_process_learns_and_refuses_whatever_the_workers(tmp_path
     assert [(each.source, each.why) for each in done.refused] == refused and len(refused) > 2
     with TactileLearner.open(tmp_path / "m") as learner, TactileLearner.open(tmp_path / "one") as one:
         assert seen(learner) == rows
-        held = [(name, key, t.rows.tobytes(), t.copies) for name, key, t in learner.memory.sample]
-        assert held == [(name, key, t.rows.tobytes(), t.copies) for name, key, t in one.memory.sample]
+        held = [(name, key, t.rows.tobytes()) for name, key, t in learner.memory.sample]
+        assert held == [(name, key, t.rows.tobytes()) for name, key, t in one.memory.sample]
         assert learner.exemplars == one.exemplars
 
 

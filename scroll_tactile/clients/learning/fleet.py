@@ -333,8 +333,8 @@ class Destination:
         descriptions: Choice,
     ) -> None:
         self._report, self._descriptions, self._made = report, descriptions, not place.exists()
-        asked = requested.recipe() if self._made else requested
-        self.learner = TactileLearner.open(place, **asked.arguments)
+        asked = requested.recipe().arguments if self._made else requested.arguments
+        self.learner = TactileLearner.open(place, **asked)
         stack.callback(lambda: remove_tree(place) if self.nothing_learned else None)
         stack.enter_context(self.learner)
         hush(self.learner)

@@ -53,7 +53,7 @@ def test_paths(tmp_path, monkeypatch, learner, path):
         ({"embedding": "kernels"}, r"Use Kernels\(\.\.\.\)$"),
         ({"embedding": Kernels}, r"Call it: Kernels\(\.\.\.\)$"),
         ({"embedding": 5}, "expected embedding as an embedding"),
-        ({"augmentation": 4}, "'augmentation' is no setting .* It left with 0.16"),
+        ({"augmentation": 4}, "'augmentation' is gone. A touch is learned as it was felt"),
         ({"false_alarms": "x"}, "expected false_alarms .*came 'x'"),
         ({"false_alarms": None}, "expected false_alarms"),
         ({"kept_touches": "x"}, "expected kept_touches"),

@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -66,7 +66,7 @@ BATCH = 32
 # Larger rates train faster away from what f has solved. Held out, with 400 exemplars of RoboSkin, f's log loss is
 # 0.171; f*'s is 0.151 with adapters' rates of 5e-6 and 5e-5, 0.159 with 1e-6. BioTac tells them apart: f 0.060, f*
 # 0.060 at 5e-6 and 0.073 at 5e-5, which had 92.0 % on the touches of the test where f has 99.5.
-RATES: dict[TuneMode, float] = {"head": 0.0, "adapters": 5e-6, "network": 3e-6}
+RATES: dict[TuneMode, float] = {"adapters": 5e-6, "network": 3e-6}
 HEAD_RATE = 3e-5  # in units of a feature's spread
 # A tenth of the touches is augmented, gently: at the strengths of offline training, where nothing else is known, f*
 # lost 2 to 3 points on clean touches more.
@@ -84,15 +84,13 @@ def fine_tune(
     epochs: int | None = None,
     seed: int = 0,
     device: str = "cpu",
-    mode: TuneMode | None = None,
     progress: Progress = lambda what, done, of: None,
 ) -> tuple[Tuned, TuneReport]:
     """Fine-tune on exemplars; the same arguments give the same bytes on the same device.
 
     model: of the memory that the exemplars come from. statistics: a copy of that memory's. extractor: as the exemplars
-    were observed with. epochs: the most, `EPOCHS` unless given; fewer are taken where
-    the exemplars held out say so. device: torch's name of one. mode: what to train; by the number of exemplars unless
-    given.
+    were observed with. epochs: the most, `EPOCHS` unless given; fewer are taken where the exemplars held out say so.
+    device: torch's name of one.
 
     Raises InputError for fewer than two materials, no exemplar long enough for the widest scale, or settings that
     cannot be; FineTuneError where the loss is not finite or the device is out of memory.
@@ -108,7 +106,8 @@ def fine_tune(
             f"expected exemplars of at least two materials of {model.plan.milestones()[-1]} columns or more; there "
             f"are some of {names}. Observe longer touches, or more materials"
         )
-    chosen = mode or _mode(touches, len(samples))
+    trained: TuneMode = "adapters" if len(samples) < WHOLE_NETWORK_FROM else "network"
+    chosen: TuneMode = trained if touches.tunable else "head"
     with repeatable(device), named_out_of_memory(device):
         spreads = touches.spreads(samples)
         trainer = Trainer(touches, spreads, most, seed, torch.device(device), chosen, progress)
@@ -133,8 +132,17 @@ def fine_tune_memory(
         model, ranked = predictor.fitted(), ranked_exemplars(memory, ledger.store)
         last_sequence, retractions = memory.sequence, memory.retractions
         statistics = copy.deepcopy(memory.statistics)
-    how: dict[str, Any] = {"epochs": epochs, "seed": seed, "device": device, "progress": progress}
-    tuned, report = fine_tune(predictor.recipe.embedding, model, statistics, ranked, extractor, **how)
+    tuned, report = fine_tune(
+        predictor.recipe.embedding,
+        model,
+        statistics,
+        ranked,
+        extractor,
+        epochs=epochs,
+        seed=seed,
+        device=device,
+        progress=progress,
+    )
     ledger.keep_tuned(tuned, memory, last_sequence, retractions)
     return report
 
@@ -152,20 +160,12 @@ def _require_settings(
             f"expected an exemplar of every material; the buffer has none of {without[:10]}. Make a new memory with "
             f"exemplars={len(names)} or more, or touch again what was observed before exemplars were kept"
         )
-    if len(exemplars) < 2:
-        raise InputError(f"expected at least two materials; the buffer has exemplars of {list(exemplars)} only")
     try:
         torch.zeros(1, dtype=torch.float64, device=torch.device(device)).item()
     except (RuntimeError, AssertionError, TypeError) as error:
         raise InputError(
             f"expected a device of torch's that computes in float64, such as cpu or cuda; came {device!r}: {error}"
         ) from error
-
-
-def _mode(touches: TouchFeatures, count: int) -> TuneMode:
-    if not touches.tunable:
-        return "head"
-    return "adapters" if count < WHOLE_NETWORK_FROM else "network"
 
 
 def _samples(
@@ -179,16 +179,13 @@ def _samples(
     if len(model.calibrations) < len(model.stages):  # nothing was observed for long enough
         return
     known = {name for name in model.names if all(name in model.readouts[s].places for s in model.stages[-1])}
-    total, done = sum(map(len, exemplars.values())), 0
-    for material, buffered in sorted(exemplars.items()):
-        for exemplar in buffered:
-            image = extractor.image(extractor.stream(exemplar.readings))
-            columns = image.shape[1]
-            if material in known and model.is_last(columns) and touches.reads(columns):
-                codes = extractor.codes(image)
-                yield TrainingSample(material, exemplar.key, image, touches.frozen(image), codes)
-            done += 1
-            progress("reading exemplars", done, total)
+    buffered = [(name, exemplar) for name in sorted(exemplars) for exemplar in exemplars[name]]
+    for done, (material, exemplar) in enumerate(buffered, start=1):
+        image = extractor.image(extractor.stream(exemplar.readings))
+        columns = image.shape[1]
+        if material in known and model.is_last(columns) and touches.reads(columns):
+            yield TrainingSample(material, exemplar.key, image, touches.frozen(image), extractor.codes(image))
+        progress("reading exemplars", done, len(buffered))
 
 
 @dataclass(frozen=True)
@@ -201,29 +198,25 @@ class _Score:
     losses: FloatArray
 
     @classmethod
-    def of(cls, folds: Sequence[tuple[FloatArray, npt.NDArray[np.intp]]], temperatures: FloatArray) -> _Score:
-        losses = np.concatenate([_losses(logits, targets, temperatures) for logits, targets in folds], axis=1)
+    def of(cls, folds: Sequence[tuple[FloatArray, npt.NDArray[np.intp]]]) -> _Score:
+        losses = np.concatenate([_losses(logits, targets) for logits, targets in folds], axis=1)
         wrong = sum(int((logits.argmax(axis=1) != targets).sum()) for logits, targets in folds)
         best = int(np.argmin(losses.mean(axis=1)))
-        return cls(float(losses[best].mean()), wrong / losses.shape[1], float(temperatures[best]), losses[best])
+        return cls(float(losses[best].mean()), wrong / losses.shape[1], float(TEMPERATURES[best]), losses[best])
 
 
-def _losses(logits: FloatArray, targets: npt.NDArray[np.intp], temperatures: FloatArray) -> FloatArray:
+def _losses(logits: FloatArray, targets: npt.NDArray[np.intp]) -> FloatArray:
     """Log loss (temperatures, touches)."""
-    heated = temperatures[:, None, None] * logits
-    losses: FloatArray = logsumexp(heated, axis=2) - heated[:, np.arange(len(targets)), targets]
-    return losses
+    heated = TEMPERATURES[:, None, None] * logits
+    return np.asarray(logsumexp(heated, axis=2) - heated[:, np.arange(len(targets)), targets])
 
 
 def _best(trials: list[Trained], before: list[Trained], most: int) -> tuple[int, float, dict[str, dict[str, float]]]:
     """The number of epochs and the temperature of least held-out loss, and what f and f* come to there."""
     if not trials:
         return most, 1.0, {}
-    f = _Score.of([(trial.logits[0], trial.targets) for trial in before], TEMPERATURES)
-    epochs = [
-        _Score.of([(trial.logits[i], trial.targets) for trial in trials], TEMPERATURES)
-        for i in range(len(trials[0].logits))
-    ]
+    f = _Score.of([(trial.logits[0], trial.targets) for trial in before])
+    epochs = [_Score.of([(trial.logits[i], trial.targets) for trial in trials]) for i in range(len(trials[0].logits))]
     best = min(range(len(epochs)), key=lambda i: epochs[i].loss)
     scores = {name: {"loss": score.loss, "wrong": score.wrong} for name, score in (("f", f), ("f*", epochs[best]))}
     gain = f.losses - epochs[best].losses
@@ -308,11 +301,12 @@ def fold_of(key: bytes) -> int:
 @contextmanager
 def repeatable(device: str) -> Iterator[None]:
     """One thread, no shortened floats, no algorithm whose sums depend on timing."""
-    with ExitStack() as stack:
-        stack.enter_context(one_torch_thread())
-        stack.enter_context(full_float32())
-        stack.enter_context(torch.autocast(torch.device(device).type, enabled=False))
-        stack.enter_context(torch.backends.cudnn.flags(deterministic=True, benchmark=False, allow_tf32=False))
+    with (
+        one_torch_thread(),
+        full_float32(),
+        torch.autocast(torch.device(device).type, enabled=False),
+        torch.backends.cudnn.flags(deterministic=True, benchmark=False, allow_tf32=False),
+    ):
         yield
 
 
@@ -362,8 +356,7 @@ class Trainer:
                 continue
             head = LinearHead(start, self.spreads).to(self.device)
             before.append(Trained([self._judge(head, None, test)], _targets(head, test), {}, start.bias, {}))
-            what = f"held out {fold + 1}/{FOLDS}"
-            trials.append(self.train(start, train, test, self.epochs, salt=fold, what=what))
+            trials.append(self.train(start, train, test, self.epochs, salt=fold, what=f"held out {fold + 1}/{FOLDS}"))
         return trials, before
 
     def train(
@@ -379,8 +372,14 @@ class Trainer:
         """Train for `until` epochs of a schedule of `epochs`, and test it after each."""
         random = np.random.default_rng([self.seed, salt])
         head = LinearHead(start, self.spreads).to(self.device)
-        net = None if self.mode == "head" else self._network()
-        optimiser, schedule = self._optimiser(head, net, -(-len(train) // BATCH) * self.epochs)
+        groups: list[dict[str, Any]] = [{"params": [*head.parameters()], "lr": HEAD_RATE}]
+        net = None if self.mode == "head" else self.touches.network().to(self.device)
+        if net is not None:
+            if self.mode == "adapters":
+                adapted(net)
+            groups.append({"params": [p for p in net.parameters() if p.requires_grad], "lr": RATES[self.mode]})
+        optimiser = torch.optim.AdamW(groups, weight_decay=0.0)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, -(-len(train) // BATCH) * self.epochs)
         logits = []
         for epoch in range(until):
             order = random.permutation(len(train))
@@ -397,22 +396,6 @@ class Trainer:
         if not all(np.isfinite(array).all() for array in arrays):
             raise FineTuneError(f"the weights are not finite after {what}: nothing was changed; take another seed")
         return Trained(logits, _targets(head, test), heads, bias, network)
-
-    def _network(self) -> Backbone:
-        net = adapted(self.touches.network()) if self.mode == "adapters" else self.touches.network()
-        return net.to(self.device)
-
-    def _optimiser(
-        self, head: LinearHead, net: Backbone | None, steps: int
-    ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-        groups: list[dict[str, Any]] = [
-            {"params": [*head.changes.values()], "lr": HEAD_RATE},
-            {"params": [head.offset], "lr": HEAD_RATE},
-        ]
-        if net is not None:
-            groups.append({"params": [p for p in net.parameters() if p.requires_grad], "lr": RATES[self.mode]})
-        optimiser = torch.optim.AdamW(groups, weight_decay=0.0)
-        return optimiser, torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
 
     def _augmented(self, sample: TrainingSample, random: np.random.Generator) -> TrainingSample:
         if random.random() >= AUGMENTED:
@@ -447,8 +430,7 @@ class Trainer:
                 head(self.touches.means(net, test[first : first + BATCH], self.device))
                 for first in range(0, len(test), BATCH)
             ]
-        logits: FloatArray = torch.cat(parts).cpu().numpy()
-        return logits
+        return np.asarray(torch.cat(parts).cpu())
 
 
 def _targets(head: LinearHead, samples: Sequence[TrainingSample]) -> npt.NDArray[np.intp]:
@@ -461,32 +443,28 @@ class LinearHead(nn.Module):
     def __init__(self, start: Start, spreads: Mapping[int, FloatArray]) -> None:
         super().__init__()
         self.names = start.names
-        self.scales = sorted(start.heads)
-        self.bases: dict[int, torch.Tensor] = {}
-        self.spreads: dict[int, torch.Tensor] = {}
-        self.changes = nn.ParameterDict()
-        for scale in self.scales:
-            self.bases[scale] = torch.from_numpy(start.heads[scale])
-            self.spreads[scale] = torch.from_numpy(1.0 / spreads[scale])[:, None]
-            self.changes[str(scale)] = nn.Parameter(torch.zeros(start.heads[scale].shape, dtype=torch.float64))
+        self.bases = {scale: torch.from_numpy(head) for scale, head in sorted(start.heads.items())}
+        self.spreads = {scale: torch.from_numpy(1.0 / spreads[scale])[:, None] for scale in self.bases}
+        self.changes = nn.ParameterDict(
+            {str(scale): nn.Parameter(torch.zeros_like(base)) for scale, base in self.bases.items()}
+        )
         self.bias = torch.from_numpy(start.bias)
         self.offset = nn.Parameter(torch.zeros(len(start.names), dtype=torch.float64))
 
     def weights(self, scale: int) -> torch.Tensor:
         """The weights of a scale, (d, C), before the temperature."""
         change = self.changes[str(scale)]
-        weights: torch.Tensor = self.bases[scale].to(change.device) + self.spreads[scale].to(change.device) * change
-        return weights
+        return self.bases[scale].to(change.device) + self.spreads[scale].to(change.device) * change
 
     def forward(self, means: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Logits (B, C) of mean features by scale, each (B, d)."""
         logits: torch.Tensor = self.bias.to(self.offset.device) + self.offset
-        for scale in self.scales:
+        for scale in self.bases:
             logits = logits + means[scale] @ self.weights(scale)
         return logits
 
     def arrays(self) -> tuple[dict[int, FloatArray], FloatArray]:
         """The weights by scale and the bias."""
         with torch.no_grad():
-            heads = {scale: self.weights(scale).cpu().numpy() for scale in self.scales}
+            heads = {scale: self.weights(scale).cpu().numpy() for scale in self.bases}
             return heads, (self.bias.to(self.offset.device) + self.offset).cpu().numpy()

@@ -61,8 +61,7 @@ class Backbone(nn.Module):
 
     def forward(self, images: torch.Tensor, windows: Sequence[tuple[int, int]]) -> torch.Tensor:
         """Features (B, windows, d) of images (B, C, T) at windows (first column, width)."""
-        features: torch.Tensor = self.twin(images.contiguous(), windows)
-        return features
+        return self.twin.forward(images.contiguous(), windows)
 
     def tensors(self) -> dict[str, npt.NDArray[np.float32]]:
         """The tensors that are trained, by name."""
@@ -98,8 +97,7 @@ class _Adapted(nn.Module):
         )
 
     def forward(self, planes: torch.Tensor) -> torch.Tensor:
-        both: torch.Tensor = self.conv(planes) + functional.conv2d(planes, self.alpha, stride=self.conv.stride)
-        return both
+        return self.conv.forward(planes) + functional.conv2d(planes, self.alpha, stride=self.conv.stride)
 
 
 def adapted(net: Backbone) -> Backbone:
@@ -216,17 +214,16 @@ class TunedReader:
     def __init__(self, embedding: Embedding, plan: WindowPlan, tuned: Tuned) -> None:
         self.tuned = tuned
         self._touches = TouchFeatures(embedding, plan)
-        self._net: Backbone | None = None
         judging = {int(scale) for scale in plan.judging(plan.milestones()[-1])}
         if set(tuned.heads) != judging or (tuned.mode != "head" and not self._touches.tunable):
             raise MismatchError(
                 f"f*, with heads of windows {sorted(tuned.heads)} and {tuned.mode!r} trained, is of another embedding "
                 f"than {embedding.name!r}: fine-tune again"
             )
-        if tuned.mode != "head":
-            self._net = self._touches.network()
+        self._net = None if tuned.mode == "head" else self._touches.network()
+        if self._net is not None:
             if tuned.mode == "adapters":
-                self._net = adapted(self._net)
+                adapted(self._net)
             self._net.put(tuned.network)
             self._net.requires_grad_(False)
 

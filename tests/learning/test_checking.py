@@ -49,7 +49,7 @@ def test_what_is_no_memory_is_refused_as_by_the_check_here(tmp_path):
 
 
 DEATHS = {
-    "a crash": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", r"died by signal 11 \(SIGSEGV\)"),
+    "a crash": ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", r"died by signal 11 \(Segmentation fault\)"),
     "an end": ("import os; os._exit(3)", "ended with code 3"),
     "a hang": ("import time; time.sleep(600)", "did not end within"),
     "all memory": ("bytearray(2**36)", "more memory than its size explains"),

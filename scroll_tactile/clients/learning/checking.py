@@ -45,7 +45,7 @@ REFUSALS = {
 
 
 def check_in_process(
-    path: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
+    path: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] = lambda what, done, of: None
 ) -> list[Problem]:
     """All that is wrong with the memory in folder `path`, as `store.check_store`; nothing for a sound one.
 
@@ -72,8 +72,7 @@ def check_in_process(
             for kind, content in _reports(process):
                 if kind == "progress":
                     doing = "verified {1} of {2} {0}".format(*content)
-                    if progress is not None:
-                        progress(*content)
+                    progress(*content)
                 elif kind == "problem":
                     problems.append(Problem(Path(content[0]), content[1], content[2]))
                 elif kind == "refused":
@@ -86,7 +85,9 @@ def check_in_process(
         finally:
             timer.cancel()
     if not ended:
-        how = f"did not end within {seconds:.0f} s" if expired.is_set() else _death(process.returncode)
+        code = process.returncode
+        died = f"died by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with code {code}"
+        how = f"did not end within {seconds:.0f} s" if expired.is_set() else died
         what = f"the check itself {how}, when it had {doing} of {folder}: what it was reading is not as it was written"
         problems.append(Problem(folder, what, "lost"))
     return problems
@@ -97,9 +98,14 @@ def _begun(folder: Path) -> subprocess.Popen[str]:
     # Not from the working directory: it may be the folder that came from elsewhere.
     imports = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path if entry)
     environment = os.environ | {"PYTHONPATH": imports, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-    nowhere = subprocess.DEVNULL
-    command = [sys.executable, "-P", "-m", __name__, str(folder)]
-    return subprocess.Popen(command, env=environment, stdin=nowhere, stdout=subprocess.PIPE, stderr=nowhere, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", __name__, str(folder)],
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
 
 
 def _reports(process: subprocess.Popen[str]) -> Iterator[tuple[str, Any]]:
@@ -107,14 +113,6 @@ def _reports(process: subprocess.Popen[str]) -> Iterator[tuple[str, Any]]:
         with suppress(ValueError):  # the last line of a process that died may be a half of one
             kind, content = json.loads(line)
             yield kind, content
-
-
-def _death(code: int) -> str:
-    if code >= 0:
-        return f"ended with code {code}"
-    with suppress(ValueError):
-        return f"died by signal {-code} ({signal.Signals(-code).name})"
-    return f"died by signal {-code}"
 
 
 def _report(kind: str, content: object) -> None:
@@ -149,11 +147,10 @@ def _check(folder: Path) -> None:
                 _report("problem", (str(folder), what, "lost"))
     except StoreError as error:
         _report("refused", (type(error).__name__, str(error)))
-    except MemoryError:
-        what = f"to check {folder} takes more memory than its size explains: it is not as it was written"
-        _report("problem", (str(folder), what, "lost"))
     except Exception as error:
         what = f"the check itself failed in {folder} ({type(error).__name__}: {error})"
+        if isinstance(error, MemoryError):
+            what = f"to check {folder} takes more memory than its size explains: it is not as it was written"
         _report("problem", (str(folder), what, "lost"))
     _report("end", None)
 

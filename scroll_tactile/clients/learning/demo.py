@@ -13,7 +13,8 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -86,10 +87,11 @@ class Demo:
     held_out: int = 4
     features: int = 504
     folder: Path | None = None
-    scene: Scene = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "scene", Scene(self.sensor, self.seed))
+    @cached_property
+    def scene(self) -> Scene:
+        """Where its touches come from."""
+        return Scene(self.sensor, self.seed)
 
     def run(self, report: Callable[[str], object] = lambda name: None) -> Outcome:
         """Learn and test; `report` receives every material when it is learned, those of an interrupted run first.
@@ -101,14 +103,10 @@ class Demo:
         plan: dict[str, Any] = {"run": "demo", "sensor": self.sensor.model_dump(mode="json"), "seed": self.seed}
         plan |= {name: getattr(self, name) for name in ("materials", "touches", "held_out", "features")}
         notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
-        with self._open() as learner:
+        how: dict[str, Any] = {"sensor": self.sensor, "embedding": Kernels(dimension=self.features)}
+        made = TactileLearner(**how) if self.folder is None else TactileLearner.open(self.folder / "memory", **how)
+        with made as learner:
             return self._learn(learner, notes, report)
-
-    def _open(self) -> TactileLearner:
-        embedding = Kernels(dimension=self.features)
-        if self.folder is None:
-            return TactileLearner(sensor=self.sensor, embedding=embedding)
-        return TactileLearner.open(self.folder / "memory", sensor=self.sensor, embedding=embedding)
 
     def _learn(self, learner: TactileLearner, notes: RunFile, report: Callable[[str], object]) -> Outcome:
         names = self.scene.materials[: self.materials]
@@ -130,12 +128,18 @@ class Demo:
         return Outcome(Half(**notes.notes["half"]), answers, first, short, observed, learner.digest())
 
     def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
-        right = evaluate(learner, self._held_out(learned)).accuracy
         answers = evaluate(learner, self._held_out(others))
         unknown = sum(answer.known is False for answer in answers.predictions)
         first = answers.predictions[0]
-        nearest = str(first.material)
-        return Half(right, unknown, len(answers.truth), answers.truth[0], nearest, first.novelty, first.known)
+        return Half(
+            right=evaluate(learner, self._held_out(learned)).accuracy,
+            unknown=unknown,
+            tested=len(answers.truth),
+            material=answers.truth[0],
+            nearest=str(first.material),
+            novelty=first.novelty,
+            known=first.known,
+        )
 
     def _held_out(self, names: Sequence[str]) -> list[Labelled]:
         return [touch for name in names for touch in self._touches(name, self.touches, self.held_out)]
@@ -162,12 +166,10 @@ def pull_the_plug(sensor: Sensor, seed: int) -> Unplugged:
     with tempfile.TemporaryDirectory(prefix="scroll-tactile-") as folder:
         place = Path(folder) / "memory"
         words = [sys.executable, "-m", __name__, str(place), sensor.model_dump_json(), str(seed)]
-        acknowledged = 0
         with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
             try:
                 assert process.stdout is not None
-                for _ in itertools.islice(process.stdout, ACKNOWLEDGED):
-                    acknowledged += 1
+                acknowledged = len(list(itertools.islice(process.stdout, ACKNOWLEDGED)))
             finally:
                 process.kill()
         with TactileLearner.open(place, mode="read") as left:

@@ -17,11 +17,13 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import accumulate
 from multiprocessing import get_all_start_methods, get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
@@ -37,7 +39,6 @@ from scroll_tactile.clients.learning.sources import (
     SourceOptions,
     fetched,
     find_sources,
-    has_touches,
     stored_source,
 )
 from scroll_tactile.clients.learning.steps import NOTES, LearnJob, Made, Making, Step, Steps, hush, learn_job
@@ -170,6 +171,8 @@ class _Run:
     ) -> None:
         self._steps, self._report, self._into, self._progress = steps, report, into, progress
         self._patience, self._total = into.making.patience, len(found)
+        # Seconds in which a job that was handed over is answered.
+        self._bound = math.inf if self._patience is None else QUEUED * self._patience + GRACE
         self._begun = time.perf_counter()
         self._answered = -math.inf
         report.sources = len(steps.learned & set(found))
@@ -192,10 +195,12 @@ class _Run:
             while steps.steps:
                 while steps.waiting and len(running) < engine.room:
                     step = steps.waiting.popleft()
-                    running[engine.submit(learn_job, steps.job(step.sources))] = step, time.monotonic()
+                    job = LearnJob(self._into.making, step.sources, str(steps.folder))
+                    running[engine.submit(learn_job, job)] = step, time.monotonic()
                 if self._come_in(steps.steps[0]):
                     continue
-                for future in wait(running, self._longest(running), FIRST_COMPLETED).done:
+                late = min(begun for _, begun in running.values()) + self._bound - time.monotonic()
+                for future in wait(running, min(max(0.0, late), threading.TIMEOUT_MAX), FIRST_COMPLETED).done:
                     self._answered = time.monotonic()
                     self._done(future, *running.pop(future))
                 self._give_up(engine, running)
@@ -222,7 +227,6 @@ class _Run:
     def _merge_made(self, step: Step, made: Made) -> bool:
         path = Path(made.path)
         try:
-            made.require_packed()
             refused = self._into.merge(path, self._merging, {bytes.fromhex(content) for content in made.clipped})
         except (StoreError, MismatchError) as error:
             if not _is_of(error, path):
@@ -233,7 +237,8 @@ class _Run:
         refusals = [Refused(str(head.attributes[SOURCE]), why) for head, why in refused]
         self._report.refused += [*made.refused, *refusals]
         self._report.repeated += made.repeated
-        step.failed = {*made.failed, *(step.source_of(head.sequence) for head, _ in refused)}
+        ends = [*accumulate(made.rows)]
+        step.failed = {*made.failed, *(step.sources[bisect_left(ends, head.sequence)] for head, _ in refused)}
         return True
 
     def _merge_memory(self, step: Step) -> None:
@@ -262,22 +267,11 @@ class _Run:
         failed = f", {refused} refused" if refused else ""
         self._progress(f"{count} touches, {count / seconds:.0f} a second{left}{failed}", done, self._total)
 
-    @property
-    def _bound(self) -> float:
-        """Seconds in which a job that was handed over is answered."""
-        return math.inf if self._patience is None else QUEUED * self._patience + GRACE
-
-    def _longest(self, running: Mapping[Future[Made], tuple[Step, float]]) -> float | None:
-        """Seconds until the first of these jobs is given up; None where nobody has a patience."""
-        if math.isinf(self._bound) or not running:
-            return None
-        return max(0.0, min(begun for _, begun in running.values()) + self._bound - time.monotonic())
-
     def _give_up(self, engine: Engine, running: dict[Future[Made], tuple[Step, float]]) -> None:
         """Hand jobs over again that nobody answers. Raises ScrollTactileError where nobody answers any."""
         before = time.monotonic() - self._bound
         late = [future for future, (_, begun) in running.items() if begun <= before and not future.done()]
-        if late and not engine.own and len(late) == len(running) and self._answered <= before:
+        if late and not isinstance(engine, Processes) and len(late) == len(running) and self._answered <= before:
             raise ScrollTactileError(
                 f"{engine.name} has answered no job for {self._bound:.0f} s: look whether it has workers, and whether "
                 f"they reach {self._steps.folder}. What was learned is kept: call again to go on"
@@ -321,7 +315,7 @@ def _is_of(error: Exception, path: Path) -> bool:
 
 
 class Destination:
-    """The memory that comes out: made when the first touches come in.
+    """The memory that comes out; it is removed again where nothing was learned into a new one.
 
     making: what it is made with. learned: whether it was there before the run, with touches.
 
@@ -338,45 +332,35 @@ class Destination:
         report: FleetReport,
         descriptions: Choice,
     ) -> None:
-        self._place, self._stack, self._report, self._descriptions = place, stack, report, descriptions
-        self.learner: TactileLearner | None = None
-        if place.exists():
-            self.learner = stack.enter_context(TactileLearner.open(place, **requested.arguments))
-            hush(self.learner)
-            if adaptations := self.learner.memory.corrections:  # workers learn apart from it
-                raise InputError(
-                    f"{place} was adapted to a changed skin by row {max(adaptations)}, of which the workers of a fleet "
-                    "know nothing: learn with scroll-tactile learn, or retract that row first"
-                )
-        there = {} if self.learner is None else self.learner.quantities
+        self._report, self._descriptions, self._made = report, descriptions, not place.exists()
+        asked = requested.recipe().arguments if self._made else requested.arguments
+        self.learner = TactileLearner.open(place, **asked)
+        stack.callback(lambda: remove_tree(place) if self.nothing_learned else None)
+        stack.enter_context(self.learner)
+        hush(self.learner)
+        if adaptations := self.learner.memory.corrections:  # workers learn apart from it
+            raise InputError(
+                f"{place} was adapted to a changed skin by row {max(adaptations)}, of which the workers of a fleet "
+                "know nothing: learn with scroll-tactile learn, or retract that row first"
+            )
         for quantity in options.declared:
-            require_declarable(there, quantity)
-        recipe = requested.recipe() if self.learner is None else self.learner._recipe
-        self.making = Making(recipe, options, patience, tuple(there.values()))
-        self.learned = self.learner is not None and bool(self.learner.observations())
-        self._made = self.learner is None
+            require_declarable(self.learner.quantities, quantity)
+        self.making = Making(self.learner._recipe, options, patience, tuple(self.learner.quantities.values()))
+        self.learned = bool(self.learner.observations())
 
-    def opened(self) -> TactileLearner:
-        """The memory, made where there is none."""
-        if self.learner is None:
-            self.learner = self._stack.enter_context(self.making.open(self._place))
-            hush(self.learner)
-        return self.learner
+    @property
+    def nothing_learned(self) -> bool:
+        """Whether it is new and has no touch yet."""
+        return self._made and not self.learner.materials
 
     def learn(self, step: Step, progress: Progress) -> None:
         """Learn the recordings of a step. Raises StoreError, CapacityError."""
-        options, recipe = self.making.options, self.making.recipe
-        if self.learner is None and not has_touches(recipe.sensor, step.sources, options, recipe.embedding):
-            learner = TactileLearner(sensor=recipe.sensor, embedding=recipe.embedding)  # for what is refused
-            hush(learner)
-        else:
-            learner = self.opened()
-        done = learn_sources(learner, step.sources, options, progress)
+        done = learn_sources(self.learner, step.sources, self.making.options, progress)
         step.made, step.failed = Made("", range_problem=done.range_problem), done.failed
         self._report.observations += done.learned.total()
         self._report.repeated += done.skipped
         self._report.refused += done.refused
-        self._save()
+        self.learner._ledger.checkpoint_in_background(SAVED_EVERY)
 
     def merge(
         self, path: Path, progress: Progress, clipped: Collection[bytes] = (), source: str | None = None
@@ -384,7 +368,7 @@ class Destination:
         """Merge a memory, each touch once; its rows that are refused, and why. Raises as `Ledger.merge`."""
         begun, processor = time.perf_counter(), time.process_time()
         try:
-            ledger = self.opened()._ledger
+            ledger = self.learner._ledger
             # What our own workers made is taken as what this memory holds itself.
             rules = MergeRules(
                 one_name=True,
@@ -394,7 +378,7 @@ class Destination:
                 thorough=source is not None,
             )
             merged, refused = ledger.merge(path, rules, progress)
-            self._save()
+            ledger.checkpoint_in_background(SAVED_EVERY)
         finally:
             self._report.merging += time.perf_counter() - begun
             self._report.processor["merging"] += time.process_time() - processor
@@ -402,20 +386,12 @@ class Destination:
         self._report.repeated += merged.shared
         return refused
 
-    def _save(self) -> None:
-        ledger = None if self.learner is None else self.learner._ledger
-        if ledger is not None:
-            ledger.checkpoint_in_background(SAVED_EVERY)
-
     def close(self, progress: Progress) -> None:
         """Write a checkpoint and a fitted model, and close it.
 
-        Raises InputError where nothing was learned; it is not there then.
+        Raises InputError where nothing was learned.
         """
-        if self.learner is None or (self._made and not self.learner.memory.sequence):
-            if self.learner is not None:
-                self.learner.close()
-                remove_tree(self._place)
+        if self.nothing_learned:
             refused = self._report.refused
             first = f", such as {refused[0].source}: {refused[0].why}" if refused else ""
             raise InputError(f"nothing was learned, and no memory made: {len(refused)} sources were refused{first}")
@@ -428,14 +404,13 @@ class Destination:
 class Engine:
     """Who runs the jobs: an Executor of the caller's.
 
-    workers: how many jobs run at once, as far as is known. room: how many are handed over at once. own: whether they
-    are processes of ours, which can be ended.
+    workers: how many jobs run at once, as far as is known. room: how many are handed over at once. name: of what runs
+    them.
     """
-
-    own = False
 
     def __init__(self, executor: Executor, workers: int) -> None:
         self._executor, self.workers, self.room = executor, workers, 2 * workers
+        self.name = type(executor).__name__
 
     def submit(self, what: Callable[[Any], Made], job: LearnJob) -> Future[Made]:
         """Have a job done; the future raises where it could not be."""
@@ -444,11 +419,6 @@ class Engine:
     def abandon(self, future: Future[Made]) -> None:
         """Wait no longer for a job."""
         future.cancel()
-
-    @property
-    def name(self) -> str:
-        """What runs the jobs."""
-        return type(self._executor).__name__
 
     def __enter__(self) -> Engine:
         return self
@@ -459,8 +429,6 @@ class Engine:
 
 class Processes(Engine):
     """So many processes, each a pool of its own: one that dies takes nobody else's job with it."""
-
-    own = True
 
     def __init__(self, workers: int) -> None:
         self.workers = self.room = workers

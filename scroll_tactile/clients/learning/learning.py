@@ -307,8 +307,7 @@ def evaluate_sources(
             known = bool(learner.names_of(touch.stream))
             seen += known
             if with_learned or not known:
-                own = _answered(learner, touch) if of is None else Answered(touch, learner.predict(touch.stream, of=of))
-                answered.append(own)
+                answered.append(_answered(learner, touch, of=of))
     learned = frozenset(learner.materials if of is None else learner.axes[of])
     return Evaluation(tuple(answered), tuple(refused), learned, seen, of, unlabelled)
 

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,6 @@ __all__ = [
     "evaluate",
     "interval_figures",
     "mean_and_spread",
-    "missing",
     "observe_all",
 ]
 
@@ -52,11 +51,6 @@ class Answers:
         """The share of right answers."""
         return accuracy(self.truth, self.predicted)
 
-    def of(self, material: str) -> Answers:
-        """The answers to streams of one material."""
-        places = [i for i, name in enumerate(self.truth) if name == material]
-        return Answers([material] * len(places), [self.predictions[i] for i in places])
-
     def confusions(self) -> list[tuple[str, str, int]]:
         """(truth, predicted, count) of what was taken for something else, the most frequent first."""
         pairs = Counter(
@@ -73,36 +67,27 @@ def evaluate(learner: TactileLearner, touches: Sequence[Labelled], *, seconds: f
     return Answers([name for name, _ in cut], [learner.predict(stream) for _, stream in cut])
 
 
-def missing(touches: Sequence[Labelled], observed: Mapping[str, int]) -> list[Labelled]:
-    """Those of `touches` that a memory has still to observe, given how many of each material it has observed.
+def observe_all(learner: TactileLearner, touches: Sequence[Labelled]) -> int:
+    """Observe, in order, those that the memory does not hold yet; returns how many.
 
     A memory that was filled in this very order and interrupted holds the first few of every material.
 
     Raises InputError where it holds more than these touches: it is another pass's.
     """
-    planned = Counter(name for name, _ in touches)
-    extra = {name: count for name, count in observed.items() if count > planned[name]}
+    left, planned, observed = dict(learner.materials), Counter(name for name, _ in touches), 0
+    extra = {name: count for name, count in left.items() if count > planned[name]}
     if extra:
         raise InputError(
             f"expected a memory that this run began; it holds more than the run would train it on: {extra}. "
             "Take another folder"
         )
-    left = dict(observed)
-    remaining = []
     for name, stream in touches:
         if left.get(name, 0):
             left[name] -= 1
         else:
-            remaining.append((name, stream))
-    return remaining
-
-
-def observe_all(learner: TactileLearner, touches: Sequence[Labelled]) -> int:
-    """Observe, in order, those that the memory does not hold yet; returns how many."""
-    remaining = missing(touches, learner.materials)
-    for name, stream in remaining:
-        learner.observe(name, stream)
-    return len(remaining)
+            learner.observe(name, stream)
+            observed += 1
+    return observed
 
 
 def accuracy(truth: Sequence[str | None], predicted: Sequence[str | None]) -> float:

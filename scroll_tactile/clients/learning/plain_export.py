@@ -70,7 +70,8 @@ def export_plain(
 
 
 def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, int], object]) -> None:
-    held, journal = _one_state(learner)
+    with learner._ledger.lock:  # whatever is observed meanwhile, both are of one state
+        held, journal = copy.deepcopy(learner), learner.observations()
     if learner.path is not None:
         progress("observations", 0, 1)
         header, rows = _observed(held.quantities, journal)
@@ -107,14 +108,6 @@ def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, 
     (target / "memory.json").write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _one_state(learner: TactileLearner) -> tuple[TactileLearner, list[Observation]]:
-    """A snapshot and the journal of the same state, whatever is observed meanwhile."""
-    while True:
-        held, journal = copy.deepcopy(learner), learner.observations()
-        if learner.memory.sequence == held.memory.sequence:
-            return held, journal
-
-
 def date_of(seconds: float) -> str | float:
     """A moment in seconds since 1970 as ISO 8601, UTC; the number where no calendar has it."""
     try:
@@ -126,9 +119,8 @@ def date_of(seconds: float) -> str | float:
 def _observed(quantities: Mapping[str, Quantity], journal: Sequence[Observation]) -> tuple[list[str], list[list[Any]]]:
     """The heading and the rows of the table of observations."""
     axes = sorted({axis for row in journal for axis in row.labels})
-    header = ["sequence", "material", "key", "time", "state", "source"]
-    header += [*map(str, quantities.values()), *(f"{axis} [label]" for axis in axes)]
-    return header, [
+    noted = [*map(str, quantities.values()), *(f"{axis} [label]" for axis in axes)]
+    return ["sequence", "material", "key", "time", "state", "source", *noted], [
         [
             *(row.sequence, row.material, row.key.hex(), date_of(row.time), row.state, row.source or ""),
             *(row.values.get(name, "") for name in quantities),
@@ -139,31 +131,28 @@ def _observed(quantities: Mapping[str, Quantity], journal: Sequence[Observation]
 
 
 def _described(descriptions: Mapping[str, Description]) -> list[list[Any]]:
-    def present(value: float | bool | None) -> str:
-        return "unknown" if value is None else "yes" if value else "no"
-
     return [
-        [material, name, present(value), value if isinstance(value, float) else ""]
+        [
+            *(material, name, "unknown" if value is None else "yes" if value else "no"),
+            value if isinstance(value, float) else "",
+        ]
         for material, description in descriptions.items()
         for name, value in constituents_of(description).items()
     ]
 
 
 def _arrays(statistics: Statistics) -> dict[str, npt.NDArray[Any]]:
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    names = sorted(statistics.materials)
-    arrays["materials"] = np.array(names, dtype=np.str_)
-    dimension = statistics.dimension
+    names, dimension = sorted(statistics.materials), statistics.dimension
+    arrays: dict[str, npt.NDArray[Any]] = {"materials": np.array(names, dtype=np.str_)}
     lower = np.tril_indices(dimension)
     for scale in statistics.scales:
-        known = statistics.names(scale)
-        places = [names.index(name) for name in known]
+        places = [names.index(name) for name in statistics.names(scale)]
         counts, sums = np.zeros(len(names), np.int64), np.zeros((len(names), dimension), np.int64)
         counts[places], sums[places] = statistics.totals(scale)
         second = np.zeros((dimension, dimension), np.int64)
         second[lower] = statistics.second(scale).packed()
-        arrays |= {f"counts-{scale}": counts, f"sums-{scale}": sums}
-        arrays[f"second-{scale}"] = second + np.tril(second, -1).T
+        whole = second + np.tril(second, -1).T
+        arrays |= {f"counts-{scale}": counts, f"sums-{scale}": sums, f"second-{scale}": whole}
     return arrays
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,6 @@ else:
 __all__ = ["RunFile", "alone_in"]
 
 _FORMAT = 1
-BEGIN = "Move its folder away to begin anew"
-TRIES = 100  # to lock a folder that others remove as they end
 
 
 class RunFile:
@@ -42,8 +40,6 @@ class RunFile:
         self.notes: dict[str, Any] = {}
         if path is None:
             return
-        if path.parent.exists() and not path.parent.is_dir():
-            raise InputError(f"expected a folder for the memory; {path.parent} is a file")
         if path.exists():
             self.notes = self._read(path)
         elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:
@@ -52,21 +48,17 @@ class RunFile:
                 "move this one away"
             )
         else:
-            self._write()
+            self._write(path)
 
     def _read(self, path: Path) -> dict[str, Any]:
-        if not path.is_file():  # a pipe would be waited for
-            raise InputError(f"expected the notes of a run in {path}; it is no file: move it away")
         try:
             kept = json.loads(path.read_text(encoding="utf-8"))
-            plan, notes = kept["plan"], kept["notes"]
-            version = kept["format"]
+            version, plan, notes = kept["format"], dict(kept["plan"]), dict(kept["notes"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
-                f"expected the notes of a run in {path}; they cannot be read: {error!r:.200}. {BEGIN}"
+                f"expected the notes of a run in {path}; they cannot be read: {error!r:.200}. Move its folder away "
+                "to begin anew"
             ) from error
-        if not isinstance(plan, dict):
-            raise InputError(f"expected the notes of a run in {path}; its plan is a {type(plan).__name__}. {BEGIN}")
         if version != _FORMAT:
             raise InputError(f"{path} was written in format {version}; this version reads {_FORMAT}")
         differing = [
@@ -79,29 +71,26 @@ class RunFile:
                 f"{path.parent} belongs to another run ({'; '.join(differing)}). Ask for the same, take another "
                 "folder, or move this one away to begin anew"
             )
-        if not isinstance(notes, dict):
-            raise InputError(f"expected the notes of a run in {path}; they are a {type(notes).__name__}. {BEGIN}")
         return notes
 
     def note(self, name: str, value: Any) -> None:
         """Keep a value, in JSON's types, under a name; it is on disk when this returns."""
         self.notes[name] = value
         if self.path is not None:
-            self._write()
+            self._write(self.path)
 
-    def _write(self) -> None:
-        assert self.path is not None
+    def _write(self, path: Path) -> None:
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            draft = _draft(self.path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            draft = _draft(path)
             with new_file(draft, "w") as file:  # a link that came with a folder of others leads to any file
                 json.dump({"format": _FORMAT, "plan": self.plan, "notes": self.notes}, file, indent=1)
                 file.flush()
                 os.fsync(file.fileno())
-            draft.replace(self.path)
+            draft.replace(path)
         except OSError as error:
             raise InputError(
-                f"{self.path} cannot be written: {error.strerror}. What was noted before is kept: make room, or take "
+                f"{path} cannot be written: {error.strerror}. What was noted before is kept: make room, or take "
                 "another folder, and start again"
             ) from error
 
@@ -110,43 +99,23 @@ class RunFile:
 def alone_in(folder: Path, destination: Path) -> Iterator[None]:
     """Keep other runs out of the folder of one, which is made; where the system has no locks nothing does.
 
-    An empty folder is removed again. Raises LockedError where another run is in it, for this destination.
+    Raises LockedError where another run is in it, for this destination.
     """
-    descriptor = _locked(folder, destination)
-    try:
-        yield
-    finally:
-        if descriptor is not None:
-            with suppress(OSError):
-                folder.rmdir()
-            os.close(descriptor)
-
-
-def _locked(folder: Path, destination: Path) -> int | None:
-    """The folder, made and locked; None where that cannot be. Raises LockedError."""
-    descriptor = None
-    for _ in range(TRIES):
-        with suppress(OSError):  # what is wrong with it is raised where notes are written
+    with ExitStack() as stack:
+        try:
             folder.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(folder, os.O_RDONLY)
-        if descriptor is None or flock is None:
-            break
-        try:
-            flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            stack.callback(os.close, descriptor)
+            if flock is not None:
+                flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            os.close(descriptor)
             raise LockedError(
                 f"another run is at work for {destination}, in {folder}: wait until it has ended, or take another "
                 "destination"
             ) from error
-        except OSError:
-            break
-        with suppress(OSError):  # where it is not there, another run ended meanwhile, and removed it
-            if os.path.samestat(os.fstat(descriptor), folder.stat()):
-                break
-        os.close(descriptor)
-        descriptor = None
-    return descriptor
+        except OSError:  # what is wrong with the folder is raised where notes are written
+            pass
+        yield
 
 
 def _draft(path: Path) -> Path:

@@ -108,7 +108,7 @@ class SourceOptions:
     def declared(self) -> list[Quantity]:
         """All quantities that are declared before anything is learned."""
         of_columns = (Heading.parsed(text).quantity for text in self.annotate)
-        return [*self.quantities, *(quantity for quantity in of_columns if quantity is not None)]
+        return [*self.quantities, *filter(None, of_columns)]
 
     def touches_in(self, address: str, learner: TactileLearner) -> tuple[Recording, tuple[Touch, ...]]:
         """A source and the touches in it; raises what `recordings.read` and `recordings.touches` raise."""
@@ -201,8 +201,8 @@ def source_touches(
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
             stream = learner.stream(part.stream(learner.sensor))
             noted = Noted(touch.values, touch.labels) + noted_in(recording.annotations, touch.begin, touch.end)
-            values, name = _values(noted, learner.quantities), material if material is None else require_name(material)
-            yield SourceTouch(source, name, stream, values, dict(noted.labels))
+            name = None if material is None else require_name(material)
+            yield SourceTouch(source, name, stream, _values(noted, learner.quantities), dict(noted.labels))
         except (InputError, SensorMismatchError) as error:
             yield Refused.by(error, source)
 

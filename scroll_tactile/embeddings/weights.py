@@ -174,7 +174,7 @@ def _read_safetensors(path: Path) -> Tensors:
         from safetensors import SafetensorError
         from safetensors.torch import load_file
     try:
-        return cast(Tensors, load_file(path))
+        return load_file(path)
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise WeightsError(f"{path} cannot be read as safetensors: {error}. It is damaged or cut off") from error
 

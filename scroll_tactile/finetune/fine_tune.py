@@ -454,7 +454,8 @@ class LinearHead(nn.Module):
     def weights(self, scale: int) -> torch.Tensor:
         """The weights of a scale, (d, C), before the temperature."""
         change = self.changes[str(scale)]
-        return self.bases[scale].to(change.device) + self.spreads[scale].to(change.device) * change
+        moved: torch.Tensor = self.spreads[scale].to(change.device) * change
+        return self.bases[scale].to(change.device) + moved
 
     def forward(self, means: Mapping[int, torch.Tensor]) -> torch.Tensor:
         """Logits (B, C) of mean features by scale, each (B, d)."""

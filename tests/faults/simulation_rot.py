@@ -13,7 +13,7 @@ from scroll_tactile_store.layout import DERIVED, read_current
 
 from faults.cases import Wrong
 from faults.learners import KIT, perform
-from faults.model import State
+from faults.model import State, after
 from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
 from faults.simulation_events import OneMemory
 from faults.simulation_world import Machine
@@ -138,20 +138,25 @@ class Rotting(OneMemory):
             raise Wrong(f"a repair after one bit of {hurt.name} left out rows {unlisted}")
         # A row of another kind may be left out, too, such as one that took another back.
         if unlisted or compacted > whole.compacted or heads < rows.last:
-            self._with_less(machine, rows)
+            self._with_less(machine, rows, unlisted)
             return
         machine.candidates, machine.begins = [rows], []
 
-    def _with_less(self, machine: Machine, rows: State) -> None:
-        """A memory of which a repair left less knows still what it learned, and learns on."""
+    def _with_less(self, machine: Machine, rows: State, unlisted: set[int]) -> None:
+        """A memory of which a repair left less knows still what it learned, and learns on.
+
+        unlisted: the observations that were left out.
+        """
         self.counts["rot: repaired, with less"] += 1
         learner = self.open(machine, machine.path, [rows])
         try:
-            for candidate in (rows, rows.plus(("observe", KIT.materials[0], 0))):
-                if candidate is not rows:
-                    perform(learner, ("observe", KIT.materials[0], 0), machine.path)
-                machine.candidates = [candidate]
-                self.look(machine, learner, "repaired with less", but=("listed", "names", *KEPT))
+            touch, but = ("observe", KIT.materials[0], 0), ("listed", "names", *KEPT)
+            machine.candidates = [rows]
+            self.look(machine, learner, "repaired with less", but=but)
+            perform(learner, touch, machine.path)
+            # A touch whose row was left out is not known any more, and is learned again.
+            machine.candidates = [after(rows, touch, {})[0], *([rows.plus(touch)] if unlisted else [])]
+            self.look(machine, learner, "learning on", but=but)
         finally:
             abandon(learner)
         self._replace(machine)  # nothing of this was written down

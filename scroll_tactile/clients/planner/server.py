@@ -18,7 +18,7 @@ from pydantic_core import from_json
 from scroll_tactile_store import StoreError
 
 from scroll_tactile import __version__
-from scroll_tactile.clients.report.facts import MemoryFacts
+from scroll_tactile.clients.report.facts import MemoryFacts, mistakes
 from scroll_tactile.errors import InputError, ObservationError, ScrollTactileError
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner
@@ -172,7 +172,7 @@ class _Tools:
         """Say which materials are worth touching again, and why: mixed up with others, or hardly touched."""
         facts = MemoryFacts(self.learner, risk=0.05)
         why: dict[str, list[str]] = {}
-        for one in facts.mistakes:
+        for one in mistakes(facts.held_out):
             said = f"{one.count} of {one.tested} of its touches, held out, were taken for {one.answer}"
             why.setdefault(one.material, []).append(said)
         for name, count in sorted(facts.counts.items(), key=lambda pair: (pair[1], pair[0])):

@@ -98,7 +98,19 @@ def channels_of(
             fault = "drifting"
         missing = "missing readings" if own[MISSING] >= SATURATED * max(own.sum(), 1) else ""
         faults = [each for each in (fault, missing) if each]
-        found.append(ChannelSummary(i, *places, float(always[i]), bottom, top, moved, faults))
+        found.append(
+            ChannelSummary(
+                number=i,
+                middle=places[0],
+                low=places[1],
+                high=places[2],
+                still=float(always[i]),
+                bottom=bottom,
+                top=top,
+                drift=moved,
+                faults=faults,
+            )
+        )
     return found
 
 

@@ -116,8 +116,19 @@ def fine_tune(
         final = trainer.train(start_of(model, names), samples, [], best, salt=FOLDS)
     kept, reason = _verdict(scores)
     heads = {scale: head * temperature for scale, head in final.heads.items()}
-    tuned = Tuned(names, heads, final.bias * temperature, final.network, chosen, kept)
-    report = TuneReport(kept, reason, chosen, len(samples), best, scores, time.perf_counter() - begun, tuned.digest())
+    tuned = Tuned(
+        names=names, heads=heads, bias=final.bias * temperature, network=final.network, mode=chosen, kept=kept
+    )
+    report = TuneReport(
+        kept=kept,
+        reason=reason,
+        mode=chosen,
+        exemplars=len(samples),
+        epochs=best,
+        held_out=scores,
+        seconds=time.perf_counter() - begun,
+        digest=tuned.digest(),
+    )
     return replace(tuned, report=Tuned.described(report)), report
 
 
@@ -355,7 +366,15 @@ class Trainer:
             if len(start.names) < 2 or not train or not test:
                 continue
             head = LinearHead(start, self.spreads).to(self.device)
-            before.append(Trained([self._judge(head, None, test)], _targets(head, test), {}, start.bias, {}))
+            before.append(
+                Trained(
+                    logits=[self._judge(head, None, test)],
+                    targets=_targets(head, test),
+                    heads={},
+                    bias=start.bias,
+                    network={},
+                )
+            )
             trials.append(self.train(start, train, test, self.epochs, salt=fold, what=f"held out {fold + 1}/{FOLDS}"))
         return trials, before
 
@@ -395,7 +414,7 @@ class Trainer:
         arrays: list[npt.NDArray[Any]] = [bias, *heads.values(), *network.values()]
         if not all(np.isfinite(array).all() for array in arrays):
             raise FineTuneError(f"the weights are not finite after {what}: nothing was changed; take another seed")
-        return Trained(logits, _targets(head, test), heads, bias, network)
+        return Trained(logits=logits, targets=_targets(head, test), heads=heads, bias=bias, network=network)
 
     def _augmented(self, sample: TrainingSample, random: np.random.Generator) -> TrainingSample:
         if random.random() >= AUGMENTED:

@@ -213,7 +213,13 @@ def exemplars_from_arrays(arrays: Arrays, about: Mapping[str, Any]) -> list[Exem
     readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
     rows = zip(arrays["exemplar-keys"], readings, arrays["exemplar-codes"], arrays["exemplar-scales"], strict=False)
     return [
-        Exemplar(material, key.tobytes(), {"readings": stream}, code, Scale.numbered(int(scale)))
+        Exemplar(
+            material=material,
+            key=key.tobytes(),
+            packed={"readings": stream},
+            code=code,
+            scale=Scale.numbered(int(scale)),
+        )
         for material, (key, stream, code, scale) in zip(about["materials"], rows, strict=True)
     ]
 

@@ -74,7 +74,15 @@ class Ledger(OpenMemory):
 
     def _receipt(self, sequence: int, material: str, stream: Stream, *, repeated: bool = False) -> Receipt:
         durable = self.store is not None and not self._batching
-        return Receipt(sequence, material, stream.key, stream.seconds, stream.clipped, durable, repeated)
+        return Receipt(
+            sequence=sequence,
+            material=material,
+            key=stream.key,
+            seconds=stream.seconds,
+            clipped=stream.clipped,
+            durable=durable,
+            repeated=repeated,
+        )
 
     def observe(
         self,

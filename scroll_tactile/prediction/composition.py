@@ -224,11 +224,11 @@ class Composer:
         evidence = sorted((item for item in having if item[1] > 0), key=lambda item: (-item[1], item[0]))
         presence, share = heads.presence[name], heads.share[name]
         return Constituent(
-            name,
-            weighed(presence, target.presence),
-            weighed(share, target.share),
-            tuple(evidence[:MOST_EVIDENCE]),
-            presence if isinstance(presence, str) else "",
+            name=name,
+            presence=weighed(presence, target.presence),
+            share=weighed(share, target.share),
+            evidence=tuple(evidence[:MOST_EVIDENCE]),
+            unlearned=presence if isinstance(presence, str) else "",
         )
 
 

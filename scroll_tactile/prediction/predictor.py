@@ -169,7 +169,10 @@ class Predictor:
         def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Composition]:
             wanted = require_constituents(self.ledger.memory.descriptions, constituents)
             if not model.names:
-                nothing = tuple(Constituent(name, None, None, (), "nothing was observed yet") for name in wanted)
+                nothing = tuple(
+                    Constituent(name=name, presence=None, share=None, evidence=(), unlearned="nothing was observed yet")
+                    for name in wanted
+                )
                 return lambda: Composition(nothing, 1.0, nothing_known(touch.seconds))
             composer = self.current.composer(self.ledger, model)
             scales_for = _scales_for([(model, model.names)], composer)

@@ -256,7 +256,9 @@ def _interval(
     if files is not None and not any(_same(file, source) for source in files):
         raise InputError(f"{where}: {file!r} is none of the recordings{nearest(file, files)}")
     noted = _noted(where, cells, headings)
-    return Interval(file, begin, end, material, row, noted.values, noted.labels)
+    return Interval(
+        file=file, begin=begin, end=end, material=material, row=row, values=noted.values, labels=noted.labels
+    )
 
 
 def _noted(where: str, cells: dict[str, str], headings: dict[str, Heading]) -> Noted:

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from examples.benchmarks.shift import simulated_shift
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.clients.cli import touches
+from scroll_tactile.clients.cli import everyday
 from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -83,7 +83,7 @@ def test_lines_on_the_standard_input_are_one_touch(memory):
 
 def test_on_a_terminal_the_answer_grows(memory, monkeypatch):
     screen = Console(file=io.StringIO(), force_terminal=True, width=80)
-    monkeypatch.setattr(touches, "console", lambda **_: screen)
+    monkeypatch.setattr(everyday, "console", lambda **_: screen)
     run("live", memory / "memory", memory / "silk.npy", "--touch")
     shown = screen.file.getvalue()
     assert "touched for 0.30 s" in shown and "touched for 1.50 s" in shown and "█" in shown
@@ -93,7 +93,7 @@ def test_what_cannot_be_replayed_is_one_red_line(memory, monkeypatch):
     assert "it is not there" in refused("live", memory / "memory", memory / "nothing.npy")
     np.save(memory / "narrow.npy", np.zeros((5, 3)))
     assert "(T, 60)" in refused("live", memory / "memory", memory / "narrow.npy")
-    monkeypatch.setattr(touches, "LONGEST_LINE", 400)
+    monkeypatch.setattr(everyday, "LONGEST_LINE", 400)
     row = b",".join([b"1"] * 60) + b"\n"
     for line, said in ((b"3,x\n", "line 2"), (b"\xff\xfe,1\n", "xff"), (b"1" * 401, "of less than 400 characters")):
         done = CliRunner().invoke(APP, ["live", str(memory / "memory"), "-"], input=row + line)

@@ -72,9 +72,10 @@ def test_a_server_that_falls_silent_is_given_up(tmp_path, monkeypatch, call):
         ended.wait(20)
         raise OSError("the test is over")
 
-    monkeypatch.setattr(MemoryFileSystem, call, silent)
     try:
-        done = run(tmp_path / "m", [tmp_path / "in", "memory://silent"], patience=2)
+        with monkeypatch.context() as patched:
+            patched.setattr(MemoryFileSystem, call, silent)
+            done = run(tmp_path / "m", [tmp_path / "in", "memory://silent"], patience=2)
     finally:
         ended.set()
         files.rm("/silent", recursive=True)

@@ -63,8 +63,8 @@ def application() -> typer.Typer:
     import typer
 
     from scroll_tactile.clients.cli.bulk import demo, evaluate, fleet, learn, report
+    from scroll_tactile.clients.cli.everyday import compose, describe, inspect, live, observe, predict
     from scroll_tactile.clients.cli.terminal import Commands, version
-    from scroll_tactile.clients.cli.touches import compose, describe, inspect, live, observe, predict
     from scroll_tactile.clients.cli.upkeep import PASSED_ON, mcp, memory, ros2
 
     app = typer.Typer(

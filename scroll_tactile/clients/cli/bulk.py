@@ -13,12 +13,13 @@ from scroll_tactile_store import NotAStoreError
 from scroll_tactile_store.layout import holds_store
 from typer import Argument, Option
 
+from scroll_tactile.clients.cli.everyday import ANSWER, answer_row
 from scroll_tactile.clients.cli.terminal import (
+    Annotating,
     AsCsv,
     AsJson,
     Axis,
     MemoryFolder,
-    Noted,
     Reading,
     SensorName,
     Sources,
@@ -37,7 +38,6 @@ from scroll_tactile.clients.cli.terminal import (
     verdict,
     with_options,
 )
-from scroll_tactile.clients.cli.touches import ANSWER, answer_row
 from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import optional
 
@@ -56,7 +56,7 @@ SECONDS = 20  # in which a scheduler answers
 
 @with_options
 def learn(
-    memory: MemoryFolder, sources: Sources, *, sensor: SensorName = None, how: Noted, as_json: AsJson = False
+    memory: MemoryFolder, sources: Sources, *, sensor: SensorName = None, how: Annotating, as_json: AsJson = False
 ) -> None:
     """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
 
@@ -117,7 +117,7 @@ def fleet(
         float | None, Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
     ] = None,
     sensor: SensorName = None,
-    how: Noted,
+    how: Annotating,
     as_json: AsJson = False,
 ) -> None:
     """Learn recordings and memories, in folders, files and buckets, by many workers into one memory.
@@ -180,7 +180,7 @@ def evaluate(
     memory: MemoryFolder,
     sources: Sources,
     *,
-    how: Noted,
+    how: Annotating,
     of: Axis = None,
     with_learned: Annotated[
         bool, Option("--with-learned", help="Answer also the touches that the memory has learned.")

@@ -128,7 +128,7 @@ class Named(Reading):
 
 
 @dataclass(frozen=True)
-class Noted(Named):
+class Annotating(Named):
     """The same, with what was measured of touches."""
 
     annotate: Annotated[

@@ -155,7 +155,7 @@ class ExportedJudge:
         steps = taken.shape[1]
         reached = [stage for stage in self.stages if stage.least <= steps]
         if not reached:
-            return ExportedAnswer(None, None, 0.0, (), 0, steps)
+            return ExportedAnswer(material=None, known=None, probability=0.0, scores=(), novelty=0, readings=steps)
         stage = reached[-1]
         novelty, scores = -stage.threshold, np.zeros(len(self.materials), np.int64)
         among = self.scales[: len(stage.weights)]
@@ -167,7 +167,14 @@ class ExportedJudge:
         total = int(CHANCES[behind[behind < MOST_CHANCES]].sum(dtype=np.int64))
         probability = 65535 * int(CHANCES[0]) // total / 65535
         known, best = False if novelty > 0 else True if stage.detects else None, self.materials[scores.argmax()]
-        return ExportedAnswer(best, known, probability, tuple(scores.tolist()), novelty, steps)
+        return ExportedAnswer(
+            material=best,
+            known=known,
+            probability=probability,
+            scores=tuple(scores.tolist()),
+            novelty=novelty,
+            readings=steps,
+        )
 
     def _sums(self, levels: npt.NDArray[np.float32], among: Sequence[ExportedScale]) -> list[tuple[Integers, int]]:
         """For each scale the weighed sums of its features over its windows, (M,), and how many windows these are."""

@@ -13,8 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from functools import cached_property
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -87,11 +86,11 @@ class Demo:
     held_out: int = 4
     features: int = 504
     folder: Path | None = None
+    scene: Scene = field(init=False, repr=False)
 
-    @cached_property
-    def scene(self) -> Scene:
-        """Where its touches come from."""
-        return Scene(self.sensor, self.seed)
+    def __post_init__(self) -> None:
+        # Here, so that a camera or a seed is refused before anything is written.
+        object.__setattr__(self, "scene", Scene(self.sensor, self.seed))
 
     def run(self, report: Callable[[str], object] = lambda name: None) -> Outcome:
         """Learn and test; `report` receives every material when it is learned, those of an interrupted run first.
@@ -125,7 +124,14 @@ class Demo:
             learner, [(name, self.scene.touch(name, self.touches + self.held_out)) for name in names], seconds=0.3
         )
         first = middle * self.held_out
-        return Outcome(Half(**notes.notes["half"]), answers, first, short, observed, learner.digest())
+        return Outcome(
+            half=Half(**notes.notes["half"]),
+            answers=answers,
+            first=first,
+            short=short,
+            observed=observed,
+            digest=learner.digest(),
+        )
 
     def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
         answers = evaluate(learner, self._held_out(others))

@@ -309,7 +309,9 @@ def evaluate_sources(
             if with_learned or not known:
                 answered.append(_answered(learner, touch, of=of))
     learned = frozenset(learner.materials if of is None else learner.axes[of])
-    return Evaluation(tuple(answered), tuple(refused), learned, seen, of, unlabelled)
+    return Evaluation(
+        answered=tuple(answered), refused=tuple(refused), learned=learned, seen=seen, of=of, unlabelled=unlabelled
+    )
 
 
 def _name_of(touch: SourceTouch, of: str | None) -> str | None:

@@ -202,7 +202,13 @@ def source_touches(
             stream = learner.stream(part.stream(learner.sensor))
             noted = Noted(touch.values, touch.labels) + noted_in(recording.annotations, touch.begin, touch.end)
             name = None if material is None else require_name(material)
-            yield SourceTouch(source, name, stream, _values(noted, learner.quantities), dict(noted.labels))
+            yield SourceTouch(
+                source=source,
+                material=name,
+                stream=stream,
+                values=_values(noted, learner.quantities),
+                labels=dict(noted.labels),
+            )
         except (InputError, SensorMismatchError) as error:
             yield Refused.by(error, source)
 

@@ -129,14 +129,14 @@ def learn_job(job: LearnJob) -> Made:
         if done.learned:
             write_archive(place, job.target)
     return Made(
-        str(job.target) if done.learned else "",
-        [done.rows[source] for source in job.sources],
-        done.skipped,
-        done.refused,
-        sorted(done.failed),
-        sorted(content.hex() for content in done.clipped),
-        done.range_problem,
-        time.process_time() - begun,
+        path=str(job.target) if done.learned else "",
+        rows=[done.rows[source] for source in job.sources],
+        repeated=done.skipped,
+        refused=done.refused,
+        failed=sorted(done.failed),
+        clipped=sorted(content.hex() for content in done.clipped),
+        range_problem=done.range_problem,
+        processor=time.process_time() - begun,
     )
 
 

@@ -6,7 +6,6 @@ import functools
 import json
 import math
 import os
-import re
 import sys
 from collections.abc import AsyncIterator, Callable
 from io import TextIOWrapper
@@ -38,7 +37,6 @@ INSTRUCTIONS = (
 )
 MOST_VALUES = 2**20  # numbers in the readings of one call: a minute of 100 channels at 170 Hz
 LARGEST = 2**28  # bytes of a recording
-CALL = re.compile(r"^read\((.*)\)$", re.MULTILINE)  # the line to copy of a recording's contents, as Python has it
 
 Readings = Annotated[
     list[list[float]] | None, Field(description="Rows of one touch in time, each with the sensor's channels.")
@@ -226,9 +224,8 @@ class Served:
         return readings
 
     def without_paths(self, text: str) -> str:
-        """An error's text as a planner is to read it: the folder is not named, and lines to copy are its own."""
-        text = text if self._folder is None else text.replace(f"{self._folder}{os.sep}", "")
-        return CALL.sub(r"such as file=\1", text)
+        """An error's text as a planner is to read it: the folder is not named."""
+        return text if self._folder is None else text.replace(f"{self._folder}{os.sep}", "")
 
     def _place(self, file: str) -> Path:
         """A recording in the folder, wherever its links lead. Raises InputError for any other."""

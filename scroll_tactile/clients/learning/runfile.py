@@ -40,6 +40,8 @@ class RunFile:
         self.notes: dict[str, Any] = {}
         if path is None:
             return
+        if path.parent.is_file():
+            raise InputError(f"expected a folder for the memory; {path.parent} is a file")
         if path.exists():
             self.notes = self._read(path)
         elif path.parent.is_dir() and {entry.name for entry in path.parent.iterdir()} - {_draft(path).name}:

@@ -16,7 +16,7 @@ is expected to be (1 + 1/n) times the scatter for a new touch, and (1 + 1/(n −
 it is multiplied by their ratio, 1 − 1/n²: calibration would otherwise expect new touches to look less like their own
 material than they do.
 
-Where the statistics hold more rows of a touch than the sample does (copies), its sampled rows stand for all of them.
+Where windows are learned one by one, the sample has fewer rows of a touch: these stand for all of them.
 """
 
 from __future__ import annotations

@@ -51,8 +51,8 @@ class SampledTouch:
     """The mean row that a touch added to the statistics at each stage that it reached, of each scale that judges there.
 
     rows: codes, int32 of shape (pairs, d). pairs: the stage of each, the place of its scale among those that judge at
-    the stage, ascending, and the rows that the touch added at that scale in all, with those of its copies: int64 of
-    shape (pairs, 3). annotation: its values and labels.
+    the stage, ascending, and the rows that the touch added at that scale in all, of which a stage has several where
+    its windows are learned one by one: int64 of shape (pairs, 3). annotation: its values and labels.
     """
 
     rows: npt.NDArray[np.int32]
@@ -61,7 +61,7 @@ class SampledTouch:
 
     @classmethod
     def of(cls, stages: Stages, codes: Codes, annotation: Annotation = NO_ANNOTATION) -> SampledTouch:
-        """The sampled touch of some codes, of which its own come first, stage after stage; as `stage_rows` gives."""
+        """The sampled touch of some codes, stage after stage, as `stage_rows` gives them."""
         used: dict[Scale, int] = {}
         rows, pairs = [], []
         for stage, scales in enumerate(stages):

@@ -18,7 +18,7 @@ from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.touch_rows import (
-    Added,
+    Changed,
     Arrays,
     Codes,
     Encode,
@@ -216,7 +216,7 @@ class Memory:
 
         return undo
 
-    def retract(self, record: Record) -> Added:
+    def retract(self, record: Record) -> Changed:
         """Subtract an observation from the sums; call `replaying.refill` afterwards, for what was chosen."""
         material, key, annotation = record.label, record.key, annotation_of(record.attributes)
         columns, codes = self.codes(record)
@@ -228,7 +228,7 @@ class Memory:
             self.stale = True
         if record.sequence <= self.tuned_last_sequence:
             self.tuned = None
-        return Added(material, codes, -1, annotation.labels)
+        return Changed(material, annotation.labels)
 
     @property
     def samples(self) -> list[Sample[Any]]:

@@ -17,6 +17,10 @@ it is multiplied by their ratio, 1 − 1/n²: calibration would otherwise expect
 material than they do.
 
 Where windows are learned one by one, the sample has fewer rows of a touch: these stand for all of them.
+
+With K = L Lᵀ all of these are products between whitened vectors L⁻¹ x, of which the R means and the k rows of a touch
+span R + k dimensions. So they are taken between coordinates there: in the orthonormal basis Q of the whitened means,
+and, for what lies beyond it, in a basis of the touch's own.
 """
 
 from __future__ import annotations
@@ -39,7 +43,7 @@ FloatArray = npt.NDArray[np.float64]
 Sampled = Iterable[tuple[str, bytes, SampledTouch]]
 """Material, key and rows of the touches that readouts are calibrated on: a `TouchSample`, or what was copied of it."""
 
-TOGETHER = 32  # touches: each step of all at once takes 8 MB
+TOGETHER = 256  # touches: of a row of 1008 features each these take 2 MB
 
 
 @dataclass(frozen=True)
@@ -139,7 +143,8 @@ def held_out_scores(
             groups.setdefault((len(judged), len(at)), []).append((number, at, rows, weight, own[material], scored))
     index: dict[tuple[int, int], int] = {}
     parts = []
-    leaving = _Leaving(readout, kind) if groups else None
+    beyond = max((judged + asked * (queries is not None) for judged, asked in groups), default=0)
+    leaving = _Leaving(readout, kind, beyond) if groups else None
     for members in (group[i : i + TOGETHER] for group in groups.values() for i in range(0, len(group), TOGETHER)):
         for number, at, *_ in members:
             for stage in at:
@@ -163,11 +168,14 @@ def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale
 class _Leaving:
     """Takes touches out of one readout as it was solved; M touches with k rows each at once.
 
-    All products are taken between whitened vectors, L⁻¹ x with K = L Lᵀ. Those of T follow from them (Woodbury): with
-    B = √(N p_y) (m_y − μ) whitened and A Aᵀ = I + B Bᵀ, xᵀ T⁻¹ y = x·y − (A⁻¹ B x)·(A⁻¹ B y).
+    All products are taken between whitened vectors, L⁻¹ x with K = L Lᵀ, in the coordinates of the module's docstring:
+    D of them, the first of the means' basis. Products of T follow from them (Woodbury): with B = √(N p_y) (m_y − μ)
+    and A Aᵀ = I + B Bᵀ, xᵀ T⁻¹ y = x·y − (A⁻¹ B x)·(A⁻¹ B y).
+
+    beyond: the most vectors that a touch has, of rows and of queries: so many coordinates are its own.
     """
 
-    def __init__(self, readout: Readout, kind: ReadoutName) -> None:
+    def __init__(self, readout: Readout, kind: ReadoutName, beyond: int) -> None:
         self.readout, self.kind = readout, kind
         self.derived = readout.derived()
         self.counts = readout.counts[: len(readout.near)]
@@ -175,11 +183,24 @@ class _Leaving:
         # The total scatter is that of the reference materials, scaled to the rows of all materials.
         self.excess = float(readout.counts.sum()) / self.total
         with one_thread():
-            self.means = readout.system.whiten(np.asarray(readout.near.means, np.float64))
+            self.basis, upper = np.linalg.qr(readout.system.whiten(np.asarray(readout.near.means, np.float64)).T)
+            self.means = np.pad(upper.T, ((0, 0), (0, beyond)))
             self.center = readout.shares @ self.means
             spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
             factor = np.linalg.cholesky(spread @ spread.T + np.eye(len(spread)))
             self.onto_spread = np.linalg.solve(factor, spread)
+
+    def _coordinates(self, vectors: FloatArray) -> FloatArray:
+        """The coordinates of each touch's vectors about the origin, (M, k, d) to (M, k, D)."""
+        white = self.readout.system.whiten(vectors.reshape(-1, vectors.shape[2]))
+        near = white @ self.basis
+        rest = (white - near @ self.basis.T).reshape(vectors.shape)
+        # The triangle of a QR, which equal rows do not make singular, as they make their Gram matrix.
+        beyond = np.linalg.qr(rest.transpose(0, 2, 1), mode="r").transpose(0, 2, 1)
+        found = np.zeros((*vectors.shape[:2], self.means.shape[1]))
+        found[:, :, : near.shape[1]] = near.reshape(*vectors.shape[:2], -1)
+        found[:, :, near.shape[1] : near.shape[1] + beyond.shape[2]] = beyond
+        return found
 
     def out(
         self,
@@ -196,13 +217,14 @@ class _Leaving:
         for, (M,). own: its material among the reference, (M,). queries: what is scored, about the origin, (M, q, d);
         the rows themselves unless given.
         """
-        touches, count, dimension = rows.shape
-        queries = rows if queries is None else queries
-        count_scored = queries.shape[1]
+        touches, count = rows.shape[:2]
         with one_thread():
-            white = self.readout.system.whiten(rows.reshape(-1, dimension)).reshape(rows.shape)
-            scored = white if queries is rows else self.readout.system.whiten(queries.reshape(-1, dimension))
-            scored = scored.reshape(queries.shape)
+            if queries is None:
+                queries, white = rows, self._coordinates(rows)
+                scored = white
+            else:
+                both = self._coordinates(np.concatenate([rows, queries], axis=1))
+                white, scored = both[:, :count], both[:, count:]
             counts = self.counts[own]
             stretch = np.sqrt(weights * counts / (counts - weights))[:, None]
             share = np.sqrt(weights / count)[:, None, None]
@@ -231,7 +253,7 @@ class _Leaving:
         centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
         scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
         diagonal = self._diagonal_distances(rows, queries, weights, own, scores.argmax(axis=2))
-        flat = [part.reshape(touches * count_scored, -1) for part in (scores, centred, distances)]
+        flat = [part.reshape(scored.shape[0] * scored.shape[1], -1) for part in (scores, centred, distances)]
         return flat[0], flat[1], flat[2], if_new.reshape(-1), diagonal.reshape(-1)
 
     def _as_new(
@@ -244,7 +266,7 @@ class _Leaving:
     ) -> FloatArray:
         """The rise of each row's own LDA score where its distance is brought to that of a new touch, (M, k).
 
-        white: the rows, whitened, (M, k, d). leaving, inner: the columns that leave K, whitened, and E.
+        white: the rows, whitened, (M, k, D). leaving, inner: the columns that leave K, whitened, and E.
         """
         counts = self.counts[own]
         back = (weights / (counts - weights))[:, None] * (white.mean(axis=1) - self.means[own])
@@ -276,7 +298,7 @@ class _Leaving:
         """The squared length of each query about the total mean, by T without its touch, (M, q).
 
         Also B of the touch's rows, (M, k, k), and of its queries with them, (M, q, k). leaving: the columns that
-        leave K, whitened, shape (M, k, d).
+        leave K, whitened, shape (M, k, D).
         """
         count, half, queries = white.shape[1], white - self.center, scored - self.center
         rest = (self.total - weights)[:, None]
@@ -302,7 +324,7 @@ class _Leaving:
         return self._length_without(moved, columns, -np.ones(columns.shape[1]))
 
     def _length_without(self, moved: FloatArray, columns: FloatArray, signs: FloatArray) -> FloatArray:
-        """The squared length, (M, q), of whitened vectors (M, q, d) under T changed by signed columns (M, k, d)."""
+        """The squared length, (M, q), of whitened vectors (M, q, D) under T changed by signed columns (M, k, D)."""
         inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
         onto = self._products(moved, columns)
         length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)

@@ -146,29 +146,31 @@ class InverseTriangle:
     def __init__(self, matrix: FloatArray) -> None:
         edges = pairwise(_edges(len(matrix)))
         self._blocks = [(first, last, matrix[first:last, :last].copy()) for first, last in edges]
-        self._factorise()
-        self._invert()
+        self._invert(self._factorised())
 
-    def _factorise(self) -> None:
-        """Turn the blocks of K into those of L, block of columns after block."""
+    def _factorised(self) -> list[FloatArray]:
+        """Turn the blocks of K into those of L below their own columns. Returns L⁻¹ of these columns, block by block.
+
+        Each is inverted once, in place of a solution for each block below it.
+        """
+        inverses = []
         for i, (first, last, block) in enumerate(self._blocks):
-            own = np.linalg.cholesky(block[:, first:])
-            block[:, first:] = own
+            inverses.append(np.tril(np.linalg.inv(np.linalg.cholesky(block[:, first:]))))
             for _, _, below in self._blocks[i + 1 :]:
-                below[:, first:last] = np.linalg.solve(own, below[:, first:last].T).T
+                below[:, first:last] = below[:, first:last] @ inverses[i].T
             for j, (start, stop, row) in enumerate(self._blocks[i + 1 :], i + 1):
                 for _, _, below in self._blocks[j:]:
                     below[:, start:stop] -= below[:, first:last] @ row[:, first:last].T
+        return inverses
 
-    def _invert(self) -> None:
+    def _invert(self, inverses: list[FloatArray]) -> None:
         """Turn the blocks of L into those of L⁻¹, from above: a block needs those before it, inverted already."""
         for i, (first, _, block) in enumerate(self._blocks):
-            own = np.tril(np.linalg.inv(block[:, first:]))
             sums = np.zeros((len(block), first))
             for start, stop, above in self._blocks[:i]:
                 sums[:, :stop] += block[:, start:stop] @ above
-            block[:, :first] = -own @ sums
-            block[:, first:] = own
+            block[:, :first] = -inverses[i] @ sums
+            block[:, first:] = inverses[i]
 
     def times(self, rows: FloatArray) -> FloatArray:
         """L⁻¹ times each of the rows, shape (k, d)."""

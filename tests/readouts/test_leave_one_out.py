@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from readouts.dense import Dense, require_near
 
@@ -13,24 +13,28 @@ from scroll_tactile.readouts.task import Task
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import Statistics
 
-SCALE, WIDTH = 7, 4
+SCALE = 7
 STAGES = [[SCALE]] * 3
 
 
-def touches_of(kinds, seed, offset):
-    """Touches (material, key, rows, copies): `copies` times its rows are in the statistics."""
+def touches_of(kinds, seed, offset, width=4, alike=False):
+    """Touches (material, key, rows, copies): `copies` times its rows are in the statistics.
+
+    alike: the rows of a touch are equal.
+    """
     rng = np.random.default_rng(seed)
-    means = rng.normal(size=(9, WIDTH)) * 40_000 + offset
+    means = rng.normal(size=(9, width)) * 40_000 + offset
     touches = []
     for number, (material, count, copies) in enumerate(kinds):
-        rows = np.rint(means[material] + rng.normal(size=(count, WIDTH)) * 20_000).astype(np.int32)
+        rows = np.rint(means[material] + rng.normal(size=(count, width)) * 20_000).astype(np.int32)
+        rows[1:] = rows[0] if alike else rows[1:]
         touches.append(("abcdefghi"[material], bytes([number]) * 32, rows, copies))
     return touches
 
 
 def learned(touches, unsampled=()):
     """Of a touch's rows its own come first, then those of its copies."""
-    statistics, sample = Statistics(WIDTH, [SCALE]), TouchSample()
+    statistics, sample = Statistics(touches[0][2].shape[1], [SCALE]), TouchSample()
     for material, key, rows, copies in touches:
         codes = {SCALE: np.concatenate([rows] * copies)}
         statistics.add(material, codes)
@@ -70,19 +74,35 @@ def require_left_out(found, place, row, own, without, every, material, weight, r
     best = reference[int(found.scores[place].argmax())]
     away = [float(int(x) - m) for x, m in zip(row, without.means[best], strict=True)]
     total = float(readout.counts.sum())
-    variances = [(float(every.scatter[j][j]) + readout.penalty) / total for j in range(WIDTH)]
+    variances = [(float(every.scatter[j][j]) + readout.penalty) / total for j in range(len(row))]
     far = sum(a**2 / v for a, v in zip(away, variances, strict=True))
     require_near(found.diagonal_distances[place], far * (1 - share**2) if best == material else far)
 
 
-@settings(max_examples=40, deadline=None)
-@given(KINDS, st.integers(0, 999), st.sampled_from([0, 900_000]), KIND, st.booleans(), st.booleans())
-def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind, others, elsewhere):
-    """With the same P and γ. others: some materials are of no sampled touch, as where there are very many.
+WIDTHS, NOT = st.integers(1, 9), st.just(False)
+ALIKE = [(material, 3, 1) for material in (0, 0, 0, 1, 1, 1)]
 
-    elsewhere: other rows are asked in place of its own, as of its beginnings, or of the touch at another pace.
+
+@settings(max_examples=40, deadline=None)
+@given(
+    KINDS,
+    st.integers(0, 999),
+    st.sampled_from([0, 900_000]),
+    WIDTHS,
+    KIND,
+    st.booleans(),
+    st.booleans(),
+    st.just(False),
+)
+@example(ALIKE, 0, 0, 9, "ridge", False, False, True)
+@example(ALIKE, 1, 900_000, 9, "lda", False, True, True)
+def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, width, kind, others, elsewhere, alike):
+    """With the same P and γ, of fewer features than materials and of more than they and the touch's rows span.
+
+    others: some materials are of no sampled touch, as where there are very many. elsewhere: other rows are asked in
+    place of its own, as of its beginnings, or of the touch at another pace; its own are among them.
     """
-    touches = touches_of(kinds, seed, offset)
+    touches = touches_of(kinds, seed, offset, width, alike)
     unsampled = {"d", "e"} if others and kind == "lda" else set()
     if not {material for material, *_ in touches} - unsampled:
         return
@@ -93,9 +113,12 @@ def test_it_is_as_if_the_touch_had_never_been_observed(kinds, seed, offset, kind
     if elsewhere:
         rng = np.random.default_rng(seed + 1)
         asked = {
-            place: {2 * at: np.rint(rng.normal(size=WIDTH) * 60_000 + offset) for at in range(int(rng.integers(0, 4)))}
+            place: {2 * at: np.rint(rng.normal(size=width) * 60_000 + offset) for at in range(int(rng.integers(0, 4)))}
             for place in places.values()
         }
+        for material, key, rows, _ in touches:
+            if material not in unsampled and asked[places[material, key]]:
+                asked[places[material, key]][1] = rows[0].astype(float)
     found = held_out_scores(readout, sample, STAGES, kind, asked)
     assert found.names == reference
     total = Fraction(int(statistics.second(SCALE).rows))

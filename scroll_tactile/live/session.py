@@ -165,9 +165,7 @@ class GrowingTouch:
             return self.prediction
         self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
         current = self._encoded(stream, self.cache)
-        self.prediction = self.predictor.answer_of(
-            self.model, self.candidates, [*self.encoded, current]
-        )
+        self.prediction = self.predictor.answer_of(self.model, self.candidates, [*self.encoded, current])
         self.decided |= self.rule.decided(self.prediction, current.steps, several=bool(self.earlier))
         self._estimate(current, self.prediction)
         return self.prediction

@@ -18,8 +18,8 @@ from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.touch_rows import (
-    Changed,
     Arrays,
+    Changed,
     Codes,
     Encode,
     Readings,

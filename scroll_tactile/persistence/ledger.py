@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from scroll_tactile_store import Checkpoint, Head, Record, Store
+from scroll_tactile_store import Head, Record, Store
 
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError, ObservationError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text

@@ -8,6 +8,7 @@ touches.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,13 +17,24 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.kept_arrays import KeptArrays, at_places
 from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.match import KeptTouch, Match, independent
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
-from scroll_tactile.prediction.model import WITHIN, Model, Row, Trajectories, Weighing, held_out_of, match_scores, tempered
+from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.model import (
+    WITHIN,
+    Model,
+    Paces,
+    Row,
+    Trajectories,
+    Weighing,
+    held_out_of,
+    match_scores,
+    tempered,
+)
 from scroll_tactile.readouts.calibration import (
     AHEAD,
     FEWEST,
@@ -32,14 +44,14 @@ from scroll_tactile.readouts.calibration import (
     held_out_probabilities,
 )
 from scroll_tactile.readouts.dependence import dependence_of
-from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Draft", "rehearse"]
+__all__ = ["Draft", "paces_of", "rehearse"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -49,6 +61,7 @@ ALONE_TOUCHES = 2.0  # how many touches the prior of τ counts as
 UNMATCHED = 1 / 16_000  # τ where nothing can be held out: a larger one misclassifies prefixes, with one touch of each
 PRIOR_OUTLIERS = 0.5  # of one more touch than the held-out ones
 STEPS = 100  # of EM
+PACES = 2.0, 0.5  # times a touch's own, at which it is judged as others made faster or slower
 EVEN = 4.0  # times the energy of noise that those stay below: there the share of noise is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 LEAST_SPREAD, LEAST_INFORMATION, LEAST_WEIGHT = 1e-9, 1e-3, 1e-9
@@ -92,9 +105,7 @@ class Draft:
         views = [view for view in memory.plan.views if view in tasks]
         kept = memory.kept.touches() if memory.kept is not None and views else []
         lengths = statistics.longest, max(1, min(statistics.fifth_percentile_length, statistics.longest))
-        return cls(
-            kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, statistics.touches
-        )
+        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, statistics.touches)
 
     def fit(self, *, rehearsed: bool = False) -> Model:
         """Solve the readouts and weigh them. Can be called once: it frees the tasks. rehearsed: with trajectories."""
@@ -187,9 +198,7 @@ def _outlier_rate(own: FloatArray, materials: int) -> float:
     return rate
 
 
-def _chosen(
-    weighing: Weighing, held_out: Mapping[Scale, HeldOutScores], matcher: TouchMatcher
-) -> dict[int, int]:
+def _chosen(weighing: Weighing, held_out: Mapping[Scale, HeldOutScores], matcher: TouchMatcher) -> dict[int, int]:
     """Row among the kept touches → place in the sample, of at most MOST_HELD_OUT held-out touches, evenly by key.
 
     Of a material of which none but itself is kept, a touch says nothing.
@@ -286,6 +295,60 @@ def rehearse(model: Model) -> None:
                     answered = tempered(fused, row.outliers)
                 else:
                     continue
-                chances[place, stage], novelty[place, stage], targets[place] = answered, held.novelty[i], held.targets[i]
+                chances[place, stage], novelty[place, stage], targets[place] = (
+                    answered,
+                    held.novelty[i],
+                    held.targets[i],
+                )
     reached = np.isfinite(novelty).any(axis=1)
     weighing.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
+
+
+def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:
+    """How known touches look at twice and half their pace; None where too few can be held out.
+
+    Half of the kept touches that a fit matches are resampled, and judged by the views and the kept touches without
+    them. The first touch of another length has it measured, and later ones find it in the weighing.
+    """
+    weighing, matcher = model.fitted, model.matcher
+    if weighing.paces is None and matcher is not None:
+        chosen = dict(list(_chosen(weighing, model.held_out, matcher).items())[::2])
+        if len(chosen) >= FEWEST:
+            with one_thread():
+                weighing.paces = _measured_paces(model, extractor, matcher, chosen)
+    return weighing.paces
+
+
+def _measured_paces(
+    model: Model, extractor: FeatureExtractor, matcher: TouchMatcher, chosen: Mapping[int, int]
+) -> Paces:
+    """As `paces_of`. chosen: row among the kept touches → place in the sample."""
+    weighing, row = model.fitted, model.fitted.paced
+    queries: dict[Scale, dict[int, dict[int, FloatArray]]] = {view: {} for view in model.views}
+    excess = np.zeros((len(PACES), len(weighing.sample)))
+    for kept, place in chosen.items():
+        levels = matcher.kept.levels(kept)
+        for number, pace in enumerate(PACES):
+            columns = max(2, round(levels.shape[1] / pace))
+            other = at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))
+            excess[number, place] = matcher.beside(matcher.query(other, whole=True, held_out=kept), CLEAN).excess
+            image = extractor.image(stream_of(other, extractor.sensor))
+            for view, mean in extractor.means(image, model.views).items():
+                queries[view].setdefault(place, {})[number] = mean
+    viewed = [[*stage, *model.views] for stage in model.stages]
+    held_out = [
+        held_out_scores(model.readouts[view], weighing.sample, viewed, model.kind, queries[view])
+        for view in model.views
+    ]
+    others = []
+    for number in range(len(PACES)):
+        found = StageScores(number, weighing.sample, held_out)
+        values = np.column_stack([found.distances().min(axis=2), excess[number, found.places]])
+        mean, spread = values.mean(axis=0), np.maximum(values.std(axis=0), LEAST_SPREAD)
+        spread *= max(float(((values - mean) / spread).mean(axis=1).std()), LEAST_SPREAD)
+        novelties = np.sort(((values - mean) / spread).mean(axis=1))
+        # As many of these lie above the threshold as of touches in their own time.
+        rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
+        high = float(novelties[rank]) / max(row.calibration.threshold(1 - WITHIN), LEAST_SPREAD)
+        others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
+    return Paces(np.vstack([row.calibration.scale_novelty, row.excess]), np.stack(others))

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,7 @@ from scroll_tactile.matching.conformal import Typicality
 from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
 from scroll_tactile.matching.match import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
+from scroll_tactile.prediction.fitting import paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, tempered
 from scroll_tactile.readouts.calibration import held_out_probabilities
 from scroll_tactile.readouts.estimation import Estimator
@@ -43,6 +45,15 @@ __all__ = ["HeldOutTouch", "Touch", "answer", "estimates_of", "held_out_touches"
 FloatArray = npt.NDArray[np.float64]
 Touch = tuple[Encoded, Mapping[str, float] | None]
 """An encoded touch, and the logits of f* where it answers."""
+
+
+class Matched(NamedTuple):
+    """A touch beside kept ones under a hypothesis. clean: its excess loss where no noise came over it."""
+
+    hypothesis: Hypothesis
+    match: Match
+    clean: float
+
 
 COUNTED = 30.0  # the effective number of independent values in a touch: neighbouring values are correlated
 LEAST_SHARE = 1e-5  # a hypothesis of less weight is not judged
@@ -124,16 +135,19 @@ def judged(
     if model.views and not learned and shortest <= length <= longest:
         hypotheses.append("paced")
     matches = _matches(model, levels, hypotheses, alone)
-    gains = np.array([match.log_likelihood_gain for _, match in matches])
-    best, match = matches[int(gains.argmax())]
-    filled = encoded if best != own else _filled(model, extractor, encoded, match)
-    answers = [
-        _fused(model, candidates, _read(model, extractor, candidates, encoded, filled, alone, hypothesis), match)
-        for hypothesis, match in matches
-    ]
+    gains = np.array([each.match.log_likelihood_gain for each in matches])
+    best = matches[int(gains.argmax())]
+    filled = encoded if best.hypothesis != own else _filled(model, extractor, encoded, best.match)
+    answers = []
+    for each in matches:
+        if each.hypothesis == "paced":
+            judgement = _paced(model, extractor, candidates, filled.stream, each)
+        else:
+            judgement = alone if filled is encoded else model.judge(candidates, filled.means, encoded.steps, own)
+        answers.append(_fused(model, candidates, judgement, each))
     weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
-    unusual = _unusual(model, encoded, match, best)
+    unusual = _unusual(model, encoded, best.match, best.hypothesis)
     return replace(answers[int(weights.argmax())], probability=probability / probability.sum(), unusual=unusual)
 
 
@@ -147,7 +161,7 @@ def _matches(
     hypotheses: Sequence[Hypothesis],
     alone: Judgement,
     held_out: int | None = None,
-) -> list[tuple[Hypothesis, Match]]:
+) -> list[Matched]:
     """The matches of a touch by each hypothesis that is likely enough to be judged.
 
     held_out: the row of the kept touch that it is, if it is one.
@@ -155,36 +169,31 @@ def _matches(
     matcher = model.matcher
     assert matcher is not None
     queries = [matcher.query(levels, whole=hypothesis == "paced", held_out=held_out) for hypothesis in hypotheses]
-    found = [matcher.beside(query, CLEAN) for query in queries]
+    clean = found = [matcher.beside(query, CLEAN) for query in queries]
     likeliest = max(range(len(found)), key=lambda i: found[i].gain)
     row = alone.row if hypotheses[likeliest] != "paced" else model.fitted.paced
     if row.unlikely(found[likeliest].excess, LIKELY):
         found = [matcher.beside(query, None) for query in queries]
     most, span = max(each.gain for each in found), -math.log(LEAST_SHARE) / COUNTED
     return [
-        (hypothesis, matcher.result(each))
-        for hypothesis, each in zip(hypotheses, found, strict=True)
+        Matched(hypothesis, matcher.result(each), without.excess)
+        for hypothesis, each, without in zip(hypotheses, found, clean, strict=True)
         if each.gain > most - span
     ]
 
 
-def _read(
-    model: Model,
-    extractor: FeatureExtractor,
-    candidates: Sequence[str],
-    encoded: Encoded,
-    filled: Encoded,
-    alone: Judgement,
-    hypothesis: Hypothesis,
-) -> tuple[Hypothesis, Judgement]:
-    """The judgement of a touch, as it was filled in, by the readouts under a hypothesis."""
-    if hypothesis != "paced":
-        if filled is encoded:
-            return hypothesis, alone
-        return hypothesis, model.judge(candidates, filled.means, encoded.steps, hypothesis)
-    complete = stream_of(_levels_of(filled.stream), extractor.sensor)
-    means = extractor.means(extractor.image(complete), model.views)
-    return hypothesis, model.judge(candidates, means, len(encoded.stream), hypothesis)
+def _paced(
+    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], stream: Stream, matched: Matched
+) -> Judgement:
+    """The judgement by the readouts of a touch as a whole one at another pace; novel as such touches are not."""
+    means = extractor.means(extractor.image(stream_of(_levels_of(stream), extractor.sensor)), model.views)
+    judgement, kept = model.judge(candidates, means, len(stream), "paced"), model.matcher
+    assert kept is not None
+    if (paces := paces_of(model, extractor)) is None:
+        return judgement
+    values = np.append(model.distances(judgement.row.scales, means, candidates), matched.clean)
+    pace = float(np.median(kept.kept.columns)) / len(stream)
+    return replace(judgement, novelty=paces.novelty(values, pace))
 
 
 def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> FloatArray:
@@ -210,14 +219,12 @@ def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
 
 
-def _fused(
-    model: Model, candidates: Sequence[str], read: tuple[Hypothesis, Judgement], match: Match
-) -> Judgement:
-    """The judgement of a touch by the readouts, as they judge it alone, and the kept touches together."""
+def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: Matched) -> Judgement:
+    """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts."""
     assert model.matcher is not None
-    hypothesis, alone = read
+    match = matched.match
     scores = match_scores(model.matcher, candidates, match)
-    chances = model.fitted.fused(hypothesis, alone.probability, match, scores, alone.distance)
+    chances = model.fitted.fused(matched.hypothesis, alone.probability, match, scores, alone.distance)
     share = match.noise_share
     novelty = (1 - share) * alone.novelty + share * alone.row.matched_novelty(match.excess_loss)
     return replace(alone, probability=tempered(chances, alone.row.outliers), novelty=float(novelty))
@@ -312,8 +319,8 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
             chances = np.exp(held.logs[i])
             alone = Judgement(chances, float(held.novelty[i]), row, float(held.distance[i]))
             if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):
-                [(own, match)] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
-                result = _fused(model, held.names, (own, alone), match)
+                [matched] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
+                result = _fused(model, held.names, alone, matched)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
             threshold = row.calibration.threshold(false_alarms)

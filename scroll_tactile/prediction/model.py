@@ -7,6 +7,7 @@ the weighing those of the last fit. Nothing of a model changes, so any thread ma
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -34,6 +35,7 @@ __all__ = [
     "Hypothesis",
     "Judgement",
     "Model",
+    "Paces",
     "Row",
     "Trajectories",
     "Weighing",
@@ -51,6 +53,7 @@ Hypothesis = Literal["prefix", "complete", "paced"]
 WITHIN = 0.95  # the share of held-out touches within the limits
 SURE = 0.99  # a touch whose highest probability by the readouts is less is matched with kept ones
 BESIDE = 0.1  # the weight of kept touches beside sure readouts, of that by themselves: fitted ones were 0.03 to 0.28
+MOST_OCTAVES = 1.5  # to which what was measured an octave off is continued
 LEAST_DISTANCE_WEIGHT = 0.5  # the least weight at another pace, as a share of that at the distance limit
 
 
@@ -121,6 +124,24 @@ class Trajectories:
     targets: npt.NDArray[np.intp]
 
 
+@dataclass(frozen=True)
+class Paces:
+    """How known touches look at other paces: mean and spread of each view's distance, and of the excess loss, last.
+
+    own: at their own pace, (S' + 1, 2). others: at twice and at half of it, (2, S' + 1, 2).
+    """
+
+    own: FloatArray
+    others: FloatArray
+
+    def novelty(self, values: FloatArray, pace: float) -> float:
+        """The standardised novelty of distances and excess loss, (S' + 1,), of a touch so many times as fast."""
+        octaves = math.log2(pace)
+        moved = min(abs(octaves), MOST_OCTAVES) * (self.others[0 if octaves > 0 else 1] - self.own)
+        mean, spread = (self.own + moved).T
+        return float(((values - mean) / np.maximum(spread, self.own[:, 1] / 2)).mean())
+
+
 @dataclass(eq=False)
 class Weighing:
     """What a fit found out of held-out touches: how readouts and kept touches are to be weighed.
@@ -128,8 +149,8 @@ class Weighing:
     rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
     another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
     of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
-    to. sample: those that were held out. held_out, trajectories: see `Model.held_out` and `fitting.rehearse`; made
-    when they are first asked for.
+    to. sample: those that were held out. held_out, trajectories, paces: see `Model.held_out`, `fitting.rehearse` and
+    `fitting.paces_of`; made when they are first asked for.
     """
 
     rows: tuple[Row, ...]
@@ -142,6 +163,7 @@ class Weighing:
     sample: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
     held_out: dict[Scale, HeldOutScores] | None = None
     trajectories: Trajectories | None = None
+    paces: Paces | None = None
 
     def row(self, hypothesis: Hypothesis, stage: int) -> Row:
         """How a touch is judged at a stage."""

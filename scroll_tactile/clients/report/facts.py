@@ -427,7 +427,9 @@ class MemoryFacts:
         if not streams:
             return [], "of no touch that could be left out the readings are kept."
         try:
-            return growing(self.model, self.memory, self.extractor, self.rule, self.learner.settings.false_alarms, streams), ""
+            return growing(
+                self.model, self.memory, self.extractor, self.rule, self.learner.settings.false_alarms, streams
+            ), ""
         except CANNOT_EMBED as error:
             return [], str(error)
 

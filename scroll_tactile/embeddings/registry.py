@@ -21,7 +21,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES
-from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.embeddings.protocol import Embedding, cache_folder
 from scroll_tactile.errors import EmbeddingError
 
 __all__ = [

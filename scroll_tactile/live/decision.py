@@ -1,7 +1,7 @@
 """When a prediction is made within a touch, and when it is safe to act on.
 
 A touch is decided at the first moment at which its prediction is known and its probability is at least `sure`, or at
-which its novelty is at least `least_new`. Held-out touches, run through all moments (see `prediction.fitting.rehearse`),
+which its novelty is at least `least_new`. Held-out touches, run through all rows (see `fitting.rehearse`),
 set both. `least_new` is a novelty that none of them comes near. `sure` is the least probability for which, as for every
 higher one, few enough of the n held-out touches are decided wrongly:
 

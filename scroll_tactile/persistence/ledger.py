@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -61,7 +61,7 @@ from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.validation.gate import MemoryStore
 
-__all__ = ["AxisLedger", "Ledger", "axis_name"]
+__all__ = ["AxisLedger", "Ledger"]
 
 
 class Ledger(OpenMemory):
@@ -434,6 +434,10 @@ class AxisLedger(Ledger):
     def correction(self) -> Correction | None:
         """As of the memory."""
         return self._of.correction
+
+    def take_weighing(self) -> str | None:
+        """As of the memory, of the axis."""
+        return self._of.memory.weighings.pop(self._axis, None)
 
     def _follow(self, changes: Sequence[Changed] | None) -> None:
         """Note what the memory changed by: of touches without a label that something did."""

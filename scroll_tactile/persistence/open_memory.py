@@ -46,8 +46,9 @@ class OpenMemory:
 
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
     grows with each change of a description. changed: the materials of touches observed and retracted since the set was
-    last cleared; None where something else has changed. followers: are called with the touches at each change. watched: the rows that health was last read from, by some rules; not there while they are read.
-    lost: grows where a change was cut short, whose rows may not be in the journal. saves: whether checkpoints are
+    last cleared; None where something else has changed. followers: are called with the touches at each change. watched:
+    the rows that health was last read from, by some rules; not there while they are read. lost: grows where a change
+    was cut short, whose rows may not be in the journal. saves: whether checkpoints are
     written; the journal alone has every row, too.
     """
 
@@ -69,7 +70,7 @@ class OpenMemory:
         self.followers: list[Callable[[Sequence[Changed] | None], None]] = []
         self._load = load
         self._memory = load()
-        self._saved = self._memory.saved
+        self._saved, self._saved_weighings = self._memory.saved, dict(self._memory.weighings)
         self._closed = False
         self._whole = True
         self._undo: Callable[[], None] | None = None
@@ -242,12 +243,15 @@ class OpenMemory:
         found = self.store.derived(name)
         return found if found is not None and found.number == self.memory.checkpoint else None
 
-    def saved_since(self, memory: Memory) -> bool:
-        """Whether a checkpoint was written since the one that the memory was loaded from."""
-        return self.store is not None and self.store.newest != memory.checkpoint
+    def take_weighing(self) -> str | None:
+        """What the checkpoint that the memory was read from says of how materials are weighed, once."""
+        return self.memory.weighings.pop("", None)
 
-    def close(self, derived: Mapping[str, Callable[[], Derived | None]]) -> None:
-        """As `TactileLearner.close`. derived: by name, what gives the arrays to store with the newest checkpoint."""
+    def close(self, derived: Mapping[str, Callable[[], Derived | None]], weighings: Mapping[str, str]) -> None:
+        """As `TactileLearner.close`.
+
+        derived: by name, what gives the arrays to store with the newest checkpoint. weighings: see `Memory`.
+        """
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
@@ -257,7 +261,8 @@ class OpenMemory:
             try:
                 # A change that was cut short is never saved: the journal holds all of it, or nothing.
                 if store.mode == "write" and self.saves and self._whole:
-                    if self._memory.sequence > self._saved:
+                    self._memory.weighings |= weighings
+                    if self._memory.sequence > self._saved or self._memory.weighings != self._saved_weighings:
                         self._pass_over_failures(store)
                         self._write_checkpoint()
                     for name, arrays in derived.items():

@@ -8,6 +8,7 @@ memories of at most FEW touches, and where touches came much faster than fits, a
 
 from __future__ import annotations
 
+import logging
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -19,8 +20,11 @@ from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.stored import read_weighing, weighing_text
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.settings import Settings
+
+logger = logging.getLogger(__name__)
 
 __all__ = ["CurrentModel", "estimator_of"]
 
@@ -32,9 +36,13 @@ FASTER = 2  # times the touches of the last fit: where there are more, or fewer 
 
 @dataclass
 class _Job:
-    """A fit in a thread. changed: the materials that changed since it began; None where that is not known."""
+    """A fit in a thread.
+
+    retractions: of the memory when it began. changed: the materials that changed since; None where that is not known.
+    """
 
     future: Future[Model]
+    retractions: int
     changed: set[str] | None = field(default_factory=set)
 
 
@@ -46,6 +54,7 @@ class CurrentModel:
         self._model: Model | None = None
         self._behind: set[str] | None = set()  # the materials that changed since the model; None where any may have
         self._version = -1  # of the memory up to which that is so
+        self._retractions = 0  # of the memory when the model was fitted
         self._exact = False  # whether the model was fitted to the present memory
         self._job: _Job | None = None
         self._worker: ThreadPoolExecutor | None = None
@@ -63,6 +72,9 @@ class CurrentModel:
             self._job = None
             if job.changed is not None and job.future.exception() is None:
                 model, behind, self._exact = job.future.result(), job.changed, not job.changed
+                self._retractions = job.retractions
+        elif model is None:
+            model = self._restored(ledger)
         if model is None or behind is None or _outgrown(model, memory):
             return self._fitted(memory)
         if behind:
@@ -97,7 +109,8 @@ class CurrentModel:
         with suppress(MemoryError, InputError, RuntimeError):
             draft = Draft.of(memory, self._kind, model)
             self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-            self._job = _Job(self._worker.submit(draft.fit, rehearsed=self._rehearses))
+            fitted = self._worker.submit(draft.fit, rehearsed=self._rehearses)
+            self._job = _Job(fitted, memory.retractions)
 
     def rehearsed(self, ledger: Ledger) -> Model:
         """The present model with the trajectories of held-out touches; fits have them from now on."""
@@ -113,10 +126,29 @@ class CurrentModel:
             return self._fitted(memory)
         return self._model
 
+    def _restored(self, ledger: Ledger) -> Model | None:
+        """The model by the weighing of the checkpoint that the memory was read from; None where it has none that fits.
+
+        It was fitted to these touches or to fewer: a retraction drops it.
+        """
+        if (text := ledger.take_weighing()) is None:
+            return None
+        try:
+            return read_weighing(text, Draft.of(ledger.memory, self._kind).solved(), ledger.memory)
+        except ValueError as error:
+            logger.warning("the weighing in the memory's checkpoint is not used, and fitted anew: %.300s", error)
+            return None
+
+    def stored(self, ledger: Ledger) -> str | None:
+        """The weighing of the present model, for a checkpoint; None where there is none of touches that all count."""
+        if self._model is None or self._retractions != ledger.memory.retractions:
+            return None
+        return weighing_text(self._model)
+
     def _fitted(self, memory: Memory) -> Model:
         self._model, self._job = None, None
         self._model = model = Draft.of(memory, self._kind).fit(rehearsed=self._rehearses)
-        self._behind, self._exact = set(), True
+        self._behind, self._exact, self._retractions = set(), True, memory.retractions
         return model
 
     def close(self) -> None:

@@ -45,7 +45,7 @@ from scroll_tactile.readouts.calibration import (
 )
 from scroll_tactile.readouts.dependence import dependence_of
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
-from scroll_tactile.readouts.readout import Readout, ReadoutName
+from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
@@ -109,29 +109,35 @@ class Draft:
 
     def fit(self, *, rehearsed: bool = False) -> Model:
         """Solve the readouts and weigh them. Can be called once: it frees the tasks. rehearsed: with trajectories."""
+        model = self.solved()
+        with one_thread():
+            if (weighing := _weighed(self, model)) is not None and model.matcher is not None:
+                weighing, matcher = _by_kept_touches(weighing, model.matcher)
+                model = replace(model, matcher=matcher)
+        model = replace(model, weighing=weighing)
+        if rehearsed:
+            rehearse(model)
+        give_back_scratch()
+        return model
+
+    def solved(self) -> Model:
+        """A model without a weighing. Can be called once: it frees the tasks."""
         with one_thread():
             # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
-            weighing = _Fit(self, readouts).weighing() if readouts else None
             matcher, conformal = self._matched()
-            if weighing is not None and matcher is not None:
-                weighing, matcher = _by_kept_touches(weighing, matcher)
-        model = Model(
+        return Model(
             kind=self.kind,
             plan=self.plan,
             names=self.names,
             stages=self.stages,
             views=self.views,
             readouts=readouts,
-            weighing=weighing,
+            weighing=None,
             matcher=matcher,
             conformal=conformal,
             longest=self.longest,
         )
-        if rehearsed:
-            rehearse(model)
-        give_back_scratch()
-        return model
 
     def _matched(self) -> tuple[TouchMatcher | None, Conformal | None]:
         """What touches are matched by, where any are kept."""
@@ -144,49 +150,39 @@ class Draft:
         return TouchMatcher.of(KeptArrays.of(self.kept)), Conformal.of(self.kept)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """One fit: a draft and its solved readouts."""
+def _weighed(draft: Draft, model: Model) -> Weighing | None:
+    """How the readouts are to be believed; None where no touch reached a stage."""
+    reached = [scales for scales in model.stages if all(scale in model.readouts for scale in scales)]
+    if not reached:
+        return None
+    last, milestones = len(reached) - 1, model.plan.milestones()
+    held_out = held_out_of(model.readouts, draft.sample, model.stages, model.views, model.kind)
 
-    draft: Draft
-    readouts: dict[Scale, Readout]
-
-    def weighing(self) -> Weighing | None:
-        """How the readouts are to be believed; None where no touch reached a stage."""
-        draft = self.draft
-        reached = [scales for scales in draft.stages if all(scale in self.readouts for scale in scales)]
-        if not reached:
-            return None
-        last, milestones = len(reached) - 1, draft.plan.milestones()
-        held_out = held_out_of(self.readouts, draft.sample, draft.stages, draft.views, draft.kind)
-        rows = [self._row(i, scales, milestones[i], held_out)[0] for i, scales in enumerate(reached)]
-        complete, held = self._row(last, [*reached[last], *draft.views], draft.least, held_out)
-        if len(held.keys):
-            complete = replace(complete, distance_limit=float(np.quantile(held.distance, WITHIN)))
-        paced = self._row(last, draft.views, 1, held_out)[0] if draft.views else complete
-        return Weighing(
-            rows=tuple(rows),
-            complete=complete,
-            paced=paced,
-            tau=UNMATCHED,
-            dependence=dependence_of(held),
-            least=draft.least,
-            touches=draft.touches,
-            sample=draft.sample,
-            held_out=held_out,
-        )
-
-    def _row(
-        self, stage: int, scales: Sequence[Scale], steps: int, held_out: dict[Scale, HeldOutScores]
-    ) -> tuple[Row, HeldOutProbabilities]:
+    def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
         """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
-        found = StageScores(stage, self.draft.sample, [held_out[scale] for scale in scales])
-        readouts = [self.readouts[scale] for scale in scales]
-        calibration = calibrate_stage(found, readouts, self.draft.kind, viewed=bool(self.draft.views))
+        found = StageScores(stage, draft.sample, [held_out[scale] for scale in scales])
+        readouts = [model.readouts[scale] for scale in scales]
+        calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views))
         held = held_out_probabilities(found, scales, calibration)
         own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
         rate = _outlier_rate(own, len(held.names)) if len(own) else 0.0
         return Row(steps, tuple(scales), calibration, rate, rate), held
+
+    rows = [row(stage, scales, milestones[stage])[0] for stage, scales in enumerate(reached)]
+    complete, held = row(last, [*reached[last], *model.views], draft.least)
+    if len(held.keys):
+        complete = replace(complete, distance_limit=float(np.quantile(held.distance, WITHIN)))
+    return Weighing(
+        rows=tuple(rows),
+        complete=complete,
+        paced=row(last, model.views, 1)[0] if model.views else complete,
+        tau=UNMATCHED,
+        dependence=dependence_of(held),
+        least=draft.least,
+        touches=draft.touches,
+        sample=draft.sample,
+        held_out=held_out,
+    )
 
 
 def _outlier_rate(own: FloatArray, materials: int) -> float:

@@ -264,6 +264,7 @@ class Predictor:
     def settle(self) -> None:
         """As `TactileLearner.settle`."""
         with self.ledger.lock, enough_memory():
+            self.ledger.memory.weighings.clear()  # an axis that is asked later is fitted, too
             for predictor in (self, *self._axes.values()):
                 predictor.current.settle(predictor.ledger)
 
@@ -276,9 +277,12 @@ class Predictor:
     def close(self) -> None:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
-            for predictor in (self, *self._axes.values()):
+            predictors = {"": self, **self._axes}
+            for predictor in predictors.values():
                 predictor.current.close()
-            self.ledger.close({HEALTH: partial(health_to_store, self.ledger)})
+            texts = {axis: predictor.current.stored(predictor.ledger) for axis, predictor in predictors.items()}
+            weighings = {axis: text for axis, text in texts.items() if text is not None}
+            self.ledger.close({HEALTH: partial(health_to_store, self.ledger)}, weighings)
 
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""

@@ -38,6 +38,7 @@ from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.results import Observation, Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings, validate
+from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
 __all__ = ["MOST_NEAR", "Growing", "MemoryFacts", "bins_of", "mistakes", "unknown_by"]

@@ -1,8 +1,8 @@
 """The weighing of a model as text in a checkpoint, so that the next opening only solves the readouts.
 
-It is some thousand numbers, and says nothing of any single touch. A file may come from elsewhere: fields, lengths and
-bounds are checked against the memory, so that no prediction fails because of it. Whether the numbers are the fitted ones
-cannot be checked. What another release or readout wrote is not used, and the weighing is fitted anew.
+It is some thousand numbers. A file may come from elsewhere: fields, lengths and bounds are checked against the memory,
+so that no prediction fails because of it. Whether the numbers are the fitted ones cannot be checked. What another
+release or readout wrote is not used, and the weighing is fitted anew.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ class StoredRow(_Stored):
         arrays = {name: values.tolist() for name, values in vars(row.calibration).items()}
         own = {name: value for name, value in vars(row).items() if name not in ("calibration", "scales", "excess")}
         arrays["scale_novelty"] = [tuple(pair) for pair in arrays["scale_novelty"]]
-        return cls(scales=list(map(int, row.scales)), excess=tuple(map(float, row.excess)), **own, **arrays)
+        return cls(scales=list(map(int, row.scales)), excess=row.excess, **own, **arrays)
 
     def row(self, scales: tuple[Scale, ...]) -> Row:
         """The row, if it is of these scales. Raises Unexpected."""
-        expect(self.scales == list(map(int, scales)), "scales", list(map(int, scales)), self.scales)
+        expect(self.scales == list(map(int, scales)), "scales", f"{scales}", self.scales)
         lengths = len(self.weights), len(self.median_distances), len(self.scale_novelty)
         expected = len(scales), len(scales), len(measuring(scales))
-        expect(lengths == expected, "weights", expected, lengths)
+        expect(lengths == expected, "weights", f"{expected} of them", lengths)
         for name in ("novelties", "novelties_if_new"):
             expect(getattr(self, name) == sorted(getattr(self, name)), name, "ascending", "others")
         expect(len(self.novelties) == len(self.novelties_if_new), "novelties", "as many", "others")
@@ -130,10 +130,10 @@ def weighing_text(model: Model) -> str | None:
             most=own.most,
         )
     if weighing.paces is not None:
-        pairs = [
-            [tuple(pair) for pair in part] for part in (weighing.paces.own.tolist(), *weighing.paces.others.tolist())
-        ]
-        paces = StoredPaces(own=pairs[0], others=(pairs[1], pairs[2]))
+        own, *others = (
+            [tuple(pair) for pair in part.tolist()] for part in (weighing.paces.own, *weighing.paces.others)
+        )
+        paces = StoredPaces(own=own, others=tuple(others))
     return StoredWeighing(
         made_by=MADE_BY,
         kind=model.kind,
@@ -156,13 +156,15 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
         expect(getattr(found, field) == expected, field, expected, getattr(found, field))
     reached = model.stages[: len(found.rows)]
     expect(all(scale in model.readouts for stage in reached for scale in stage), "rows", "reached stages", len(reached))
-    expect(len(reached) == len(found.rows), "rows", len(model.stages), len(found.rows))
+    expect(len(reached) == len(found.rows), "rows", f"{len(model.stages)} or fewer", len(found.rows))
     complete = (*reached[-1], *model.views)
     paces, matcher = None, model.matcher
     if found.paces is not None:
         arrays = np.array(found.paces.own), np.array(found.paces.others)
         shape = len(measuring(model.views)) + 1, 2
-        expect(bool(model.views) and [each.shape for each in arrays] == [shape, (2, *shape)], "paces", shape, "others")
+        expect(
+            bool(model.views) and [each.shape for each in arrays] == [shape, (2, *shape)], "paces", f"{shape}", "others"
+        )
         paces = Paces(*arrays)
     if matcher is not None:
         expect(found.deviation is not None, "deviation", "one", None)

@@ -144,33 +144,12 @@ class InverseTriangle:
     """
 
     def __init__(self, matrix: FloatArray) -> None:
-        edges = pairwise(_edges(len(matrix)))
-        self._blocks = [(first, last, matrix[first:last, :last].copy()) for first, last in edges]
-        self._invert(self._factorised())
-
-    def _factorised(self) -> list[FloatArray]:
-        """Turn the blocks of K into those of L below their own columns. Returns L⁻¹ of these columns, block by block.
-
-        Each is inverted once, in place of a solution for each block below it.
-        """
-        inverses = []
-        for i, (first, last, block) in enumerate(self._blocks):
-            inverses.append(np.tril(np.linalg.inv(np.linalg.cholesky(block[:, first:]))))
-            for _, _, below in self._blocks[i + 1 :]:
-                below[:, first:last] = below[:, first:last] @ inverses[i].T
-            for j, (start, stop, row) in enumerate(self._blocks[i + 1 :], i + 1):
-                for _, _, below in self._blocks[j:]:
-                    below[:, start:stop] -= below[:, first:last] @ row[:, first:last].T
-        return inverses
-
-    def _invert(self, inverses: list[FloatArray]) -> None:
-        """Turn the blocks of L into those of L⁻¹, from above: a block needs those before it, inverted already."""
-        for i, (first, _, block) in enumerate(self._blocks):
-            sums = np.zeros((len(block), first))
-            for start, stop, above in self._blocks[:i]:
-                sums[:, :stop] += block[:, start:stop] @ above
-            block[:, :first] = -inverses[i] @ sums
-            block[:, first:] = inverses[i]
+        self._blocks: list[tuple[int, int, FloatArray]] = []
+        for first, last in pairwise(_edges(len(matrix))):
+            # Rows of L before the diagonal: those of K times the transposed L⁻¹ of all above. Bordering then gives L⁻¹.
+            above = self.times(matrix[first:last, :first])
+            own = np.tril(np.linalg.inv(np.linalg.cholesky(matrix[first:last, first:last] - above @ above.T)))
+            self._blocks.append((first, last, np.hstack([-own @ self.transposed_times(above), own])))
 
     def times(self, rows: FloatArray) -> FloatArray:
         """L⁻¹ times each of the rows, shape (k, d)."""

@@ -20,17 +20,22 @@ roughness and trend: with them the first 0.3 s of BioTac's touches are recognise
 
 from __future__ import annotations
 
+import hashlib
+import tempfile
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate, combinations, pairwise
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import native
 from scroll_tactile.blas import one_thread
+from scroll_tactile.embeddings.protocol import cache_folder
 
 __all__ = [
     "GROUP",
@@ -77,6 +82,8 @@ MANY_CHANNELS = 32
 SIZE_OF_OTHERS = ROUND
 
 SIMULATED = 48  # streams for the thresholds
+MADE = 1  # in the names of kept thresholds: of how they are made
+DIGEST_BYTES = 32
 GOLDEN = (5**0.5 + 1) / 2
 
 # Of triangle features:
@@ -205,7 +212,10 @@ def to_levels(image: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
 
 @lru_cache(maxsize=64)
 def bank(seed: int, channels: int, dilation: int) -> Bank:
-    """Make the bank of a dilation for images of `channels` rows; the same arguments give the same bank."""
+    """The bank of a dilation for images of `channels` rows; the same arguments give the same bank.
+
+    Its thresholds, half a second's work for all dilations of a touch, are kept in the user's cache.
+    """
     rng = np.random.default_rng([seed, channels, dilation])
     count = bank_size(channels, dilation)
     # In each round of 84 all positions of the heavy taps, shuffled.
@@ -219,7 +229,34 @@ def bank(seed: int, channels: int, dilation: int) -> Bank:
         chosen = min(most, int((most + 1) ** rng.random()))
         summed[row, rng.permutation(channels)[:chosen]] = 1
     without = Bank(dilation, summed, rows, np.empty((0, count), dtype=np.float32))
-    return replace(without, thresholds=_thresholds(rng, without, channels))
+    name = f"{MADE}-{seed}-{channels}-{dilation}"
+    kept = _kept_thresholds(name, (THRESHOLDS, count))
+    if kept is None:
+        kept = _thresholds(rng, without, channels)
+        _keep(name, kept)
+    return replace(without, thresholds=kept)
+
+
+def _kept_thresholds(name: str, shape: tuple[int, int]) -> Floats | None:
+    """The thresholds of a file of the cache; None where it is missing or damaged."""
+    try:
+        data = (cache_folder("banks") / name).read_bytes()
+    except (OSError, RuntimeError):
+        return None
+    digest, kept = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
+    whole = hashlib.sha256(kept).digest() == digest and len(kept) == 4 * shape[0] * shape[1]
+    return np.frombuffer(kept, "<f4").astype(np.float32).reshape(shape) if whole else None
+
+
+def _keep(name: str, thresholds: Floats) -> None:
+    """Write a file of the cache, whole or not at all; where there is no room for it, none."""
+    kept = thresholds.astype("<f4").tobytes()
+    with suppress(OSError, RuntimeError):
+        path = cache_folder("banks") / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as draft:
+            draft.write(hashlib.sha256(kept).digest() + kept)
+        Path(draft.name).replace(path)
 
 
 def _thresholds(rng: np.random.Generator, kernels: Bank, channels: int) -> Floats:

@@ -6,7 +6,6 @@ least. Beside the proportions they gain 0.84 ± 0.26 points, the mean over fourt
 
 from __future__ import annotations
 
-import copy
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -105,25 +104,10 @@ class Kernels:
             raise InputError(f"seed must not be negative; came {seed}")
         self.seed = seed
         self.dimension = dimension
-        self._given: Mapping[tuple[int, int], Bank] | None = None
-        self._used: set[tuple[int, int]] = set()
-
-    def banks(self) -> dict[tuple[int, int], Bank]:
-        """The banks that were used or given, by channels and dilation."""
-        return {key: self.bank_of(*key) for key in sorted({*self._used.copy(), *(self._given or ())})}
-
-    def with_banks(self, banks: Mapping[tuple[int, int], Bank]) -> Kernels:
-        """The same embedding with some banks that need not be made: a fifth of a second before the first touch."""
-        other = copy.copy(self)
-        other._given, other._used = dict(banks), set()
-        other.__dict__.pop("fingerprint", None)  # it shows what these banks give
-        return other
 
     def bank_of(self, channels: int, dilation: int) -> Bank:
         """The kernels of a dilation, for images of so many channels."""
-        self._used.add((channels, dilation))
-        given = None if self._given is None else self._given.get((channels, dilation))
-        return bank(self.seed, channels, dilation) if given is None else given
+        return bank(self.seed, channels, dilation)
 
     def __repr__(self) -> str:
         return f"Kernels(seed={self.seed}, dimension={self.dimension})"

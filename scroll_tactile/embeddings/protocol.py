@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -21,6 +23,7 @@ __all__ = [
     "CompositeEmbedding",
     "Embedding",
     "WindowEmbedding",
+    "cache_folder",
     "canary",
     "capabilities_of",
     "embed_competing",
@@ -247,3 +250,12 @@ def canary(channels: int, steps: int) -> npt.NDArray[np.float32]:
     """
     place = np.arange(channels * steps).reshape(channels, steps)
     return np.asarray((place * (place + 7) * 13 % 255) / 127.0 - 1, np.float32)
+
+
+def cache_folder(what: str) -> Path:
+    """Where files are kept that can be made again: in $SCROLL_TACTILE_CACHE, or in the user's cache of scroll-tactile.
+
+    Raises RuntimeError for a user without a home.
+    """
+    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.environ.get("SCROLL_TACTILE_CACHE") or f"{cache}/scroll-tactile").expanduser() / what

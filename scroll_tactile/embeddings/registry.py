@@ -21,7 +21,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from scroll_tactile.embeddings.kernels import LEAST_FEATURES, MOST_FEATURES
-from scroll_tactile.embeddings.protocol import Embedding
+from scroll_tactile.embeddings.protocol import Embedding, cache_folder
 from scroll_tactile.errors import EmbeddingError
 
 __all__ = [
@@ -203,11 +203,11 @@ def _weighted(make: Callable[..., Any], held: WeightsConfiguration | None, **set
 
 def _source(held: WeightsConfiguration, kind: str) -> str | Path:
     """The published name, or the file of that name in the cache folder of weights."""
-    from scroll_tactile.embeddings.weights import PUBLISHED, cache_folder
+    from scroll_tactile.embeddings.weights import PUBLISHED
 
     if held.name in PUBLISHED:
         return held.name
-    folder = cache_folder()
+    folder = cache_folder("weights")
     if held.name is not None and (folder / held.name).is_file():
         return folder / held.name
     came, put = ("a state dict", "") if held.name is None else (repr(held.name), f", or put that file into {folder}")

@@ -17,6 +17,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
+from scroll_tactile.embeddings.protocol import cache_folder
 from scroll_tactile.embeddings.resnet import ResNet, Stem
 from scroll_tactile.errors import WeightsError
 from scroll_tactile.libraries import optional
@@ -25,9 +26,7 @@ with optional("torch", "torch", "a network's weights"):
     import torch
 
 __all__ = [
-    "CACHE_VARIABLE",
     "PUBLISHED",
-    "cache_folder",
     "digest_of",
     "hash_tensors",
     "load_network",
@@ -39,7 +38,6 @@ Tensors = dict[str, torch.Tensor]
 
 # torchvision's; a name ends in the first eight hex digits of the file's SHA-256.
 PUBLISHED: Final = {"resnet18": "https://download.pytorch.org/models/resnet18-f37072fd.pth"}
-CACHE_VARIABLE: Final = "SCROLL_TACTILE_CACHE"
 CONTAINERS = ("state_dict", "model_state_dict", "model", "net", "backbone")  # under which checkpoints keep the tensors
 PREFIXES = re.compile(r"^(?:(?:module|backbone|model|encoder|net)\.)+")  # left by wrappers around the network
 HEADS = re.compile(r"^(?:fc|cls_fn|classifier)\.|(?:^|\.)num_batches_tracked$")
@@ -138,16 +136,10 @@ def _network_of(tensors: Mapping[str, Any], where: str) -> ResNet:
     return net
 
 
-def cache_folder() -> Path:
-    """Where fetched weights are kept: weights/ in $SCROLL_TACTILE_CACHE, or in the user's cache of scroll-tactile."""
-    cache = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(os.environ.get(CACHE_VARIABLE) or f"{cache}/scroll-tactile").expanduser() / "weights"
-
-
 def _published(name: str) -> Path:
     """The file of a published name, fetched where the cache has none."""
     url = PUBLISHED[name]
-    path = cache_folder() / url.rsplit("/", 1)[1]
+    path = cache_folder("weights") / url.rsplit("/", 1)[1]
     expected = path.stem.rsplit("-", 1)[1]
     if not path.is_file():
         try:

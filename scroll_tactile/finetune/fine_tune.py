@@ -187,7 +187,7 @@ def _samples(
     progress: Progress,
 ) -> Iterator[TrainingSample]:
     """The exemplars that reach the last stage, by material and rank."""
-    if len(model.calibrations) < len(model.stages):  # nothing was observed for long enough
+    if len(model.fitted.rows) < len(model.stages):  # nothing was observed for long enough
         return
     known = {name for name in model.names if all(name in model.readouts[s].places for s in model.stages[-1])}
     buffered = [(name, exemplar) for name in sorted(exemplars) for exemplar in exemplars[name]]
@@ -274,7 +274,7 @@ class Trained:
 def start_of(model: Model, names: Sequence[str], readouts: Mapping[Scale, Readout] | None = None) -> Start:
     """f's own readouts at the last stage as one linear head; or others in their place."""
     heads, bias = {}, np.zeros(len(names))
-    for scale, weight in zip(model.stages[-1], model.calibrations[-1].weights, strict=True):
+    for scale, weight in zip(model.stages[-1], model.fitted.rows[-1].calibration.weights, strict=True):
         readout = (readouts or model.readouts)[scale]
         slopes, offsets = readout.linear(names, model.kind)
         heads[scale.width] = np.ascontiguousarray(weight * slopes * 2.0**BITS)  # as it will lie when it is read again

@@ -1,7 +1,7 @@
 """When a prediction is made within a touch, and when it is safe to act on.
 
 A touch is decided at the first moment at which its prediction is known and its probability is at least `sure`, or at
-which its novelty is at least `least_new`. Held-out touches, run through all moments (see `prediction.moment_table`),
+which its novelty is at least `least_new`. Held-out touches, run through all rows (see `fitting.rehearse`),
 set both. `least_new` is a novelty that none of them comes near. `sure` is the least probability for which, as for every
 higher one, few enough of the n held-out touches are decided wrongly:
 
@@ -24,8 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.moment_table import Trajectories
+from scroll_tactile.prediction.model import Model, Trajectories
 from scroll_tactile.readouts.calibration import FEWEST, UNMEASURED
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction
@@ -77,17 +76,19 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     """
     if not 0 < risk < 1:
         raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
-    least = max(1, min(model.least, model.longest))
-    held_out = None if model.fusion is None else model.fusion.trajectories
-    if model.fusion is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
+    weighing = model.weighing
+    least = 1 if weighing is None else weighing.least
+    held_out = None if weighing is None else weighing.trajectories
+    if weighing is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
         return DecisionRule((least,), risk, sure=1 - risk, together=1 - risk, least_new=2 * UNMEASURED)
-    moments = model.fusion.moments[:-1]
-    thresholds = np.array([np.quantile(m.novelties, KNOWN) if len(m.novelties) else np.inf for m in moments])
+    rows = weighing.early
+    known_ones = [row.calibration.novelties for row in rows]
+    thresholds = np.array([np.quantile(own, KNOWN) if len(own) else np.inf for own in known_ones])
     sure = _least_sure_of(held_out, held_out.novelty <= thresholds, risk)
-    pairs, known = in_pairs(held_out, thresholds, model.dependence)
+    pairs, known = in_pairs(held_out, thresholds, weighing.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk
     return DecisionRule(
-        moments=(*(moment.steps for moment in moments), least),
+        moments=(*(row.steps for row in rows), least),
         risk=risk,
         sure=sure,
         together=max(sure, together),

@@ -23,10 +23,9 @@ from scroll_tactile.live.answers import End, LiveReport, LiveState, LiveTouch
 from scroll_tactile.live.clock import Clock
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.live.detector import ContactDetector, Event, PressDetector
-from scroll_tactile.prediction.current import FrozenModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, WindowCache
 from scroll_tactile.prediction.judging import estimates_of
-from scroll_tactile.prediction.model import Model
+from scroll_tactile.prediction.model import Model, Weighing
 from scroll_tactile.prediction.predictor import Predictor, nothing_known
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.results import Estimate, Health, Prediction
@@ -117,7 +116,7 @@ class GrowingTouch:
     rows: list[Array]
     limit: int
     at: float
-    frozen: FrozenModel
+    model: Model
     rule: DecisionRule
     moments: list[int]
     earlier: tuple[Stream, ...]
@@ -166,15 +165,13 @@ class GrowingTouch:
             return self.prediction
         self.encoded = self.encoded or [self._encoded(each, WindowCache()) for each in self.earlier]
         current = self._encoded(stream, self.cache)
-        self.prediction = self.predictor.answer_of(
-            self.frozen.model, self.extractor, self.candidates, [*self.encoded, current]
-        )
+        self.prediction = self.predictor.answer_of(self.model, self.candidates, [*self.encoded, current])
         self.decided |= self.rule.decided(self.prediction, current.steps, several=bool(self.earlier))
         self._estimate(current, self.prediction)
         return self.prediction
 
     def _encoded(self, stream: Stream, cache: WindowCache) -> Encoded:
-        model, estimator = self.frozen.model, self.estimator
+        model, estimator = self.model, self.estimator
 
         def scales_for(steps: int) -> list[Scale]:
             own = model.scales_for(self.candidates, steps)
@@ -220,12 +217,11 @@ class LiveSession:
             raise InputError(f"expected contact as 'auto' or 'manual'; came {contact!r}")
         if not 0 < false_contacts < math.inf:
             raise InputError(f"expected false_contacts an hour above 0 and finite; came {false_contacts!r}")
-        self._predictor, self._extractor, self._risk = predictor, predictor.reading(), risk
+        self._predictor, self._extractor, self._risk = predictor, predictor.extractor.verified(), risk
         self.sensor = sensor = predictor.recipe.sensor
         rest = capabilities_of(self._extractor.embedding).rest
         self._before = int(sensor.camera and isinstance(rest, str))  # frames that are no part of a touch
-        frozen = predictor.frozen()  # until the rule is measured, which takes seconds
-        model = frozen.model
+        model = predictor.rehearsed()
         candidates_of(scene, model.names, model.known)
         self._scene, self._widths = scene, _checked(predictor, widths)
         self._manual, self._notes = contact == "manual", notes
@@ -248,9 +244,9 @@ class LiveSession:
         self._again = False  # whether the next touch is one more of them
         self._closed = self._settled = False
         self.touch: Stream | None = None
-        first = model not in _RULES
+        first = model.weighing is not None and model.weighing not in _RULES
         rule = self._rule(model, risk)
-        if first and model.names and not sensor.camera:
+        if first and not sensor.camera:
             self._warm_up(model, rule)
 
     def push(self, reading: npt.ArrayLike, time: Any = None) -> LiveState:
@@ -328,7 +324,7 @@ class LiveSession:
         Raises what `TactileLearner.live` raises for these, and InputError after `close`. Then nothing has changed.
         """
         self._require_open()
-        model = self._predictor.frozen().model
+        model = self._predictor.rehearsed()
         candidates_of(scene, model.names, model.known)
         self._rule(model, risk)
         self._scene, self._risk = scene, risk
@@ -415,8 +411,7 @@ class LiveSession:
     def _begin(self, rows: Array, rest: Array | None = None) -> None:
         """A touch began with these readings, after those at rest."""
         self._recent.clear()
-        frozen = self._predictor.frozen()
-        model, scene = frozen.model, self._scene
+        model, scene = self._predictor.rehearsed(), self._scene
         rule = self._rule(model, self._risk)
         prefix = None if self._detector is None else self._detector.prefix
         before, frame, limit = self._before, 1, max(round(KEPT * self.sensor.rate), 4 * model.longest)
@@ -432,7 +427,7 @@ class LiveSession:
             rows=[],
             limit=limit,
             at=self._since + (self._came - max(0, len(rows) - before)) / self.sensor.rate,
-            frozen=frozen,
+            model=model,
             rule=rule,
             moments=sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True),
             earlier=earlier,
@@ -445,8 +440,10 @@ class LiveSession:
         self._under_way.predict_in_time()
 
     def _rule(self, model: Model, risk: float) -> DecisionRule:
-        """When predictions are made with a model, and when they are decided; once for each model."""
-        known = _RULES.setdefault(model, {})
+        """When predictions are made with a model, and when they are decided; found once for each fit."""
+        if model.weighing is None:
+            return decision_rule(model, risk)
+        known = _RULES.setdefault(model.weighing, {})
         if risk not in known:
             known[risk] = decision_rule(model, risk)
         return known[risk]
@@ -460,7 +457,7 @@ class LiveSession:
             encoded = self._extractor.encode(
                 stream, model.longest, lambda steps: model.scales_for(model.names, steps), cache
             )
-            self._predictor.answer_of(model, self._extractor, model.names, [encoded])
+            self._predictor.answer_of(model, model.names, [encoded])
 
     def _end(self, end: End) -> None:
         """The touch under way, if any, is over."""
@@ -545,7 +542,7 @@ def _is_touch(predictor: Predictor, rows: Array) -> bool:
     beginning of one, were touches in 12 of 60 rests of RoboSkin, these in none. What is like a learned touch but for
     its level, or through noise alone, is rest: it has no features but noise.
     """
-    model = predictor.frozen().model
+    model = predictor.present()
     if not model.names:
         return False
     n = model.longest
@@ -576,4 +573,4 @@ def _says(prediction: Prediction) -> str | None:
     return None if prediction.known is False else prediction.material
 
 
-_RULES: WeakKeyDictionary[Model, dict[float, DecisionRule]] = WeakKeyDictionary()  # by risk
+_RULES: WeakKeyDictionary[Weighing, dict[float, DecisionRule]] = WeakKeyDictionary()  # by risk

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scroll_tactile import native
 from scroll_tactile.matching.likelihood import MISSING, LevelArray
 
-__all__ = ["QUARTERS", "compiled", "log_sums_by_c", "log_sums_by_numpy", "mean_distances"]
+__all__ = ["QUARTERS", "compiled", "log_sums", "mean_distances"]
 
 AT_ONCE = 128  # kept touches whose means are multiplied at once: more leave the processor's cache
 QUARTERS = 4  # steps of a guess in one level
@@ -30,16 +30,19 @@ def compiled() -> bool:
     return native.available and _agrees()
 
 
-def log_sums_by_c(own: LevelArray, others: LevelArray, logs: npt.NDArray[np.int16]) -> IntArray:
+def log_sums(own: LevelArray, others: LevelArray, logs: npt.NDArray[np.int16]) -> IntArray:
     """Sums of `Table.logs`, (others,), over the values of a touch (values,) beside each of others (others, values)."""
+    return (_log_sums_by_c if compiled() else _log_sums_by_numpy)(own, others, logs)
+
+
+def _log_sums_by_c(own: LevelArray, others: LevelArray, logs: npt.NDArray[np.int16]) -> IntArray:
     sums = np.empty(len(others), np.int64)
-    native.sum_logs(own, others, logs, sums)
+    native.sum_logs(np.ascontiguousarray(own), np.ascontiguousarray(others), logs, sums)
     return sums
 
 
-def log_sums_by_numpy(places: npt.NDArray[np.intp], logs: npt.NDArray[np.int16]) -> IntArray:
-    """The same. places: 256 · own level + other level, (others, values)."""
-    return np.asarray(logs.take(places).sum(axis=1, dtype=np.int64))
+def _log_sums_by_numpy(own: LevelArray, others: LevelArray, logs: npt.NDArray[np.int16]) -> IntArray:
+    return np.asarray(logs.take((own.astype(np.intp) << 8) | others).sum(axis=1, dtype=np.int64))
 
 
 def mean_distances(rows: LevelArray, guesses: Guesses, known: Known) -> FloatArray:
@@ -77,7 +80,7 @@ def _agrees() -> bool:
     levels = rng.choice([0, 1, 100, MISSING - 1, MISSING], (6, 301)).astype(np.uint8)
     logs = rng.integers(-(2**15), 2**15, 256 * 256).astype(np.int16)
     guesses = rng.choice([-MOST_GUESS, -1, 4, MOST_GUESS], (3, 301)).astype(np.int16)
-    known, places = rng.random(301) < 0.8, (levels[0].astype(np.intp) << 8) | levels
-    by_c = log_sums_by_c(levels[0], levels, logs), *_distances_by_c(levels, guesses, known)
-    by_numpy = log_sums_by_numpy(places, logs), *_distances_by_numpy(levels, guesses, known)
+    known = rng.random(301) < 0.8
+    by_c = _log_sums_by_c(levels[0], levels, logs), *_distances_by_c(levels, guesses, known)
+    by_numpy = _log_sums_by_numpy(levels[0], levels, logs), *_distances_by_numpy(levels, guesses, known)
     return all(np.array_equal(one, other) for one, other in zip(by_c, by_numpy, strict=True))

@@ -1,142 +1,145 @@
-"""Kept touches in rows, with the arrays that a matcher compares a touch with: made, written, read and followed.
+"""Kept touches in rows, with the arrays that a matcher compares a touch with.
 
 And levels between those that were read: between the steps of a touch, over blocks of it, and among several touches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.comparing import QUARTERS, mean_distances
-from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
+from scroll_tactile.matching.likelihood import MISSING, LevelArray
 from scroll_tactile.matching.match import KeptTouch
 
-__all__ = ["KeptArrays", "at_places", "blends", "block_means", "unchanging", "weighted_means"]
+__all__ = ["Blocks", "KeptArrays", "at_places", "first_changes", "weighted_means"]
 
 FloatArray = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.intp]
 
 BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
+COARSER = 8  # times wider blocks, that say which touches are near at all; and of touches of another speed no more
+ENOUGH = 32  # blocks that a touch reaches: with fewer there are no wider ones
 GUESSED = (-256.0, 510.0)  # levels: a guess of what was before noise may lie beyond the range
-COARSER = 8  # blocks in one where touches of another speed are compared: finer ones are not side by side
+NEGLIGIBLE = 1e-6  # of the largest weight in a mean
 
 
-@dataclass
-class _Parts:
-    """What is made of kept touches, row by row, with room for more.
+class _Parts(NamedTuple):
+    """What is made of each kept touch, once; row by row.
 
-    blocks: means, rounded to levels, MISSING where nothing was read, (touches, C · B). wide_blocks: means over wider
-    blocks of each touch's own length, (touches, C · B'). columns: the length of each. gapless: whether it has a value
-    everywhere. unchanging: the channels that never change, (touches, C).
+    blocks: means, rounded to levels, MISSING where nothing was read, (touches, B, C). coarse: the same of wider ones,
+    (touches, B', C). relative: of wider ones in each touch's own length. columns: the length of each. gapless: whether
+    it has a value everywhere, up to the longest. first: the column of each channel's first change, the touch's length
+    where it never changes, (touches, C).
     """
 
     blocks: LevelArray
-    wide_blocks: LevelArray
+    coarse: LevelArray
+    relative: LevelArray
     columns: Rows
     gapless: npt.NDArray[np.bool_]
-    unchanging: npt.NDArray[np.bool_]
+    first: Rows
 
     @classmethod
-    def empty(cls, count: int, channels: int, edges: Rows) -> _Parts:
-        """Room for so many touches."""
+    def of(cls, touches: Sequence[LevelArray], longest: int) -> _Parts:
+        fine, wide = _edges(longest, len(touches[0]))
         return cls(
-            np.empty((count, channels * (len(edges) - 1)), np.uint8),
-            np.empty((count, channels * (len(edges[::COARSER]) - 1)), np.uint8),
-            np.empty(count, np.intp),
-            np.empty(count, np.bool_),
-            np.empty((count, channels), np.bool_),
+            np.stack([_block_levels(levels, fine) for levels in touches]),
+            np.stack([_block_levels(levels, wide) for levels in touches]),
+            np.stack([_block_levels(levels, wide * levels.shape[1] // longest) for levels in touches]),
+            np.array([levels.shape[1] for levels in touches]),
+            np.array([levels.shape[1] == longest and MISSING not in levels for levels in touches]),
+            np.stack([first_changes(levels) for levels in touches]),
         )
 
-    def take(self, other: _Parts, count: int) -> None:
-        for name in PARTS:
-            getattr(self, name)[:count] = getattr(other, name)[:count]
 
-    def move(self, row: int, to: int) -> None:
-        for name in PARTS:
-            getattr(self, name)[to] = getattr(self, name)[row]
+@dataclass(frozen=True)
+class Blocks:
+    """Block means of a touch beside those of all kept touches.
 
+    means: levels, (B, C), 0 where nothing was read. known: where something was. kept: (touches, B'', C), B'' ≥ B.
+    """
 
-PARTS = tuple(field.name for field in fields(_Parts))
+    means: FloatArray
+    known: npt.NDArray[np.bool_]
+    kept: LevelArray
+
+    def distances(self, lines: Iterable[tuple[float, float]], rows: Rows) -> FloatArray:
+        """Mean squared distances of kept touches from the touch before noise, (rows, lines), over what both have.
+
+        lines: offset and slope of a noise, each; see `Table`. Whole numbers of quarters of a level, divided once: the
+        same on every machine. The largest float where both have no block.
+        """
+        guesses = np.stack([(self.means - offset) / slope for offset, slope in lines]).reshape(-1, self.means.size)
+        steps = np.rint(np.clip(guesses, *GUESSED) * QUARTERS).astype(np.int16)
+        kept = self.kept[rows, : len(self.means)].reshape(len(rows), self.means.size)
+        return mean_distances(kept, steps, self.known.ravel())
 
 
 class KeptArrays:
-    """Kept touches of one number of channels, in rows; lengths may differ.
+    """Kept touches of one number of channels, in rows in the order of their keys; lengths may differ.
 
-    touches: material and key of each row. longest: columns of the longest that there may be. labels: the place of each
-    row's material among `materials`, which are in alphabetical order. blocks, wide_blocks, columns: as in
-    `_Parts`. gapless: whether all touches have values everywhere. quiet: how many have a channel unchanging, (C,).
+    touches: material and key of each row. longest: columns of the longest. materials: in alphabetical order; labels:
+    the place of each row's material among them. columns, first: as in `_Parts`. gapless: whether all touches have
+    values everywhere.
 
-    Any number of threads may read it at once. It follows where nobody reads: otherwise a copy does.
+    Nothing of it changes, and it is a function of the set of touches, to the bit.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        longest: int,
-        touches: Sequence[tuple[str, bytes]],
-        levels: Sequence[LevelArray],
-        parts: _Parts | None = None,
-    ) -> None:
-        """parts: of the touches, which are taken over; without them there are no touches."""
-        self.channels, self.longest = channels, longest
+    def __init__(self, touches: Sequence[tuple[str, bytes]], levels: Sequence[LevelArray], parts: _Parts) -> None:
+        """levels, parts: of the touches, which are in order."""
         self.touches = list(touches)
-        self._edges = _edges(longest, channels)
         self._levels = list(levels)  # the memory's own: of 800 touches of a BioTac a copy is 6 MB
-        self._parts = _Parts.empty(0, channels, self._edges) if parts is None else parts
-        self._index()
+        self._parts = parts
+        self.columns, self.first = parts.columns, parts.first
+        self.channels, self.longest = len(levels[0]), int(parts.columns.max())
+        self.gapless = bool(parts.gapless.all())
+        self.materials = sorted({material for material, _ in touches})
+        place = {name: i for i, name in enumerate(self.materials)}
+        self.labels = np.array([place[material] for material, _ in touches], dtype=np.intp)
 
     @classmethod
     def of(cls, touches: Iterable[KeptTouch]) -> KeptArrays:
-        """The arrays of some touches, in the order of their keys.
+        """The arrays of some touches.
 
         Raises InputError for touches of different channels, and for none.
         """
         kept = sorted(touches, key=lambda touch: (touch.key, touch.material))
         if len({len(touch.levels) for touch in kept}) != 1:
             raise InputError("expected kept touches, one or more, all of the same number of channels")
-        arrays = cls(len(kept[0].levels), max(touch.levels.shape[1] for touch in kept), (), ())
-        arrays._make_room(len(kept))
-        arrays.follow(kept)
-        return arrays
+        levels = [touch.levels for touch in kept]
+        parts = _Parts.of(levels, max(each.shape[1] for each in levels))
+        return cls([(touch.material, touch.key) for touch in kept], levels, parts)
 
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """`_Parts` of the touches, row by row in the order of `touches`."""
-        return {name: getattr(self._parts, name)[: len(self)] for name in PARTS}
+    def followed(self, added: Iterable[KeptTouch], removed: Collection[tuple[str, bytes]] = ()) -> KeptArrays | None:
+        """Those of these touches with others added, and without those removed; None where none is left.
 
-    @classmethod
-    def from_arrays(
-        cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
-    ) -> KeptArrays:
-        """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
-        parts = _Parts(**{name: arrays[name] for name in PARTS})
-        own = [(touch.material, touch.key) for touch in touches]
-        return cls(len(touches[0].levels), longest, own, [touch.levels for touch in touches], parts)
-
-    @staticmethod
-    def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """Name → dtype and shape of what `to_arrays` gives of so many touches."""
-        parts = _Parts.empty(count, channels, _edges(longest, channels))
-        return {name: (getattr(parts, name).dtype.name, getattr(parts, name).shape) for name in PARTS}
-
-    def copy(self) -> KeptArrays:
-        """Another of the same touches: what comes to it does not come to this one."""
-        parts = _Parts.empty(len(self._parts.blocks), self.channels, self._edges)
-        parts.take(self._parts, len(self))
-        return KeptArrays(self.channels, self.longest, self.touches, self._levels, parts)
+        All is made anew where the longest touch has another length than before.
+        """
+        gone, came = set(removed), list(added)
+        stays = [row for row, touch in enumerate(self.touches) if touch not in gone]
+        if not stays and not came:
+            return None
+        touches = [*(self.touches[row] for row in stays), *((touch.material, touch.key) for touch in came)]
+        levels = [*(self._levels[row] for row in stays), *(touch.levels for touch in came)]
+        order = sorted(range(len(touches)), key=lambda i: touches[i][::-1])
+        touches, levels = [touches[i] for i in order], [levels[i] for i in order]
+        if max(each.shape[1] for each in levels) != self.longest:
+            return KeptArrays(touches, levels, _Parts.of(levels, max(each.shape[1] for each in levels)))
+        parts = self._parts
+        if came:
+            new = _Parts.of([touch.levels for touch in came], self.longest)
+            parts = _Parts(*(np.concatenate(pair) for pair in zip(parts, new, strict=True)))
+        rows = np.array([*stays, *range(len(self), len(self) + len(came))], dtype=np.intp)[order]
+        return KeptArrays(touches, levels, _Parts(*(part[rows] for part in parts)))
 
     def __len__(self) -> int:
         return len(self.touches)
-
-    @property
-    def held(self) -> set[tuple[str, bytes]]:
-        """What is kept, by material and key."""
-        return set(self.touches)
 
     def levels(self, row: int) -> LevelArray:
         """The levels of a kept touch, (C, T), as many columns as were kept."""
@@ -146,165 +149,99 @@ class KeptArrays:
         """Key → row of what is kept."""
         return {key: row for row, (_, key) in enumerate(self.touches)}
 
-    def unchanging(self, row: int) -> npt.NDArray[np.bool_]:
-        """The channels of a kept touch that never change, (C,)."""
-        return np.asarray(self._parts.unchanging[row])
+    def blocks(self, levels: LevelArray, whole: bool) -> list[Blocks]:
+        """A touch's blocks beside those of the kept ones, the wider ones first.
 
-    def follow(self, added: Iterable[KeptTouch], removed: Iterable[tuple[str, bytes]] = ()) -> bool:
-        """Take in touches that came, and let others go. False where all has to be made again:
-
-        a touch is longer than all that were kept, or none is left.
+        whole: beside the whole of each, and not beside prefixes; then there are wide blocks only.
         """
-        rows = {touch: row for row, touch in enumerate(self.touches)}
-        for row in sorted((rows[touch] for touch in removed), reverse=True):
-            last = len(self.touches) - 1
-            self._parts.move(last, row)
-            self.touches[row], self._levels[row] = self.touches[last], self._levels[last]
-            self.touches.pop()
-            self._levels.pop()
-        for touch in added:
-            if touch.levels.shape[1] > self.longest:
-                return False
-            self._add(touch)
-        self._index()
-        return bool(self.touches)
+        (fine, wide), columns, parts = _edges(self.longest, self.channels), levels.shape[1], self._parts
+        if whole:
+            return [Blocks(*_block_means(levels, wide * columns // self.longest), parts.relative)]
+        near = Blocks(*_block_means(levels, fine), parts.blocks)
+        if len(near.means) < ENOUGH:
+            return [near]
+        return [Blocks(*_block_means(levels, wide), parts.coarse), near]
 
-    def _make_room(self, count: int) -> None:
-        parts = _Parts.empty(count, self.channels, self._edges)
-        parts.take(self._parts, len(self))
-        self._parts = parts
-
-    def _add(self, touch: KeptTouch) -> None:
-        row = len(self)
-        if row == len(self._parts.blocks):
-            self._make_room(row + max(8, row // 8))
-        parts, columns = self._parts, touch.levels.shape[1]
-        whole = np.full((self.channels, self.longest), MISSING, dtype=np.uint8)
-        whole[:, :columns] = touch.levels
-        parts.blocks[row] = _block_levels(whole, self._edges)
-        parts.wide_blocks[row] = _block_levels(touch.levels, self.wide_edges(columns))
-        parts.columns[row], parts.gapless[row] = columns, not bool((whole == MISSING).any())
-        parts.unchanging[row] = unchanging(touch.levels)
-        self.touches.append((touch.material, touch.key))
-        self._levels.append(touch.levels)
-
-    def _index(self) -> None:
-        count, parts = len(self), self._parts
-        self.materials = sorted({material for material, _ in self.touches})
-        place = {name: i for i, name in enumerate(self.materials)}
-        self.labels = np.array([place[material] for material, _ in self.touches], dtype=np.intp)
-        self.blocks, self.wide_blocks = parts.blocks[:count], parts.wide_blocks[:count]
-        self.columns = parts.columns[:count]
-        self.gapless = bool(parts.gapless[:count].all())
-        self.quiet = parts.unchanging[:count].sum(axis=0)
-
-    def prefixes(self, rows: Iterable[int], columns: int | None = None) -> LevelArray:
-        """The levels of some touches one below the other, (rows, C · T); T: columns, or those of the longest."""
-        kept = [self._levels[row] for row in rows]
-        found = np.full((len(kept), self.channels, columns or self.longest), MISSING, dtype=np.uint8)
+    def beginnings(self, rows: Iterable[int], columns: int) -> LevelArray:
+        """The levels of some touches up to a column one below the other, (rows, C, columns)."""
+        kept = [self._levels[row][:, :columns] for row in rows]
+        found = np.full((len(kept), self.channels, columns), MISSING, dtype=np.uint8)
         for levels, into in zip(kept, found, strict=True):
-            part = levels[:, : into.shape[1]]
-            into[:, : part.shape[1]] = part
-        return found.reshape(len(kept), -1)
+            into[:, : levels.shape[1]] = levels
+        return found
 
-    def brought_to(self, rows: Rows, columns: int) -> LevelArray:
-        """The whole of some touches, each brought to so many columns, one below the other, (rows, C · T)."""
-        brought = np.empty((len(rows), self.channels, columns), np.uint8)
+    def at_shares(self, rows: Rows, shares: FloatArray) -> LevelArray:
+        """The levels of some touches at these shares of each one's length, (rows, C, shares)."""
+        found = np.empty((len(rows), self.channels, len(shares)), np.uint8)
         lengths = self.columns[rows]
-        for length in np.flatnonzero(np.bincount(lengths)).tolist():  # touches of one length are brought alike
+        for length in sorted(set(lengths.tolist())):  # touches of one length are brought alike
             same = np.flatnonzero(lengths == length)
-            places = np.arange(columns) * ((length - 1) / max(columns - 1, 1))
-            kept = self.prefixes(rows[same], length).reshape(len(same), self.channels, length)
-            brought[same] = at_places(kept, places, np.float32)
-        return brought.reshape(len(rows), -1)
-
-    def edges(self, columns: int, whole: bool) -> Rows:
-        """The edges of the blocks of a touch of so many columns that is compared as a beginning, or as a whole one."""
-        return self.wide_edges(columns) if whole else self._edges
-
-    def wide_edges(self, columns: int) -> Rows:
-        """The edges of the blocks of a touch of so many columns that is compared as a whole one."""
-        edges: Rows = self._edges[::COARSER] * columns // self.longest
-        return edges
-
-    def distances(self, guesses: FloatArray, known: npt.NDArray[np.bool_], whole: bool) -> FloatArray:
-        """Mean squared distances of all touches from guesses, (touches, guesses), over the blocks that both have.
-
-        guesses: levels, (guesses, C · B). known: the blocks that they have, (C · B,). Whole numbers of quarters of a
-        level, divided once: the same on every machine. The largest float where both have no block.
-        """
-        steps = np.rint(np.clip(guesses, *GUESSED) * QUARTERS).astype(np.int16)
-        return mean_distances(self.wide_blocks if whole else self.blocks, steps, known)
+            found[same] = at_places(self.beginnings(rows[same], length), shares * (length - 1))
+        return found
 
     def nearest_alike(self, row: int) -> tuple[LevelArray, LevelArray] | None:
         """The levels of a touch and of the nearest other one of its material; None where there is no other."""
         others = np.flatnonzero((self.labels == self.labels[row]) & (np.arange(len(self)) != row))
         if not len(others):
             return None
-        blocks = self.blocks[row]
-        far = mean_distances(self.blocks[others], QUARTERS * blocks[None].astype(np.int16), blocks != MISSING)[:, 0]
-        own, other = self.prefixes([row, int(others[np.argmin(far)])])
+        blocks = self._parts.blocks.reshape(len(self), -1)
+        guess = QUARTERS * blocks[row][None].astype(np.int16)
+        far = mean_distances(blocks[others], guess, blocks[row] != MISSING)[:, 0]
+        own, other = self.beginnings([row, int(others[np.argmin(far)])], self.longest)
         return own, other
 
 
-def _edges(longest: int, channels: int) -> Rows:
-    """The edges of the blocks of touches of so many columns at most."""
+def _edges(longest: int, channels: int) -> tuple[Rows, Rows]:
+    """The edges of the blocks, and of the wider ones, of touches of so many columns at most."""
     blocks = max(1, min(longest, BLOCK_VALUES // channels))
-    return np.linspace(0, longest, blocks + 1).astype(np.intp)
+    fine, wide = (np.linspace(0, longest, count + 1).astype(np.intp) for count in (blocks, -(-blocks // COARSER)))
+    return fine, wide
 
 
 def _block_levels(levels: LevelArray, edges: Rows) -> LevelArray:
-    """Means of the blocks of a touch, rounded to levels, (C · B,); MISSING where nothing was read."""
-    means, known = block_means(levels, edges)
-    return np.where(known, np.rint(means), MISSING).astype(np.uint8).ravel()
+    """Means of the blocks of a touch, rounded to levels, (B, C); MISSING where nothing was read."""
+    means, known = _block_means(levels, edges)
+    found = np.full((len(edges) - 1, len(levels)), MISSING, np.uint8)
+    found[: len(means)][known] = np.rint(means[known])
+    return found
 
 
-def at_places(
-    levels: LevelArray, places: npt.NDArray[np.floating], precision: npt.DTypeLike = np.float64
-) -> LevelArray:
-    """Levels (…, T) at places between 0 and T − 1, by linear interpolation; MISSING where a neighbour is.
+def _block_means(levels: LevelArray, edges: Rows) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Means of the blocks of a touch between edges, (B, C), 0 where nothing was read; and whether anything was.
 
-    precision: of the blends before they are rounded to levels. `signals.image.stretched` is another function: an image
-    is no level and lacks no value, and its weights are ratios of integers, the same bits on every machine.
-    """
-    first = places.astype(np.intp)
-    part: npt.NDArray[np.floating] = (places - first).astype(precision)
-    low, high = levels[..., first], levels[..., np.minimum(first + 1, levels.shape[-1] - 1)]
-    blended = np.rint(low * (1 - part) + high * part).astype(np.uint8)
-    return np.where((low == MISSING) | (high == MISSING), np.uint8(MISSING), blended)
-
-
-def unchanging(levels: LevelArray) -> npt.NDArray[np.bool_]:
-    """The channels of a touch that read one level throughout, or nothing, (C,)."""
-    read = levels != MISSING
-    highest, lowest = np.where(read, levels, 0).max(axis=1), np.where(read, levels, LEVELS).min(axis=1)
-    return np.asarray(highest <= lowest)
-
-
-def block_means(levels: LevelArray, edges: npt.NDArray[np.intp]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Means of the blocks of a touch between edges, (C, B), 0 where nothing was read; and whether anything was.
-
-    A touch may end before the last edge.
+    Of the blocks that begin before the touch ends.
     """
     seen, first = levels != MISSING, edges[:-1][edges[:-1] < levels.shape[1]]
-    sums, counts = np.zeros((2, len(levels), len(edges) - 1), dtype=np.int64)
-    np.add.reduceat(np.where(seen, levels, 0), first, axis=1, dtype=np.int64, out=sums[:, : len(first)])
-    np.add.reduceat(seen, first, axis=1, dtype=np.int64, out=counts[:, : len(first)])
-    return sums / np.maximum(counts, 1), counts > 0
+    sums = np.add.reduceat(np.where(seen, levels, 0), first, axis=1, dtype=np.int32)
+    counts = np.add.reduceat(seen, first, axis=1, dtype=np.int32)
+    return (sums / np.maximum(counts, 1)).T, counts.T > 0
 
 
-def blends(levels: LevelArray, logs: FloatArray, warmths: Sequence[float]) -> LevelArray:
-    """Weighted means of touches (n, C · T) of some log-likelihoods (n,), one for each warmth, (warmths, C · T).
+def at_places(levels: LevelArray, places: FloatArray) -> LevelArray:
+    """Levels (…, T) at places between 0 and T − 1, by linear interpolation in steps of 1/256; MISSING where one lacks.
 
-    warmths: how steeply the weight of a touch falls with its log-likelihood.
+    `signals.image.stretched` is another function: an image is no level and lacks no value.
     """
-    means = weighted_means(levels, np.exp(np.outer(warmths, logs - logs.max())))
-    return np.asarray(np.where(np.isnan(means), MISSING, np.rint(means)), dtype=np.uint8)
+    first = places.astype(np.intp)
+    part = np.rint((places - first) * 256).astype(np.uint16)
+    low, high = levels[..., first], levels[..., np.minimum(first + 1, levels.shape[-1] - 1)]
+    blended = ((low * (256 - part) + high * part + np.uint16(128)) >> 8).astype(np.uint8)
+    blended[(low == MISSING) | (high == MISSING)] = MISSING
+    return np.asarray(blended)
 
 
-def weighted_means(levels: LevelArray, weights: FloatArray) -> npt.NDArray[np.floating]:
-    """Means of touches (n, C · T) by weights (means, n); NaN where no touch has a value."""
-    single, known = weights.astype(np.float32), levels != MISSING
+def first_changes(levels: LevelArray) -> Rows:
+    """The column of each channel's first change, (C,); T where it reads one level throughout, or nothing."""
+    read = levels != MISSING
+    changed = read & (levels != levels[np.arange(len(levels)), read.argmax(axis=1)][:, None])
+    return np.where(changed.any(axis=1), changed.argmax(axis=1), levels.shape[1])
+
+
+def weighted_means(levels: LevelArray, weights: FloatArray) -> npt.NDArray[np.float32]:
+    """Means of touches (n, C · T) by weights (means, n), of which the largest are 1; NaN where no touch has a value."""
+    keep = weights.max(axis=0) > NEGLIGIBLE
+    single, levels = weights[:, keep].astype(np.float32), levels[keep]
+    known = levels != MISSING
     if known.all():
         return np.asarray((single / single.sum(axis=1, keepdims=True)) @ levels.astype(np.float32))
     total = single @ known.astype(np.float32)

@@ -15,13 +15,14 @@ import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["CLEAN", "LEVELS", "MISSING", "UNIT", "Likelihood", "Noise", "Table", "levels_of"]
+__all__ = ["CLEAN", "LEVELS", "MISSING", "UNIT", "Likelihood", "Noise", "Table", "levels_of", "noise_at"]
 
 LEVELS = 255
 MISSING = 255  # the level of a value that was not read; it has a likelihood of 1 beside any other
@@ -29,16 +30,16 @@ UNIT = 1024  # of the tables, in a natural logarithm's 1
 
 FLOOR = 1e-3  # ε: a share of readings that nothing explains, such as glitches
 NARROWEST = 1.0  # levels: rounding alone spreads by 0.3, and a touch has to be near more than itself
+LEAST, STEP, AMPLITUDES = 0.01, 1.01, 464  # amplitudes from LEAST, below which none is told from touch to touch, to 1
 BLUR = 0.006  # of an amplitude: what a step of the amplitudes leaves unsaid of where the noise ends
-LEAST = 0.01  # of the range: less noise cannot be told from touch to touch
-UNIFORM_STEP, NORMAL_STEP = 1.005, 1.12  # uniform noise ends sharply, and five per cent beside it nothing is explained
-MOST_TABLES = 96  # of 128 kB; the rough and coarse noises are 50
+MOST_TABLES = 96  # of 128 kB
 
 LevelArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
 
 _LEVELS = np.arange(float(LEVELS))
 _DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of level y from x, [x, y]
+_BEFORE, _AFTER = np.maximum(np.arange(LEVELS) - 1, 0), np.minimum(np.arange(LEVELS) + 1, LEVELS - 1)
 
 
 def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
@@ -55,7 +56,7 @@ def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
 class Noise:
     """What came over a touch: independent noise on every value.
 
-    step: of the amplitude, from LEAST on; −1 is no noise. normal: whether it is normal, and not uniform.
+    step: of the amplitude, below AMPLITUDES; −1 is no noise. normal: whether it is normal, and not uniform.
     """
 
     step: int = -1
@@ -64,15 +65,7 @@ class Noise:
     @property
     def amplitude(self) -> float:
         """A share of the range: uniform noise reaches ± this far; normal noise has this / √3 as standard deviation."""
-        return 0.0 if self.step < 0 else LEAST * (NORMAL_STEP if self.normal else UNIFORM_STEP) ** self.step
-
-    def near(self, stride: int) -> list[Noise]:
-        """This noise and two weaker and two stronger ones, `stride` steps apart, of those up to the whole range."""
-        if self.step < 0:
-            return [self]
-        last = round(math.log(1 / LEAST) / math.log(NORMAL_STEP if self.normal else UNIFORM_STEP))
-        steps = (self.step + i * stride for i in range(-2, 3))
-        return [Noise(step, self.normal) for step in steps if 0 <= step <= last]
+        return 0.0 if self.step < 0 else LEAST * STEP**self.step
 
 
 CLEAN = Noise()
@@ -109,13 +102,6 @@ class Likelihood:
         self._tables: OrderedDict[Noise, Table] = OrderedDict()
         self._lock = threading.Lock()  # of the order of the tables; never held while one is made
 
-    @classmethod
-    def of(cls, spread: FloatArray, weights: FloatArray) -> Likelihood:
-        """The tables of a spread and of weights as another one has them, to the bit."""
-        likelihood = cls(spread, weights)
-        likelihood.weights = weights
-        return likelihood
-
     def table(self, noise: Noise) -> Table:
         """The table of a kind of noise; the latest are kept."""
         with self._lock:
@@ -130,49 +116,52 @@ class Likelihood:
         return found
 
     def _made(self, noise: Noise) -> Table:
-        chances = self._chances(noise)
+        reach = noise.amplitude * (LEVELS - 1)
+        below = (_below_normal if noise.normal else _below_uniform)(_DISTANCE, reach, self.spread[:, None])
+        below[:, -1] = 1.0  # what lies beyond an end of the range is read as that end
+        chances = np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)  # P(y | x), [x, y]
         logs = _logs(chances)
         whole = np.zeros((256, 256), dtype=np.int16)
-        whole[:LEVELS, :LEVELS] = np.rint(logs.T * UNIT)
+        whole[:LEVELS, :LEVELS] = np.rint(logs * UNIT).T
         mean = chances @ _LEVELS
         middle, typical = self.weights @ _LEVELS, self.weights @ mean
         scatter = float(self.weights @ (_LEVELS - middle) ** 2)
         slope = float(self.weights @ ((_LEVELS - middle) * (mean - typical))) / scatter if scatter > 0 else 1.0
         slope = max(slope, 1e-3)
+        # Fisher's 4 Σ (d√P / dx)²: between the levels beside x the sum of squares is 2 − 2 Σ √(P P').
         roots = np.sqrt(chances)
-        information = 4 * (np.gradient(roots, axis=0) ** 2).sum(axis=1) * self.spread**2
+        overlap = np.einsum("xy,xy->x", roots[_BEFORE], roots[_AFTER])
+        information = 8 * (1 - overlap) / (_AFTER - _BEFORE) ** 2 * self.spread**2
         return Table(
             logs=whole.ravel(),
             offset=float(typical - slope * middle),
             slope=slope,
             mean=mean,
-            expected=(chances * logs).sum(axis=1),
+            expected=np.einsum("xy,xy->x", chances, logs),
             information=float(self.weights @ information),
         )
 
-    def entries(self, noise: Noise, places: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
-        """`Table.logs` of a noise at some places, without the table."""
-        y, x = np.divmod(places, 256)
-        read = (y != MISSING) & (x != MISSING)
-        away, spread = y + 0.5 - x, self.spread[np.where(read, x, 0)]
-        below = np.where(y == LEVELS - 1, 1.0, self._below(noise, away, spread))
-        chances = np.maximum(below - np.where(y == 0, 0.0, self._below(noise, away - 1, spread)), 0.0)
-        return np.where(read, np.rint(_logs(chances) * UNIT), 0).astype(np.int64)
+    @cached_property
+    def by_amplitude(self) -> npt.NDArray[np.float32]:
+        """L by how far a value lies from what was kept, under each noise; of the mean spread, (512, 2 · AMPLITUDES).
 
-    def _chances(self, noise: Noise) -> FloatArray:
-        """P(y | x), [x, y]; what lies beyond an end of the range is read as that end."""
-        below = self._below(noise, _DISTANCE, self.spread[:, None])
-        below[:, -1] = 1.0
-        return np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)
+        Row d: of a value within the range that is d levels away. Row 256 + d: of one at an end of the range, where what
+        was kept is d levels within. Columns: uniform noise by amplitude, then normal noise; see `noise_at`. Rows 255
+        and 511 are 0: one of the two was not read.
+        """
+        lower = np.arange(LEVELS + 1)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
+        reach = np.array([Noise(step).amplitude for step in range(AMPLITUDES)]) * (LEVELS - 1)
+        spread = float(self.weights @ self.spread)
+        below = np.hstack([_below_uniform(lower, reach, spread), _below_normal(lower, reach, spread)])
+        found = np.zeros((2, 256, 2 * AMPLITUDES), np.float32)
+        found[0, :LEVELS] = _logs(np.maximum(np.diff(below, axis=0), 0.0))
+        found[1, :LEVELS] = _logs(np.maximum(1 - below[:LEVELS], 0.0))
+        return found.reshape(512, -1)
 
-    @staticmethod
-    def _below(noise: Noise, away: FloatArray, spread: FloatArray) -> FloatArray:
-        """The probability of no more than a level whose upper end is so far from x, which is spread so much."""
-        reach = noise.amplitude * (LEVELS - 1)
-        if noise.normal or not reach:
-            return _normal(away / np.hypot(spread, reach / math.sqrt(3)))
-        blurred = np.hypot(spread, BLUR * reach)
-        return np.asarray((_sloped(away + reach, blurred) - _sloped(away - reach, blurred)) / (2 * reach))
+
+def noise_at(column: int) -> Noise:
+    """The noise of a column of `Likelihood.by_amplitude`."""
+    return Noise(column % AMPLITUDES, column >= AMPLITUDES)
 
 
 def _logs(chances: FloatArray) -> FloatArray:
@@ -180,16 +169,28 @@ def _logs(chances: FloatArray) -> FloatArray:
     return np.asarray(np.log((1 - FLOOR) * chances + FLOOR / LEVELS))
 
 
-def _normal(z: FloatArray) -> FloatArray:
-    """Φ(z), to 1e-7: Abramowitz and Stegun 1964, 26.2.17; scipy.special would be imported for this alone."""
-    size = np.abs(z)
-    t = 1 / (1 + 0.2316419 * size)
+def _below_normal(away: FloatArray, reach: FloatArray | float, spread: FloatArray | float) -> FloatArray:
+    """The probability of no more than a level whose upper end is so far from x, through normal noise or none."""
+    return _normal(away / np.hypot(spread, reach / math.sqrt(3)))[0]
+
+
+def _below_uniform(away: FloatArray, reach: FloatArray | float, spread: FloatArray | float) -> FloatArray:
+    """The same through uniform noise in ± reach, 0 of none."""
+    if not np.any(reach):
+        return _below_normal(away, 0.0, spread)
+    blurred = np.hypot(spread, BLUR * np.asarray(reach))
+
+    def integral(z: FloatArray) -> FloatArray:  # of Φ, up to z
+        below, density = _normal(z)
+        return z * below + density
+
+    return np.asarray((integral((away + reach) / blurred) - integral((away - reach) / blurred)) * blurred / (2 * reach))
+
+
+def _normal(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Φ(z), to 1e-7, and φ(z): Abramowitz and Stegun 1964, 26.2.17; scipy.special would be imported for this alone."""
+    density = np.exp(-0.5 * z * z) * (1 / math.sqrt(2 * math.pi))
+    t = 1 / (1 + 0.2316419 * np.abs(z))
     series = t * (0.319381530 + t * (-0.356563782 + t * (1.781477937 + t * (-1.821255978 + t * 1.330274429))))
-    tail = np.exp(-0.5 * size * size) * (1 / math.sqrt(2 * math.pi)) * series
-    return np.where(z < 0, tail, 1 - tail)
-
-
-def _sloped(z: FloatArray, spread: FloatArray) -> FloatArray:
-    """∫ Φ(t / spread) dt up to z: zΦ(z / s) + sφ(z / s)."""
-    scaled = z / spread
-    return np.asarray(z * _normal(scaled) + spread * np.exp(-0.5 * scaled * scaled) / math.sqrt(2 * math.pi))
+    tail = density * series
+    return np.where(z < 0, tail, 1 - tail), density

@@ -57,25 +57,27 @@ class Match:
 
     scores: log-likelihood of each material, in the order of `KeptArrays.materials`, shape (M,).
     information: Fisher's information on the values that were read, through the noise, in units of the natural spread;
-    1 of a clean touch without gaps.
+    about 1 of a clean touch as long as the longest kept one.
     noise: what most likely came over it. stuck: the channels that never change, shape (C,).
     expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
-    noise_share: in [0, 1], how much of the touch's deviation from kept touches is independent noise beyond the natural.
+    energy, coherence: of the touch's deviation from the likeliest kept one; see `NaturalDeviation`.
+    noise_share: in [0, 1], how much of that deviation is independent noise beyond the natural.
     moved: whether the touch deviates more than touches do, and at least half of that is its channels' zeros, which
     may drift.
-    likelihood: the log-likelihood per value. log_likelihood_gain: the same less the negative entropy of the touch's own
-    values; not above 0 where nothing that is kept explains the touch. excess_loss: the negative log-likelihood per
-    value less the expected one of a touch of the set.
+    log_likelihood_gain: the log-likelihood per value less the negative entropy of the touch's own values; not above 0
+    where nothing that is kept explains the touch. excess_loss: the negative log-likelihood per value less the expected
+    one of a touch of the set.
     """
 
     scores: FloatArray
     information: float
     noise: Noise
     stuck: npt.NDArray[np.bool_]
-    expected: FloatArray
+    expected: npt.NDArray[np.floating]
+    energy: float
+    coherence: float
     noise_share: float
     moved: bool
-    likelihood: float
     log_likelihood_gain: float
     excess_loss: float
 

@@ -241,7 +241,6 @@ class FingerprintCheck:
 
     def __init__(self, identity: Identity, path: Path) -> None:
         self._identity, self._path = identity, path
-        self._compared: Embedding | None = None
         self.pending = True
 
     def require(self, embedding: Embedding) -> None:
@@ -251,9 +250,9 @@ class FingerprintCheck:
             self.pending = False
 
     @contextmanager
-    def beside(self, embedding: Embedding, *, own: bool) -> Iterator[None]:
-        """Compare an embedding beside what the block does: it embeds, too. own: whether it is the memory's own."""
-        if not self.pending or embedding is self._compared:
+    def beside(self, embedding: Embedding) -> Iterator[None]:
+        """Compare the memory's own embedding beside what the block does: it embeds, too."""
+        if not self.pending:
             yield
             return
         with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
@@ -262,9 +261,7 @@ class FingerprintCheck:
                 yield
             finally:
                 compared.result()  # of another embedding nothing else that the block raised means anything
-        self._compared = embedding
-        if own:
-            self.pending = False
+        self.pending = False
 
 
 class AbsentEmbedding:

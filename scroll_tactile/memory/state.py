@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,8 +19,8 @@ from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.touch_rows import (
-    Added,
     Arrays,
+    Changed,
     Codes,
     Encode,
     Readings,
@@ -38,8 +39,9 @@ from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, Tar
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics
 
-__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "KeptTouches", "Memory"]
+__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "WEIGHINGS", "KeptTouches", "Memory"]
 
+WEIGHINGS = "weighings"  # an array of JSON
 LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
 ANNOTATED = "sample-annotations", "kept-annotations"  # attributes: of each of their touches, how it was annotated
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
@@ -118,6 +120,8 @@ class Memory:
     - quantities: those that touches can carry, by name.
     - corrections: of readings of a changed skin, by their rows, the last of those that count; see `correction`.
     - tuned: the tuned model; None before a fine-tune, or after one of the observations behind it was retracted.
+    - weighings: how readouts and kept touches are weighed, by axis, "" for materials: text for the next opening, see
+      `prediction.stored`; gone after a retraction.
     - tuned_last_sequence: the last sequence that the tuned model was trained on.
 
     Where it stands in the journal:
@@ -148,6 +152,7 @@ class Memory:
         self.descriptions: dict[str, Description] = {}
         self.quantities: dict[str, Quantity] = {}
         self.corrections: dict[int, Correction] = {}
+        self.weighings: dict[str, str] = {}
         self.stale = False
 
     def digest(self) -> str:
@@ -216,7 +221,7 @@ class Memory:
 
         return undo
 
-    def retract(self, record: Record) -> Added:
+    def retract(self, record: Record) -> Changed:
         """Subtract an observation from the sums; call `replaying.refill` afterwards, for what was chosen."""
         material, key, annotation = record.label, record.key, annotation_of(record.attributes)
         columns, codes = self.codes(record)
@@ -224,11 +229,12 @@ class Memory:
         self.targets.remove(material, key, annotation, codes, columns)
         self.retracted.add(record.sequence)
         self.retractions += 1
+        self.weighings.clear()
         if any(sample.holds(material, key) for sample in self.samples):
             self.stale = True
         if record.sequence <= self.tuned_last_sequence:
             self.tuned = None
-        return Added(material, codes, -1, annotation.labels)
+        return Changed(material, annotation.labels)
 
     @property
     def samples(self) -> list[Sample[Any]]:
@@ -362,6 +368,8 @@ class Memory:
             held = self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
             arrays |= held[0]
             attributes["exemplars"] = held[1]
+        if self.weighings and candidates is None and compaction_at is None:
+            arrays[WEIGHINGS] = np.frombuffer(json.dumps(self.weighings).encode(), np.uint8)
         if self.tuned is not None:
             own, attributes["tuned"] = self.tuned.to_arrays()
             arrays |= own
@@ -406,6 +414,8 @@ class Memory:
         for row, text in attributes.get("corrections", ()):
             self.corrections[row] = Correction.from_text(text, self.recipe.sensor)
         self.take_tuned(arrays, attributes)
+        if WEIGHINGS in arrays:
+            self.weighings = json.loads(arrays[WEIGHINGS].tobytes())
         return self
 
     def take_tuned(self, arrays: Arrays, attributes: Any) -> None:

@@ -32,8 +32,8 @@ __all__ = [
     "SENSE",
     "SOURCE",
     "VALUES",
-    "Added",
     "Arrays",
+    "Changed",
     "Codes",
     "Encode",
     "Readings",
@@ -75,16 +75,10 @@ Encode = Callable[[Readings], Codes]
 """Embeds the readings of a touch: its rows of codes by scale."""
 
 
-class Added(NamedTuple):
-    """A touch that came, or was retracted.
-
-    material: its name. codes: its rows of codes by scale. sign: 1, or −1 where it was retracted. labels: its axes and
-    labels.
-    """
+class Changed(NamedTuple):
+    """A touch that came, or was retracted: its material, and its axes and labels."""
 
     material: str
-    codes: Codes
-    sign: int
     labels: tuple[tuple[str, str], ...] = ()
 
 

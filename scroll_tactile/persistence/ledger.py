@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from scroll_tactile_store import Checkpoint, Head, Record, Store
+from scroll_tactile_store import Head, Record, Store
 
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError, ObservationError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
@@ -27,7 +26,7 @@ from scroll_tactile.memory.touch_rows import (
     RETRACTS,
     SENSE,
     SOURCE,
-    Added,
+    Changed,
     Codes,
     annotated,
     annotation_of,
@@ -62,7 +61,7 @@ from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 from scroll_tactile.validation.gate import MemoryStore
 
-__all__ = ["AxisLedger", "Ledger", "axis_name"]
+__all__ = ["AxisLedger", "Ledger"]
 
 
 class Ledger(OpenMemory):
@@ -116,7 +115,7 @@ class Ledger(OpenMemory):
                 sequence = self._append(material, stream, columns, codes, source, annotation)
                 if self._contents is not None:
                     self._contents.add(material, stream.key, sequence, annotation)
-                self._changed([Added(material, codes, 1, annotation.labels)])
+                self._changed([Changed(material, annotation.labels)])
             self._checkpoint_if_due()
             return self._receipt(sequence, material, stream)
 
@@ -436,27 +435,17 @@ class AxisLedger(Ledger):
         """As of the memory."""
         return self._of.correction
 
-    def derived(self, name: str) -> Checkpoint | None:
-        """As of the memory, under the name that `axis_name` gives."""
-        return self._of.derived(axis_name(name, self._axis))
+    def take_weighing(self) -> str | None:
+        """As of the memory, of the axis."""
+        return self._of.memory.weighings.pop(self._axis, None)
 
-    def saved_since(self, memory: Memory) -> bool:
-        """As of the memory, whose checkpoints have the axis."""
-        del memory
-        return self._of.saved_since(self._of.memory)
-
-    def _follow(self, added: list[Added] | None) -> None:
+    def _follow(self, changes: Sequence[Changed] | None) -> None:
         """Note what the memory changed by: of touches without a label that something did."""
-        if added is None:
+        if changes is None:
             self._changed()
             return
-        labelled = ((dict(touch.labels).get(self._axis), touch) for touch in added)
-        self._changed([Added(label, touch.codes, touch.sign) for label, touch in labelled if label is not None])
-
-
-def axis_name(name: str, axis: str) -> str:
-    """The name of what is derived from an axis, where that of materials has a name: axes may have any characters."""
-    return f"{name}-{hashlib.sha256(axis.encode()).hexdigest()[:32]}"
+        labels = (dict(touch.labels).get(self._axis) for touch in changes)
+        self._changed([Changed(label) for label in labels if label is not None])
 
 
 def _nothing() -> None:

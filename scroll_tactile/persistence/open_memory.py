@@ -6,7 +6,7 @@ import ctypes
 import logging
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -17,7 +17,7 @@ from scroll_tactile_store import Checkpoint, CompactedError, ReadOnlyError, Stor
 from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.health.watch import WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import Added
+from scroll_tactile.memory.touch_rows import Changed
 from scroll_tactile.persistence.contents import ListedContents, StoredContents
 from scroll_tactile.persistence.replaying import apply_appended
 
@@ -30,7 +30,6 @@ Answer = TypeVar("Answer")
 Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any], Collection[str]]
 """Arrays, attributes, and the names of arrays that readers map."""
 
-MOST_ADDED = 1024  # touches: a model is fitted again long before
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
 REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
 # A checkpoint writes all materials, so many of them in the time that one touch takes to learn: it waits until as long
@@ -46,10 +45,10 @@ class OpenMemory:
     None where they are not known.
 
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
-    grows with each change of a description. added: if `follow` is set, the touches observed and retracted since the
-    list was last cleared; None where these are too many, or something else has changed. followers: are called with the
-    same at each change. watched: the rows that health was last read from, by some rules; not there while they are read.
-    lost: grows where a change was cut short, whose rows may not be in the journal. saves: whether checkpoints are
+    grows with each change of a description. changed: the materials of touches observed and retracted since the set was
+    last cleared; None where something else has changed. followers: are called with the touches at each change. watched:
+    the rows that health was last read from, by some rules; not there while they are read. lost: grows where a change
+    was cut short, whose rows may not be in the journal. saves: whether checkpoints are
     written; the journal alone has every row, too.
     """
 
@@ -66,13 +65,12 @@ class OpenMemory:
         self.lock = threading.RLock()
         self.version = 0
         self.described = 0
-        self.follow = False
         self.saves = True
-        self.added: list[Added] | None = []
-        self.followers: list[Callable[[list[Added] | None], None]] = []
+        self.changed: set[str] | None = set()
+        self.followers: list[Callable[[Sequence[Changed] | None], None]] = []
         self._load = load
         self._memory = load()
-        self._saved = self._memory.saved
+        self._saved, self._saved_weighings = self._memory.saved, dict(self._memory.weighings)
         self._closed = False
         self._whole = True
         self._undo: Callable[[], None] | None = None
@@ -142,14 +140,14 @@ class OpenMemory:
             raise
         self._whole = True
 
-    def _changed(self, added: list[Added] | None = None) -> None:
+    def _changed(self, changes: Sequence[Changed] | None = None) -> None:
         self.version += 1
         for follow in self.followers:
-            follow(added)
-        if added is None or (self.added is not None and len(self.added) + len(added) > MOST_ADDED):
-            self.added = None
-        elif self.follow and self.added is not None:
-            self.added += added
+            follow(changes)
+        if changes is None:
+            self.changed = None
+        elif self.changed is not None:
+            self.changed |= {touch.material for touch in changes}
 
     def require_open(self) -> None:
         """Raise StoreClosedError after `close`."""
@@ -245,12 +243,15 @@ class OpenMemory:
         found = self.store.derived(name)
         return found if found is not None and found.number == self.memory.checkpoint else None
 
-    def saved_since(self, memory: Memory) -> bool:
-        """Whether a checkpoint was written since the one that the memory was loaded from."""
-        return self.store is not None and self.store.newest != memory.checkpoint
+    def take_weighing(self) -> str | None:
+        """What the checkpoint that the memory was read from says of how materials are weighed, once."""
+        return self.memory.weighings.pop("", None)
 
-    def close(self, derived: Mapping[str, Callable[[], Derived | None]]) -> None:
-        """As `TactileLearner.close`. derived: by name, what gives the arrays to store with the newest checkpoint."""
+    def close(self, derived: Mapping[str, Callable[[], Derived | None]], weighings: Mapping[str, str]) -> None:
+        """As `TactileLearner.close`.
+
+        derived: by name, what gives the arrays to store with the newest checkpoint. weighings: see `Memory`.
+        """
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
@@ -260,7 +261,8 @@ class OpenMemory:
             try:
                 # A change that was cut short is never saved: the journal holds all of it, or nothing.
                 if store.mode == "write" and self.saves and self._whole:
-                    if self._memory.sequence > self._saved:
+                    self._memory.weighings |= weighings
+                    if self._memory.sequence > self._saved or self._memory.weighings != self._saved_weighings:
                         self._pass_over_failures(store)
                         self._write_checkpoint()
                     for name, arrays in derived.items():

@@ -26,7 +26,7 @@ from scroll_tactile.memory.touch_rows import (
     RETRACT,
     RETRACTS,
     SENSE,
-    Added,
+    Changed,
     Codes,
     active_rows,
     annotation_of,
@@ -92,14 +92,14 @@ def _loaded(memory: Memory, store: Store) -> Memory:
     return memory
 
 
-def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = None) -> list[Added] | None:
+def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = None) -> list[Changed] | None:
     """Apply a journal row; return the touches that it added or retracted, None where it brought a whole memory.
 
     Every row is added to the memory here, whether it was just written, read again or embedded anew. codes: of an
     observation; None: they are read from the row, or made from its readings. Call `refill` after the last row. Raises
     CapacityError before anything is added.
     """
-    changed: list[Added] | None = []
+    changed: list[Changed] | None = []
     apply_declaration(memory.quantities, record, store)
     if record.kind == OBSERVE:
         steps = cast(int, record.attributes["columns"])
@@ -109,7 +109,7 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         readings = unpack_readings(record.arrays) if wanted else None
         annotation = annotation_of(record.attributes)
         memory.add(record.label, record.key, steps, codes, record.sequence, source, readings, annotation)
-        changed = [Added(record.label, codes, 1, annotation.labels)]
+        changed = [Changed(record.label, annotation.labels)]
     elif record.kind == RETRACT:
         gone = unspanned(record.attributes["sequences"])
         changed = [_retracted(memory, record, sequence, store) for sequence in gone if sequence > memory.compacted]
@@ -132,7 +132,7 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
     return changed
 
 
-def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> Added:
+def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> Changed:
     """Retract an observation as a journal row says. Raises DamageError where there is none that could be."""
     observed = store.record(sequence)
     try:
@@ -177,7 +177,7 @@ def apply_declaration(quantities: dict[str, Quantity], row: Head, store: Store) 
         raise wrong
 
 
-def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Added] | None:
+def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Changed] | None:
     """Apply rows that a writer appended, and take over its tuned model; returns the changes as `replay` does."""
     changed = [replay(memory, record, store) for record in records]
     refill(memory, store)

@@ -85,8 +85,9 @@ class HeadFitter:
     """
 
     def __init__(self, model: Model, stage: int) -> None:
-        scales, calibration = model.stages[stage], model.calibrations[stage]
-        found = StageScores(stage, model.sample, [model.held_out[scale] for scale in scales])
+        weighing = model.fitted
+        scales, calibration = model.stages[stage], weighing.rows[stage].calibration
+        found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in scales])
         weights, distances = _weights(model, stage), found.distances()
         self.space = _space_of(model, stage, found.names)
         self.materials = [found.names[place] for place in found.targets]
@@ -167,7 +168,7 @@ class Composer:
         """Fit the heads of all constituents described in a memory, over the model of the same memory."""
         targets = targets_of(memory.descriptions)
         with one_thread():
-            fitters = [HeadFitter(model, stage) for stage in range(len(model.calibrations))]
+            fitters = [HeadFitter(model, stage) for stage in range(len(model.fitted.rows))]
             stages = [fitter.fit(targets) for fitter in fitters]
         return cls(model, targets, stages, [fitter.space for fitter in fitters])
 
@@ -189,7 +190,7 @@ class Composer:
         stage = self._stage(encoded.steps)
         heads = self.stages[stage]
         z = _combined(self.model, stage, self.spaces[stage].names, encoded.means)
-        new = float(heads.novel(self.model.novelty(stage, encoded.means, self.model.names)))
+        new = float(heads.novel(self.model.novelty(self.model.fitted.rows[stage], encoded.means, self.model.names)))
         # Bayes: the curve was fitted to as many new touches as known ones, a prior of one half.
         odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected
@@ -262,6 +263,6 @@ def _combined(model: Model, stage: int, names: Sequence[str], means: Mapping[Sca
 
 def _weights(model: Model, stage: int) -> FloatArray:
     """The weight of each scale of a stage, summing to one; equal weights if the calibration's are all zero."""
-    weights = model.calibrations[stage].weights
+    weights = model.fitted.rows[stage].calibration.weights
     total = float(weights.sum())
     return weights / total if total > 0 else np.full(len(weights), 1 / len(weights))

@@ -1,296 +1,167 @@
-"""The model of a memory in its present state: updated touch by touch, and fitted anew in threads, so that no call
-waits.
+"""The model of a memory in its present state: its means follow each touch, and a thread fits it anew as touches come.
 
-Three things happen at different rates:
-
-- Each observation updates the readouts at once (`Readout.follow`), so they always rest on all observations.
-- A readout can be updated by a limited number of touches. Before it is full, a thread solves it again from the integer
-  sums (a renewal).
-- Shrinkage, calibration and the table of moments are fitted in another thread (a fit). It begins when the memory has
-  grown by two sixteenths, and its model is adopted from three sixteenths on. If touches come faster, the earlier
-  calibration stays a little longer. In memories of at most FEW touches a call waits for the fit.
-
-A writer stores the model beside its last checkpoint, and the next opening reads it. A stored model cannot be updated
-(see `prediction.stored`): when touches come or go, its readouts are solved again.
+After a fit the class means, the kept touches and the materials follow at once, while the scatter and the weighing stay
+as they were fitted: measured right as often as a fit of all touches. When the memory has grown or shrunk by an eighth,
+a thread fits again, from a copy of the sums; its model is taken as soon as it is there, and follows what came since. In
+memories of at most FEW touches, and where touches came much faster than fits, a call waits.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from weakref import ReferenceType, ref
-
-from scroll_tactile_store import StoreError
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import Added
 from scroll_tactile.persistence.ledger import Ledger
-from scroll_tactile.persistence.open_memory import Derived, give_back_scratch
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.fitting import Draft, Renewal, examined
+from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.stored import NAME, banks_to_arrays, model_from, model_to_arrays, with_banks
+from scroll_tactile.prediction.stored import read_weighing, weighing_text
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.settings import Settings
-from scroll_tactile.validation.gate import WRONG
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["CurrentModel", "FrozenModel", "estimator_of"]
+__all__ = ["CurrentModel", "estimator_of"]
 
-BEGIN, ADOPT = 2, 3  # growth in sixteenths of the touches fitted to: a fit begins, and its model is adopted
-LEAST = 2  # touches of growth at which a model is adopted at the earliest
+GROWTH = 8  # a fit begins when the memory has changed by one in so many touches
+LEAST = 2  # touches by which it has changed at least
 FEW = 16  # touches: in a memory with no more, a call waits for the fit
-MOST_BEHIND = 256  # touches that a model can lag behind: their codes are kept until it takes them in
-
-
-class FrozenModel:
-    """Keeps a model unchanged while this object lives: later touches update a copy."""
-
-    def __init__(self, model: Model) -> None:
-        self.model = model
+FASTER = 2  # times the touches of the last fit: where there are more, or fewer than their share, a call waits
 
 
 @dataclass
 class _Job:
-    """A model that a thread makes.
+    """A fit in a thread.
 
-    version: of the memory when it was begun. since: the touches that came since; None if they are too many.
+    retractions: of the memory when it began. changed: the materials that changed since; None where that is not known.
     """
 
     future: Future[Model]
-    version: int
-    since: list[Added] | None = field(default_factory=list)
-
-    @property
-    def ready(self) -> bool:
-        """Whether the model is made, and can be updated to the present memory."""
-        return self.since is not None and self.future.done() and self.future.exception() is None
+    retractions: int
+    changed: set[str] | None = field(default_factory=set)
 
 
 class CurrentModel:
     """The model of one memory. The caller holds the ledger's lock."""
 
-    def __init__(self, settings: Settings, extractor: FeatureExtractor) -> None:
-        self._kind, self._extractor, self._reading = settings.readout, extractor, extractor
-        self._version = -1
+    def __init__(self, settings: Settings) -> None:
+        self._kind = settings.readout
         self._model: Model | None = None
-        self._stored: Model | None = None  # the model that was read from the disk
-        self._tried_stored = False  # whether the disk was read
-        self._exact = False  # whether the model was fitted here to the present memory, without updates since
-        self._behind: list[Added] | None = []  # the touches that the model lacks; None if it cannot take them in
-        self._fit: _Job | None = None
-        self._renewal: _Job | None = None
-        self._workers: dict[str, ThreadPoolExecutor] = {}
+        self._behind: set[str] | None = set()  # the materials that changed since the model; None where any may have
+        self._version = -1  # of the memory up to which that is so
+        self._retractions = 0  # of the memory when the model was fitted
+        self._exact = False  # whether the model was fitted to the present memory
+        self._job: _Job | None = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._rehearses = False  # whether fits are for live sessions, too
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
         self._estimator: Estimator | None = None
-        self._lent: list[ReferenceType[FrozenModel]] = []
-
-    def frozen(self, ledger: Ledger) -> FrozenModel:
-        """The present model, unchanged for as long as the returned object lives."""
-        model = self.present(ledger)
-        lent = self._holder(model)
-        if lent is None:
-            lent = FrozenModel(model)
-            self._lent = [*(one for one in self._lent if one() is not None), ref(lent)]
-        return lent
-
-    def _holder(self, model: Model) -> FrozenModel | None:
-        """The object that keeps a model unchanged, if there is one."""
-        return next((lent for one in self._lent if (lent := one()) is not None and lent.model is model), None)
 
     def present(self, ledger: Ledger) -> Model:
-        """The model that predictions are made with."""
-        present = self._present(ledger)
-        self.prepare(ledger)
-        return present
-
-    def _present(self, ledger: Ledger) -> Model:
+        """The model that predictions are made with; it never changes."""
         memory = ledger.memory  # first: after an interrupted change this reads the memory again, a new version
-        self._load_stored(ledger)
-        self.take_in(ledger)
-        # The model is None during the update: an interrupted update leaves a half-updated model.
-        (model, behind), (self._model, self._behind) = (self._model, self._behind), (None, None)
-        before = model
-        if model is not None and (behind is None or self._due(model, memory)):
-            model = None
-        if model is not None and behind:
+        self._note_changes(ledger)
+        (model, self._model), behind = (self._model, None), self._behind  # an interrupted call leaves no model
+        if (job := self._job) is not None and job.future.done():
+            self._job = None
+            if job.changed is not None and job.future.exception() is None:
+                model, behind, self._exact = job.future.result(), job.changed, not job.changed
+                self._retractions = job.retractions
+        elif model is None:
+            model = self._restored(ledger)
+        if model is None or behind is None or _outgrown(model, memory):
+            return self._fitted(memory)
+        if behind:
             self._exact = False
-            # Updated in place unless it is frozen: a copy takes as long as half a prediction.
-            model = model.copy() if self._holder(model) is not None else model
-            if not model.follow(memory, behind):
-                model = None
-        present = self._next(memory, before) if model is None else model
-        self._model, self._behind = present, []
-        return present
+            if (model := model.followed(memory, behind)) is None:
+                return self._fitted(memory)
+        self._model, self._behind = model, set()
+        self.prepare(ledger)
+        return model
 
-    def reading(self, ledger: Ledger) -> FeatureExtractor:
-        """The extractor for touches to be predicted: its kernel banks may come from the disk."""
-        self._load_stored(ledger)
-        self.take_in(ledger)
-        return self._reading
-
-    def discard_stored(self) -> None:
-        """Drop the stored model and its banks: they give other features than the memory was made with."""
-        self._reading, self._model, self._stored = self._extractor, None, None
-        self._fit = self._renewal = None
-
-    def _load_stored(self, ledger: Ledger) -> None:
-        """Start with the model that was stored beside the checkpoint, if there is one."""
-        if self._tried_stored or self._model is not None:
+    def _note_changes(self, ledger: Ledger) -> None:
+        """Have the model and the fit under way know what changed since the last call."""
+        if self._process != os.getpid():  # a forked process has not the thread
+            self._process, self._worker, self._job = os.getpid(), None, None
+        if ledger.version == self._version:
             return
-        self._tried_stored, memory = True, ledger.memory
-        if ledger.added is None:
-            return
-        try:
-            if (kept := ledger.derived(NAME)) is None:
-                return
-            embedding = with_banks(self._extractor.embedding, kept.arrays)
-            self._model = self._stored = model_from(kept, memory, self._kind)
-            if embedding is not self._extractor.embedding:
-                self._reading = self._extractor.with_embedding(embedding)
-        except (StoreError, *WRONG) as error:
-            logger.info("the model that was kept is not used: %s", error)
-        else:
-            self._behind = [] if kept.last_sequence == memory.sequence else None
-        give_back_scratch()
-
-    def arrays_to_store(self, ledger: Ledger) -> Derived | None:
-        """The present model as `prediction.stored` has it, with the banks; None if there is none to store.
-
-        That is: no model was made, the stored one is still current, or a small memory's model is out of date.
-        """
-        memory, model = ledger.memory, self._model
-        self.close()  # waits for the threads
-        self.take_in(ledger)
-        if model is None or (model is self._stored and self._behind == [] and not ledger.saved_since(memory)):
-            return None
-        if self._behind != [] and model.fitted_to <= FEW:
-            return None
-        if (made := model_to_arrays(self._present(ledger))) is None:
-            return None
-        return made[0] | banks_to_arrays(self._reading.embedding), *made[1:]
+        changed, ledger.changed = ledger.changed, set()
+        self._version, self._exact = ledger.version, False  # of an axis, a touch without a label changes samples alone
+        self._behind = _joined(self._behind, changed)
+        if self._job is not None:
+            self._job.changed = _joined(self._job.changed, changed)
 
     def prepare(self, ledger: Ledger) -> None:
-        """Start a fit or a renewal if enough touches came since the last. A lack of memory or threads raises nothing
-        here."""
-        self.take_in(ledger)
+        """Begin a fit if enough touches came or went. A lack of memory or threads raises nothing here."""
+        self._note_changes(ledger)
         model, memory = self._model, ledger.memory
-        if model is None:
+        if model is None or self._job is not None:
             return
-        lag = abs(memory.statistics.touches - model.fitted_to)
+        if abs(memory.statistics.touches - model.touches) < max(LEAST, model.touches // GROWTH):
+            return
         # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
         with suppress(MemoryError, InputError, RuntimeError):
-            if self._fit is None and lag >= max(LEAST // 2, BEGIN * model.fitted_to // 16):
-                draft = Draft.of(memory, self._kind)
-                self._fit = _Job(self._worker("fit").submit(draft.fit, self._reading), self._version)
-            if (
-                self._renewal is None
-                and self._behind
-                and model.needs_renewal(self._behind)
-                and _has_all_of(memory, model)
-            ):
-                solving = self._worker("renewal").submit(Renewal.of(model, memory).solve)
-                self._renewal = _Job(solving, self._version)
+            draft = Draft.of(memory, self._kind, model)
+            self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
+            fitted = self._worker.submit(draft.fit, rehearsed=self._rehearses)
+            self._job = _Job(fitted, memory.retractions)
 
-    def _worker(self, name: str) -> ThreadPoolExecutor:
-        if name not in self._workers:
-            self._workers[name] = ThreadPoolExecutor(1, f"scroll-tactile {name}")
-        return self._workers[name]
+    def rehearsed(self, ledger: Ledger) -> Model:
+        """The present model with the trajectories of held-out touches; fits have them from now on."""
+        self._rehearses, model = True, self.present(ledger)
+        rehearse(model)
+        return model
 
     def settle(self, ledger: Ledger) -> Model:
         """The model fitted to the present memory: a function of the set of observations alone."""
         memory = ledger.memory
-        self.take_in(ledger)
-        if self._model is None or self._behind != [] or not self._exact:
-            self._model, self._fit, self._renewal = None, None, None
-            self._reading = self._extractor  # the fitted model uses nothing that was read from the disk
-            self._model, self._behind = self._fitted(memory), []
+        self._note_changes(ledger)
+        if self._model is None or self._behind != set() or not self._exact:
+            return self._fitted(memory)
         return self._model
 
-    def examined(self, ledger: Ledger) -> Model:
-        """A copy of the present model, with the scores of its sampled touches, each held out."""
-        model = self._present(ledger)
-        if model.fusion is None or self._exact:
-            return model.copy()
-        return examined(model, ledger.memory)
+    def _restored(self, ledger: Ledger) -> Model | None:
+        """The model by the weighing of the checkpoint that the memory was read from; None where it has none that fits.
 
-    def close(self) -> None:
-        """End the threads; a later prediction starts new ones if it needs them."""
-        workers, self._workers = self._workers, {}
-        for worker in workers.values():
-            worker.shutdown()
+        It was fitted to these touches or to fewer: a retraction drops it.
+        """
+        if (text := ledger.take_weighing()) is None:
+            return None
+        try:
+            return read_weighing(text, Draft.of(ledger.memory, self._kind).solved(), ledger.memory)
+        except ValueError as error:
+            logger.warning("the weighing in the memory's checkpoint is not used, and fitted anew: %.300s", error)
+            return None
 
-    def take_in(self, ledger: Ledger) -> None:
-        """Take the changes of the memory since the last call into `_behind` and the jobs."""
-        if self._process != os.getpid():  # a forked process has not the threads
-            self._process, self._workers, self._fit, self._renewal = os.getpid(), {}, None, None
-        if ledger.version == self._version:
-            return
-        self._exact = False  # of an axis, a touch without a label changes the samples alone
-        added = ledger.added if self._model is not None else None
-        # None until all changes are noted: if this is interrupted, a touch could be noted twice, or never.
-        behind, jobs = self._behind, (self._fit, self._renewal)
-        self._behind, self._fit, self._renewal = None, None, None
-        self._version = ledger.version
-        ledger.follow, ledger.added = True, []
-        if added is not None:
-            for job in jobs:
-                if job is not None:
-                    job.since = _with(job.since, added)
-            self._behind, (self._fit, self._renewal) = _with(behind, added), jobs
-
-    def _due(self, model: Model, memory: Memory) -> bool:
-        """Whether the model is to be replaced: it is out of date, and the next is ready or worth waiting for."""
-        late = abs(memory.statistics.touches - model.fitted_to) >= max(LEAST, ADOPT * model.fitted_to // 16)
-        if late and model.fitted_to <= FEW:
-            return True
-        if self._fit is not None and self._fit.future.done() and not self._fit.ready:
-            self._fit = None  # it failed, or too many touches came since: another is begun
-        # Before the readouts are full: otherwise two models would be in memory most of the time.
-        nearly_full = any(readout.nearly_full for readout in model.readouts.values())
-        ready = nearly_full and self._renewal is not None and self._renewal.ready
-        return ready or (late and self._fit is not None and self._fit.ready)
-
-    def _next(self, memory: Memory, before: Model | None) -> Model:
-        """The model that replaces the one before: fitted by a thread, or with its readouts solved again."""
-        fit, renewal = self._fit, self._renewal
-        if fit is not None and fit.ready:
-            self._fit = None
-            model, since = fit.future.result(), fit.since or []
-            late = abs(memory.statistics.touches - model.fitted_to) >= LEAST and model.fitted_to <= FEW
-            if not late and model.follow(memory, since):
-                self._exact, self._renewal = fit.version == self._version, None
-                return model
-        if before is None or before.fitted_to <= FEW or not _has_all_of(memory, before):
-            self._fit = self._renewal = None
-            return self._fitted(memory)
-        if renewal is not None and renewal.since is not None:
-            self._renewal = None
-            if renewal.future.exception() is None:  # may wait, but less long than solving them here takes
-                model = renewal.future.result()
-                if model.follow(memory, renewal.since):
-                    self._exact = False
-                    return model
-        self._exact, self._renewal = False, None
-        model = Renewal.of(before, memory).solve()
-        return model if model.follow(memory, []) else self._fitted(memory)
+    def stored(self, ledger: Ledger) -> str | None:
+        """The weighing of the present model, for a checkpoint; None where there is none of touches that all count."""
+        if self._model is None or self._retractions != ledger.memory.retractions:
+            return None
+        return weighing_text(self._model)
 
     def _fitted(self, memory: Memory) -> Model:
-        model = Draft.of(memory, self._kind).fit(self._reading)
-        self._exact = True
+        self._model, self._job = None, None
+        self._model = model = Draft.of(memory, self._kind).fit(rehearsed=self._rehearses)
+        self._behind, self._exact, self._retractions = set(), True, memory.retractions
         return model
 
-    def composer(self, ledger: Ledger, model: Model) -> Composer:
+    def close(self) -> None:
+        """End the thread; a later prediction starts a new one if it needs it."""
+        worker, self._worker = self._worker, None
+        if worker is not None:
+            worker.shutdown()
+
+    def composer(self, ledger: Ledger) -> Composer:
         """The heads of all constituents that were described, over a model of this memory."""
-        if model.fusion is not None and not model.held_out:  # a stored model has no held-out touches, which heads need
+        model = self.present(ledger)
+        weighing = model.weighing
+        if weighing is not None and not {material for material, *_ in weighing.sample} <= model.known:
             model = self.settle(ledger)
         state = model, ledger.version, ledger.described
         if self._composer is None or self._composer[:3] != state:
@@ -309,14 +180,13 @@ def estimator_of(memory: Memory, before: Estimator | None = None) -> Estimator:
     return Estimator.of(memory.plan, memory.sample, memory.quantities, least, before)
 
 
-def _has_all_of(memory: Memory, model: Model) -> bool:
-    """Whether all materials of a model are in the memory."""
-    return model.known <= memory.statistics.materials.keys()
+def _outgrown(model: Model, memory: Memory) -> bool:
+    """Whether so many touches came or went that a call waits for the fit."""
+    now, fitted = memory.statistics.touches, model.touches
+    if fitted <= FEW:
+        return abs(now - fitted) >= min(LEAST, fitted + 1)
+    return not fitted <= FASTER * now <= FASTER * FASTER * fitted
 
 
-def _with(touches: list[Added] | None, more: Sequence[Added]) -> list[Added] | None:
-    """The list extended by more touches; None if it would be too long."""
-    if touches is None or len(touches) + len(more) > MOST_BEHIND:
-        return None
-    touches.extend(more)
-    return touches
+def _joined(before: set[str] | None, changed: set[str] | None) -> set[str] | None:
+    return None if before is None or changed is None else before | changed

@@ -109,7 +109,7 @@ class FeatureExtractor:
         plan: WindowPlan,
         check: FingerprintCheck | None = None,
     ) -> None:
-        self._check, self._own = check, True
+        self._check = check
         self._sensor = sensor
         self._embedding = embedding
         self._plan = plan
@@ -126,12 +126,6 @@ class FeatureExtractor:
         """What makes the features."""
         return self._embedding
 
-    def with_embedding(self, embedding: Embedding) -> FeatureExtractor:
-        """The same with an embedding that gives the same features."""
-        other = FeatureExtractor(self._sensor, embedding, self._plan, self._check)
-        other._own = False
-        return other
-
     @property
     def check(self) -> FingerprintCheck | None:
         """The check of its embedding that is still to be made."""
@@ -145,7 +139,7 @@ class FeatureExtractor:
 
     def verifying(self) -> AbstractContextManager[None]:
         """As `verified`, in a thread while the block runs; raises at the end of the block."""
-        return nullcontext() if self.check is None else self.check.beside(self._embedding, own=self._own)
+        return nullcontext() if self.check is None else self.check.beside(self._embedding)
 
     def stream(self, readings: Readings) -> Stream:
         """The validated stream of some readings; of a camera's, the frames in contact.

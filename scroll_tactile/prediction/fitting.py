@@ -1,14 +1,15 @@
-"""Fitting a model to the present memory: its readouts are solved, then calibrated on held-out touches.
+"""Fitting a model to the present memory: its readouts are solved, then weighed by held-out touches.
 
-A sampled touch that is kept is taken out of the readouts and out of the kept touches. Its prefixes, and its versions at
-other paces, are made from its kept levels. Readouts and kept touches, both without it, judge all of these, as they will
-judge a new touch. The calibrations (`readouts.calibration`) and the weights of readouts and kept touches at each moment
-(`fusion`) are fitted to these judgements. A prediction fits nothing, and the model is a function of the set of touches.
+Each sampled touch is scored by readouts without it, and some kept touches are matched with the others: once each,
+complete and without noise. The calibrations (`readouts.calibration`), τ and the excess loss of known touches rest on
+these; those of prefixes on the same neighbours. A prediction fits nothing, and the model is a function of the set of
+touches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,90 +17,62 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import at_places
-from scroll_tactile.matching.likelihood import LevelArray
-from scroll_tactile.matching.match import KeptTouch, Match
-from scroll_tactile.matching.matcher import TouchMatcher, matcher_of
+from scroll_tactile.matching.kept_arrays import KeptArrays, at_places
+from scroll_tactile.matching.likelihood import CLEAN
+from scroll_tactile.matching.match import KeptTouch, Match, independent
+from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
-from scroll_tactile.prediction.features import FeatureExtractor, WindowCache, stream_of
-from scroll_tactile.prediction.fusion import HeldOutMoment, chosen_of, fuse, moments_of
-from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.moment_table import Fusion
+from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.model import (
+    WITHIN,
+    Model,
+    Paces,
+    Row,
+    Trajectories,
+    Weighing,
+    held_out_of,
+    match_scores,
+    tempered,
+)
 from scroll_tactile.readouts.calibration import (
-    PRIOR_WEIGHT,
-    Calibration,
+    AHEAD,
+    FEWEST,
     HeldOutProbabilities,
     calibrate_stage,
+    fit_weights,
     held_out_probabilities,
 )
-from scroll_tactile.readouts.dependence import Dependence, dependence_of
+from scroll_tactile.readouts.dependence import dependence_of
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
-from scroll_tactile.readouts.readout import Readout, ReadoutName
+from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["PACES", "Draft", "Renewal", "at_pace", "examined"]
+__all__ = ["Draft", "paces_of", "rehearse"]
 
 FloatArray = npt.NDArray[np.float64]
-Queries = dict[Scale, dict[int, dict[int, FloatArray]]]
-"""Scale → a touch's place in the sample → number → mean features in grid units, (d,); see `held_out_scores`."""
 
 MOST_OF_RIDGE = 1024  # materials: it inverts a matrix of all of them
-PACES = (2.0, 1.41, 0.71, 0.5)  # relative to a touch's own: it is resampled to be twice to half as fast
-
-
-@dataclass(frozen=True)
-class Renewal:
-    """Solves the readouts of a model again, from the memory as it was when this was made; calibration and fusion stay.
-
-    It takes a tenth of the time of a fit: a model can keep up with touches that come too fast for fits.
-    """
-
-    model: Model
-    readouts: dict[Scale, Readout]
-    tasks: dict[Scale, Task]
-
-    @classmethod
-    def of(cls, model: Model, memory: Memory) -> Renewal:
-        """The renewal of a model whose materials are all in the memory."""
-        tasks = {
-            scale: Task.of(memory.statistics, scale, readout.reference) for scale, readout in model.readouts.items()
-        }
-        return cls(model.copy({}), dict(model.readouts), tasks)
-
-    def solve(self) -> Model:
-        """Solve the readouts one after the other; each task is freed."""
-        with one_thread():
-            for scale in sorted(self.tasks):
-                task = self.tasks.pop(scale)
-                self.model.readouts[scale] = task.solve(like=self.readouts.pop(scale))
-        give_back_scratch()
-        return self.model
-
-
-def examined(model: Model, memory: Memory) -> Model:
-    """A model as it judges this memory, with the sampled touches and the scores of each held out.
-
-    Neither is stored, and updates leave both behind. The readouts are solved again, so that touches can be held out of
-    them; calibration and fusion stay those that answer. It takes a fifth of the time of a fit.
-    """
-    renewed, sample = Renewal.of(model, memory).solve(), list(memory.sample)
-    stages = [[*stage, *renewed.views] for stage in renewed.stages]
-    with one_thread():
-        held_out = {
-            scale: held_out_scores(readout, sample, stages, renewed.kind) for scale, readout in renewed.readouts.items()
-        }
-    return replace(renewed, sample=sample, held_out=held_out)
+MOST_HELD_OUT = 96  # kept touches that are matched with the others: τ is a third too low by 32
+ALONE_TOUCHES = 2.0  # how many touches the prior of τ counts as
+UNMATCHED = 1 / 16_000  # τ where nothing can be held out: a larger one misclassifies prefixes, with one touch of each
+PRIOR_OUTLIERS = 0.5  # of one more touch than the held-out ones
+STEPS = 100  # of EM
+PACES = 2.0, 0.5  # times a touch's own, at which it is judged as others made faster or slower
+EVEN = 4.0  # times the energy of noise that those stay below: there the share of noise is a half
+ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
+LEAST_SPREAD, LEAST_INFORMATION, LEAST_WEIGHT = 1e-9, 1e-3, 1e-9
 
 
 @dataclass(frozen=True)
 class Draft:
     """The input of a fit, copied from a memory at one moment, so that fitting needs no lock.
 
-    Raises InputError, from `of`, for the ridge of more materials than it can weigh.
+    kept: the kept touches; arrays, conformal: what an earlier model made of the very same, if it did. Raises
+    InputError, from `of`, for the ridge of more materials than it can weigh.
     """
 
     kind: ReadoutName
@@ -110,13 +83,14 @@ class Draft:
     tasks: dict[Scale, Task]
     sample: list[tuple[str, bytes, SampledTouch]]
     kept: list[KeptTouch]
+    before: Model | None
     longest: int
     least: int
     touches: int
 
     @classmethod
-    def of(cls, memory: Memory, kind: ReadoutName) -> Draft:
-        """The draft of a memory as it is now."""
+    def of(cls, memory: Memory, kind: ReadoutName, before: Model | None = None) -> Draft:
+        """The draft of a memory as it is now. before: a model that followed it to here."""
         statistics, sample = memory.statistics, list(memory.sample)
         names = list(statistics.materials)
         if kind == "ridge" and len(names) > MOST_OF_RIDGE:
@@ -130,23 +104,28 @@ class Draft:
         stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
         views = [view for view in memory.plan.views if view in tasks]
         kept = memory.kept.touches() if memory.kept is not None and views else []
-        lengths = statistics.longest, statistics.fifth_percentile_length
-        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, *lengths, statistics.touches)
+        lengths = statistics.longest, max(1, min(statistics.fifth_percentile_length, statistics.longest))
+        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, statistics.touches)
 
-    def fit(self, extractor: FeatureExtractor | None) -> Model:
-        """Solve the readouts and fit calibration and weights. Can be called once: it frees the tasks.
+    def fit(self, *, rehearsed: bool = False) -> Model:
+        """Solve the readouts and weigh them. Can be called once: it frees the tasks. rehearsed: with trajectories."""
+        model = self.solved()
+        with one_thread():
+            if (weighing := _weighed(self, model)) is not None and model.matcher is not None:
+                weighing, matcher = _by_kept_touches(weighing, model.matcher)
+                model = replace(model, matcher=matcher)
+        model = replace(model, weighing=weighing)
+        if rehearsed:
+            rehearse(model)
+        give_back_scratch()
+        return model
 
-        extractor: reads kept touches; without it nothing is fitted to their prefixes and other paces.
-        """
+    def solved(self) -> Model:
+        """A model without a weighing. Can be called once: it frees the tasks."""
         with one_thread():
             # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
-            fit = _Fit(self, readouts, extractor)
-            held_out = {scale: fit.held_out_scores(scale) for scale in readouts}
-            reached = [scales for scales in self.stages if all(scale in readouts for scale in scales)]
-            calibrations = [fit.calibrated(stage, scales, held_out)[0] for stage, scales in enumerate(reached)]
-            whole, fusion = fit.fused(len(reached) - 1, held_out) if reached else (None, None)
-        give_back_scratch()
+            matcher, conformal = self._matched()
         return Model(
             kind=self.kind,
             plan=self.plan,
@@ -154,160 +133,218 @@ class Draft:
             stages=self.stages,
             views=self.views,
             readouts=readouts,
-            calibrations=calibrations,
-            held_out=held_out,
-            sample=self.sample,
-            fusion=fusion,
-            dependence=Dependence() if whole is None else dependence_of(whole),
-            conformal=Conformal.of(self.kept) if fusion is not None and fusion.matcher is not None else None,
-            least=self.least,
+            weighing=None,
+            matcher=matcher,
+            conformal=conformal,
             longest=self.longest,
-            fitted_to=self.touches,
         )
 
-
-@dataclass(frozen=True)
-class _Fit:
-    """One fit: a draft, its solved readouts, and the extractor for prefixes of kept touches."""
-
-    draft: Draft
-    readouts: Mapping[Scale, Readout]
-    extractor: FeatureExtractor | None
-
-    def held_out_scores(self, scale: Scale, queries: Queries | None = None) -> HeldOutScores:
-        """A scale's scores of the sampled touches, each held out. queries: features scored in place of their rows."""
-        draft = self.draft
-        stages = [[*stage, *draft.views] for stage in draft.stages]
-        own = None if queries is None else queries[scale]
-        return held_out_scores(self.readouts[scale], draft.sample, stages, draft.kind, own)
-
-    def calibrated(
-        self, number: int, scales: Sequence[Scale], held_out: Mapping[Scale, HeldOutScores]
-    ) -> tuple[Calibration, HeldOutProbabilities]:
-        """The calibration of some scales, and the calibrated probabilities of the held-out touches.
-
-        number: the stage of the scores in `held_out`, or the number of their query.
-        """
-        found = StageScores(number, self.draft.sample, [held_out[scale] for scale in scales])
-        readouts = [self.readouts[scale] for scale in scales]
-        calibration = calibrate_stage(found, readouts, self.draft.kind, viewed=bool(self.draft.views))
-        return calibration, held_out_probabilities(found, scales, calibration)
-
-    def judged(
-        self,
-        moment: tuple[int, int],
-        number: int,
-        scales: Sequence[Scale],
-        held_out: Mapping[Scale, HeldOutScores],
-        matches: Mapping[bytes, Match],
-    ) -> HeldOutMoment:
-        """Some scales and the kept touches at a moment, given as its steps and stage."""
-        return HeldOutMoment(*moment, *self.calibrated(number, scales, held_out), matches)
-
-    def fused(self, last: int, held_out: Mapping[Scale, HeldOutScores]) -> tuple[HeldOutProbabilities, Fusion]:
-        """The readouts' probabilities of complete held-out touches, and the table of all weights.
-
-        last: the last stage that any touch reached. held_out: each scale's scores of the sampled touches.
-        """
-        draft, milestones = self.draft, self.draft.plan.milestones()[: last + 1]
-        matcher = matcher_of(draft.kept) if draft.kept else None
-        least = max(1, min(draft.least, draft.longest))
-        complete = self.judged((least, last), last, [*draft.stages[last], *draft.views], held_out, {})
-        steps = moments_of(milestones, least, matched=matcher is not None)
-        moments = [(at, max(0, sum(length <= at for length in milestones) - 1)) for at in steps]
-        chosen, counts = chosen_of(complete.held_out, matcher)
-        weight = PRIOR_WEIGHT[draft.kind]
-        if matcher is None:
-            judged = [self.judged(moment, moment[1], draft.stages[moment[1]], held_out, {}) for moment in moments]
-            return complete.held_out, fuse(None, [*judged, complete], [complete], chosen, counts, weight)
-        if self.extractor is None:
-            moments = []
-        kept = _KeptTouches.held_out(self, matcher, chosen, {*chosen, *counts})
-        complete = replace(complete, matches=kept.matches)
-        if not chosen or self.extractor is None:
-            alone = self.judged((least, last), last, draft.views, held_out, {})
-            return complete.held_out, fuse(
-                matcher, [*kept.prefixes(moments), complete], [alone], chosen, counts, weight
-            )
-        # Every second touch is enough: early decisions use the moments alone, not the paces.
-        paced = [kept.paced(pace, chosen[::2], last) for pace in PACES]
-        return complete.held_out, fuse(matcher, [*kept.prefixes(moments), complete], paced, chosen, counts, weight)
+    def _matched(self) -> tuple[TouchMatcher | None, Conformal | None]:
+        """What touches are matched by, where any are kept."""
+        if not self.kept:
+            return None, None
+        if self.before is not None and self.before.matcher is not None and self.before.conformal is not None:
+            arrays = self.before.matcher.kept
+            if set(arrays.touches) == {(touch.material, touch.key) for touch in self.kept}:
+                return TouchMatcher.of(arrays), self.before.conformal
+        return TouchMatcher.of(KeptArrays.of(self.kept)), Conformal.of(self.kept)
 
 
-@dataclass(frozen=True)
-class _KeptTouches:
-    """Kept touches, each judged as if it were new: by readouts and kept touches without it.
+def _weighed(draft: Draft, model: Model) -> Weighing | None:
+    """How the readouts are to be believed; None where no touch reached a stage."""
+    reached = [scales for scales in model.stages if all(scale in model.readouts for scale in scales)]
+    if not reached:
+        return None
+    last, milestones = len(reached) - 1, model.plan.milestones()
+    held_out = held_out_of(model.readouts, draft.sample, model.stages, model.views, model.kind)
 
-    chosen: the keys of the touches that are judged at all moments. levels, rows: by key, the levels (C, T) and the row
-    among the kept. places: by key, in the sample. matches: of each with the other kept touches.
+    def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
+        """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
+        found = StageScores(stage, draft.sample, [held_out[scale] for scale in scales])
+        readouts = [model.readouts[scale] for scale in scales]
+        calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views))
+        held = held_out_probabilities(found, scales, calibration)
+        own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
+        rate = _outlier_rate(own, len(held.names)) if len(own) else 0.0
+        return Row(steps, tuple(scales), calibration, rate, rate), held
+
+    rows = [row(stage, scales, milestones[stage])[0] for stage, scales in enumerate(reached)]
+    complete, held = row(last, [*reached[last], *model.views], draft.least)
+    if len(held.keys):
+        complete = replace(complete, distance_limit=float(np.quantile(held.distance, WITHIN)))
+    return Weighing(
+        rows=tuple(rows),
+        complete=complete,
+        paced=row(last, model.views, 1)[0] if model.views else complete,
+        tau=UNMATCHED,
+        dependence=dependence_of(held),
+        least=draft.least,
+        touches=draft.touches,
+        sample=draft.sample,
+        held_out=held_out,
+    )
+
+
+def _outlier_rate(own: FloatArray, materials: int) -> float:
+    """ε of least log loss (EM). own: the probabilities of the touches' own materials without ε."""
+    rate = PRIOR_OUTLIERS / (len(own) + 1)
+    for _ in range(STEPS):
+        drawn = rate / materials
+        rate = (float((drawn / ((1 - rate) * own + drawn)).sum()) + PRIOR_OUTLIERS) / (len(own) + 1)
+    return rate
+
+
+def _chosen(weighing: Weighing, held_out: Mapping[Scale, HeldOutScores], matcher: TouchMatcher) -> dict[int, int]:
+    """Row among the kept touches → place in the sample, of at most MOST_HELD_OUT held-out touches, evenly by key.
+
+    Of a material of which none but itself is kept, a touch says nothing.
     """
-
-    fit: _Fit
-    matcher: TouchMatcher
-    chosen: Sequence[bytes]
-    rows: Mapping[bytes, int]
-    levels: Mapping[bytes, LevelArray]
-    places: Mapping[bytes, int]
-    matches: Mapping[bytes, Match]
-
-    @classmethod
-    def held_out(cls, fit: _Fit, matcher: TouchMatcher, chosen: Sequence[bytes], keys: Iterable[bytes]) -> _KeptTouches:
-        """The kept touches with some keys."""
-        kept = matcher.kept.rows()
-        rows = {key: kept[key] for key in sorted(keys)}
-        levels = {key: matcher.kept.levels(row) for key, row in rows.items()}
-        places = {key: place for place, (_, key, _) in enumerate(fit.draft.sample)}
-        matches = {key: matcher.match(levels[key], held_out=row) for key, row in rows.items()}
-        return cls(fit, matcher, chosen, rows, levels, places, matches)
-
-    def prefixes(self, moments: Sequence[tuple[int, int]]) -> list[HeldOutMoment]:
-        """Readouts and kept touches on their prefixes at each moment, given as its steps and stage."""
-        held_out, judged = self._read(moments), []
-        for number, (steps, stage) in enumerate(moments):
-            matches = {}
-            for key in self.chosen:
-                if (levels := self.levels[key]).shape[1] >= steps:
-                    # The noise is estimated once, on the whole touch: that is most of the cost of a match.
-                    noise = self.matches[key].noise
-                    matches[key] = self.matcher.match(levels[:, :steps], held_out=self.rows[key], noise=noise)
-            scales = self.fit.draft.stages[stage]
-            judged.append(self.fit.judged((steps, stage), number, scales, held_out, matches))
-        return judged
-
-    def _read(self, moments: Sequence[tuple[int, int]]) -> dict[Scale, HeldOutScores]:
-        """The scores of their prefixes by each scale of windows, by the moment's number."""
-        fit, draft, extractor = self.fit, self.fit.draft, self.fit.extractor
-        queries: Queries = {scale: {} for scale in fit.readouts if scale not in draft.views}
-        for key in self.chosen if moments else ():
-            assert extractor is not None
-            touch, cache = stream_of(self.levels[key], extractor.sensor), WindowCache()
-            for number, (steps, stage) in enumerate(moments):
-                if steps > len(touch):
-                    break
-                image = extractor.image(touch.first(steps / touch.sensor.rate))
-                for scale, mean in extractor.means(image, draft.stages[stage], cache=cache).items():
-                    queries[scale].setdefault(self.places[key], {})[number] = mean
-        return {scale: fit.held_out_scores(scale, queries) for scale in queries}
-
-    def paced(self, pace: float, keys: Sequence[bytes], last: int) -> HeldOutMoment:
-        """Views and kept touches on some of the touches, resampled to be so many times as fast."""
-        fit, views, extractor = self.fit, self.fit.draft.views, self.fit.extractor
-        assert extractor is not None
-        queries: Queries = {scale: {} for scale in views}
-        matches = {}
-        for key in keys:
-            levels, noise = at_pace(self.levels[key], pace), self.matches[key].noise
-            matches[key] = self.matcher.match(levels, held_out=self.rows[key], whole=True, noise=noise)
-            image = extractor.image(stream_of(levels, extractor.sensor))
-            for scale, mean in extractor.means(image, views).items():
-                queries[scale][self.places[key]] = {0: mean}
-        lengths = [self.levels[key].shape[1] / pace for key in keys]
-        steps = max(1, round(float(np.median(lengths)))) if lengths else 1
-        held_out = {scale: fit.held_out_scores(scale, queries) for scale in views}
-        return fit.judged((steps, last), 0, views, held_out, matches)
+    labels = matcher.kept.labels
+    found = StageScores(len(weighing.rows) - 1, weighing.sample, [held_out[s] for s in weighing.complete.scales])
+    places, counts = dict(zip(found.keys, found.places, strict=True)), np.bincount(labels)
+    keys = [(key, row) for key, row in sorted(matcher.kept.rows().items()) if key in places and counts[labels[row]] > 1]
+    spread = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int).tolist()
+    return {keys[i][1]: places[keys[i][0]] for i in spread}
 
 
-def at_pace(levels: LevelArray, pace: float) -> LevelArray:
-    """A touch resampled to be so many times as fast: (C, T) to (C, T / pace)."""
-    steps = max(2, round(levels.shape[1] / pace))
-    return at_places(levels, np.linspace(0, levels.shape[1] - 1, steps))
+def _by_kept_touches(weighing: Weighing, matcher: TouchMatcher) -> tuple[Weighing, TouchMatcher]:
+    """The weighing with τ, and what is natural among kept touches, by some of them matched with the others."""
+    assert weighing.held_out is not None
+    kept, chosen = matcher.kept, _chosen(weighing, weighing.held_out, matcher)
+    if len(chosen) < FEWEST or len(kept.materials) < 2:
+        return weighing, matcher
+    found = [matcher.beside(matcher.query(kept.levels(row), held_out=row), CLEAN) for row in chosen]
+    matches = [matcher.result(each) for each in found]
+    targets = kept.labels[list(chosen)].tolist()
+    early = [row.steps for row in weighing.early]
+    losses = np.stack([matcher.excess_at(each, early) for each in found])
+    whole = np.array([match.excess_loss for match in matches])
+
+    def weighed(row: Row, loss: FloatArray) -> Row:
+        loss = loss[np.isfinite(loss)]
+        outliers = max(row.readout_outliers, PRIOR_OUTLIERS / (len(chosen) + 1))
+        if len(loss) < FEWEST:
+            return replace(row, outliers=outliers)
+        return replace(row, outliers=outliers, excess=(float(loss.mean()), max(float(loss.std()), LEAST_SPREAD)))
+
+    rows = [weighed(row, losses[:, i] if i < len(early) else whole) for i, row in enumerate(weighing.rows)]
+    fitted = replace(
+        weighing,
+        rows=tuple(rows),
+        complete=weighed(weighing.complete, whole),
+        paced=weighed(weighing.paced, whole),
+        tau=_tau(matches, targets),
+    )
+    return fitted, _natural(matcher, matches)
+
+
+def _tau(matches: Sequence[Match], targets: Sequence[int]) -> float:
+    """τ: the weight at which kept touches by themselves have least log loss, at an information of 1.
+
+    It is drawn to the weight at which the best material leads the next by AHEAD logits, in the median.
+    """
+    information = np.maximum([match.information for match in matches], LEAST_INFORMATION)
+    median = float(np.median(information))
+    scores = np.stack([match.scores for match in matches]) * (median / information)[:, None]
+    best = np.sort(scores, axis=1)[:, -2:]
+    prior = AHEAD / max(float(np.median(best[:, 1] - best[:, 0])), AHEAD)
+    weight = float(fit_weights(scores[:, None], targets, np.array([prior]), ALONE_TOUCHES)[0])
+    return 1 / (1 + max(1 / max(weight, LEAST_WEIGHT) - 1, 0.0) / median)
+
+
+def _natural(matcher: TouchMatcher, matches: Sequence[Match]) -> TouchMatcher:
+    """The matcher with what is natural among its touches: how they deviate from the nearest others."""
+    energies = np.array([match.energy for match in matches])
+    coherence = float(np.median([match.coherence for match in matches]))
+    noise = [independent(match.energy, match.coherence, coherence) for match in matches]
+    even = EVEN * float(np.quantile(noise, WITHIN))
+    return matcher.measured(coherence, max(even, ROUNDING), max(float(np.quantile(energies, WITHIN)), ROUNDING))
+
+
+def rehearse(model: Model) -> None:
+    """Find how held-out kept touches are answered at the length of each row before they were complete.
+
+    Each prefix is matched with those of the other kept touches; where none are kept the readouts answer alone.
+    """
+    weighing = model.weighing
+    if weighing is None or weighing.trajectories is not None:
+        return
+    matcher, held_out = model.matcher, model.held_out
+    chosen = None if matcher is None else {place: row for row, place in _chosen(weighing, held_out, matcher).items()}
+    early = weighing.early
+    names = StageScores(0, weighing.sample, [held_out[scale] for scale in weighing.rows[0].scales]).names
+    shape = len(weighing.sample), len(early)
+    chances, novelty = np.full((*shape, len(names)), np.nan), np.full(shape, np.nan)
+    targets = np.zeros(shape[0], np.intp)
+    with one_thread():
+        for stage, row in enumerate(early):
+            found = StageScores(stage, weighing.sample, [held_out[scale] for scale in row.scales])
+            held = held_out_probabilities(found, row.scales, row.calibration)
+            for i, place in enumerate(held.places if held.names == names else ()):
+                own = np.exp(held.logs[i])
+                if matcher is None or chosen is None:
+                    answered = tempered(own, row.readout_outliers)
+                elif place in chosen:
+                    kept = chosen[place]
+                    match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept)
+                    fused = weighing.fused("prefix", own, match, match_scores(matcher, names, match), 0.0)
+                    answered = tempered(fused, row.outliers)
+                else:
+                    continue
+                chances[place, stage], novelty[place, stage], targets[place] = (
+                    answered,
+                    held.novelty[i],
+                    held.targets[i],
+                )
+    reached = np.isfinite(novelty).any(axis=1)
+    weighing.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
+
+
+def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:
+    """How known touches look at twice and half their pace; None where too few can be held out.
+
+    Half of the kept touches that a fit matches are resampled, and judged by the views and the kept touches without
+    them. The first touch of another length has it measured, and later ones find it in the weighing.
+    """
+    weighing, matcher = model.fitted, model.matcher
+    if weighing.paces is None and matcher is not None:
+        chosen = dict(list(_chosen(weighing, model.held_out, matcher).items())[::2])
+        if len(chosen) >= FEWEST:
+            with one_thread():
+                weighing.paces = _measured_paces(model, extractor, matcher, chosen)
+    return weighing.paces
+
+
+def _measured_paces(
+    model: Model, extractor: FeatureExtractor, matcher: TouchMatcher, chosen: Mapping[int, int]
+) -> Paces:
+    """As `paces_of`. chosen: row among the kept touches → place in the sample."""
+    weighing, row = model.fitted, model.fitted.paced
+    queries: dict[Scale, dict[int, dict[int, FloatArray]]] = {view: {} for view in model.views}
+    excess = np.zeros((len(PACES), len(weighing.sample)))
+    for kept, place in chosen.items():
+        levels = matcher.kept.levels(kept)
+        for number, pace in enumerate(PACES):
+            columns = max(2, round(levels.shape[1] / pace))
+            other = at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))
+            excess[number, place] = matcher.beside(matcher.query(other, whole=True, held_out=kept), CLEAN).excess
+            image = extractor.image(stream_of(other, extractor.sensor))
+            for view, mean in extractor.means(image, model.views).items():
+                queries[view].setdefault(place, {})[number] = mean
+    viewed = [[*stage, *model.views] for stage in model.stages]
+    held_out = [
+        held_out_scores(model.readouts[view], weighing.sample, viewed, model.kind, queries[view])
+        for view in model.views
+    ]
+    others = []
+    for number in range(len(PACES)):
+        found = StageScores(number, weighing.sample, held_out)
+        values = np.column_stack([found.distances().min(axis=2), excess[number, found.places]])
+        mean, spread = values.mean(axis=0), np.maximum(values.std(axis=0), LEAST_SPREAD)
+        spread *= max(float(((values - mean) / spread).mean(axis=1).std()), LEAST_SPREAD)
+        novelties = np.sort(((values - mean) / spread).mean(axis=1))
+        # As many of these lie above the threshold as of touches in their own time.
+        rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
+        high = float(novelties[rank]) / max(row.calibration.threshold(1 - WITHIN), LEAST_SPREAD)
+        others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
+    return Paces(np.vstack([row.calibration.scale_novelty, row.excess]), np.stack(others))

@@ -1,14 +1,20 @@
 """The prediction for a touch, or for several of one thing: readouts and kept touches judge each of them.
 
-If the readouts are sure of a touch, they alone judge it. If they are unsure, or the touch lies far from all learned
-ones or is shorter or longer than these, it is matched with kept touches as well (see `matching.matcher`), under two
-hypotheses: it is a prefix of such a touch, or a whole one at another pace. Each hypothesis is judged by its own row of
-the `moment_table` and weighs exp(COUNTED e), e the log-likelihood gain per value. Channels that never change are filled
-in with what the kept touches have there, and the touch is judged again. The readouts weigh less the further the touch
-lies from what was learned (w, `Moment.distance_weight`), and the larger the share t of its deviation from kept touches
-that is noise (`Match.noise_share`):
+If the readouts are sure of a touch of a learned length, they alone judge it. If they are unsure, or the touch lies far
+from all learned ones or is shorter or longer than these, it is matched with kept touches as well (see
+`matching.matcher`): as the prefix of such a touch, and, if its length lies outside the learned ones, also as a whole
+one at another pace. Each hypothesis is judged by its own `Row` and weighs exp(COUNTED e), e the log-likelihood gain per
+value. Noise is sought where the touch is unlikely without any. Channels that never change are filled in with what the
+kept touches have there, and the touch is judged again.
 
-    q_y ∝ exp(w g (1 − t) log d_y + β S_y),    p_y = (1 − ε) q_y + ε / C.
+The readouts weigh less the further the touch lies from what was learned (w), and the larger the share t of its
+deviation from kept touches that is noise (`Match.noise_share`). With d their probabilities, S the log-likelihoods by
+the kept touches, c the information of these values and h = (1 − t) w:
+
+    q_y ∝ exp(h log d_y + (b h + 1 − h) β S_y),    β = 1 / (1 + (1/τ − 1) c),    p_y = (1 − ε) q_y + ε / C.
+
+A log-likelihood counts by its share of a whole touch's information, so one τ serves all lengths, paces and noises. It
+is the only number fitted to kept touches; b is `BESIDE`.
 """
 
 from __future__ import annotations
@@ -16,17 +22,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.conformal import Typicality
-from scroll_tactile.matching.likelihood import LevelArray, levels_of
+from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
 from scroll_tactile.matching.match import Match
-from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.model import Hypothesis, Judgement, Model
-from scroll_tactile.prediction.moment_table import WITHIN, match_scores, tempered
+from scroll_tactile.prediction.fitting import paces_of
+from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, tempered
 from scroll_tactile.readouts.calibration import held_out_probabilities
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.leave_one_out import StageScores
@@ -40,8 +46,19 @@ FloatArray = npt.NDArray[np.float64]
 Touch = tuple[Encoded, Mapping[str, float] | None]
 """An encoded touch, and the logits of f* where it answers."""
 
+
+class Matched(NamedTuple):
+    """A touch beside kept ones under a hypothesis. clean: its excess loss where no noise came over it."""
+
+    hypothesis: Hypothesis
+    match: Match
+    clean: float
+
+
 COUNTED = 30.0  # the effective number of independent values in a touch: neighbouring values are correlated
-TINY = 1e-300
+LEAST_SHARE = 1e-5  # a hypothesis of less weight is not judged
+LIKELY = 2.0  # spreads of the excess loss of known touches up to which no noise is sought
+PACES = 0.4, 2.5  # times the median length of kept touches: what another pace can explain
 
 
 def answer(
@@ -69,14 +86,14 @@ def answer(
     if len(judgements) > 1:
         probability = model.dependence.probability([judgement.probability for judgement in judgements])
         novelty = model.dependence.standard([judgement.novelty for judgement in judgements])
-    thresholds = [judgement.moment.threshold(false_alarms) for judgement in judgements]
+    thresholds = [judgement.row.calibration.threshold(false_alarms) for judgement in judgements]
     threshold = math.fsum(thresholds) / len(thresholds)
     order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
     names = list(map(candidates.__getitem__, order.tolist()))
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
-    calibrations = [judgement.moment.calibration for judgement in judgements]
+    calibrations = [judgement.row.calibration for judgement in judgements]
     measured = all(each.measures(false_alarms) for each in calibrations) and len(model.names) > 1
     detects = measured and any(each.detects(false_alarms) for each in calibrations)
     known = False if novelty > threshold else True if detects else None
@@ -107,37 +124,76 @@ def judged(
     """The judgement of a touch by a model, or by the logits of f*."""
     if logits is not None:
         return model.judge(candidates, encoded.means, encoded.steps, "complete", logits)
-    fusion, steps = model.fusion, encoded.steps
-    assert fusion is not None
-    own: Hypothesis = "complete" if steps >= model.least else "prefix"
-    alone = model.judge(candidates, encoded.means, steps, own)
-    matcher = fusion.matcher
-    learned_length = model.least <= len(encoded.stream) <= model.longest
-    if matcher is None or (learned_length and alone.moment.suffices(float(alone.probability.max()), alone.distance)):
-        return _by_readouts(model, encoded, alone, own)
-    levels = _levels_of(encoded.stream)
-    matches: list[tuple[Match, Hypothesis]] = [(matcher.match(levels), own)]
-    if levels.shape[1] != matcher.kept.longest and fusion.reaches(levels.shape[1]):
-        whole = matcher.match(levels, whole=True)
-        if whole.log_likelihood_gain > 0:  # kept touches, resampled to its length, explain it better than chance
-            matches.append((whole, "paced"))
-    gains = np.array([match.log_likelihood_gain for match, _ in matches])
-    filled = _filled(model, extractor, encoded, matches[int(gains.argmax())][0])
+    weighing, own = model.fitted, _own_hypothesis(model, encoded)
+    alone = model.judge(candidates, encoded.means, encoded.steps, own)
+    length, matcher = len(encoded.stream), model.matcher
+    learned = weighing.least <= length <= model.longest
+    if matcher is None or (learned and alone.row.suffices(float(alone.probability.max()), alone.distance)):
+        return _by_readouts(model, encoded, alone)
+    levels, hypotheses = _levels_of(encoded.stream), [own]
+    shortest, longest = (part * float(np.median(matcher.kept.columns)) for part in PACES)
+    if model.views and not learned and shortest <= length <= longest:
+        hypotheses.append("paced")
+    matches = _matches(model, levels, hypotheses, alone)
+    gains = np.array([each.match.log_likelihood_gain for each in matches])
+    best = matches[int(gains.argmax())]
+    filled = encoded if best.hypothesis != own else _filled(model, extractor, encoded, best.match)
     answers = []
-    for match, hypothesis in matches:
-        judgement = alone
-        if hypothesis == "paced":
-            complete = stream_of(_levels_of(filled.stream), extractor.sensor)
-            means = extractor.means(extractor.image(complete), model.views)
-            judgement = model.judge(candidates, means, len(encoded.stream), hypothesis)
-        elif filled is not encoded:
-            judgement = model.judge(candidates, filled.means, steps, hypothesis)
-        answers.append(_fused(matcher, candidates, judgement, match, own_time=hypothesis == own))
+    for each in matches:
+        if each.hypothesis == "paced":
+            judgement = _paced(model, extractor, candidates, filled.stream, each)
+        else:
+            judgement = alone if filled is encoded else model.judge(candidates, filled.means, encoded.steps, own)
+        answers.append(_fused(model, candidates, judgement, each))
     weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
-    best = int(weights.argmax())
-    unusual = _unusual(model, encoded, matches[best][0], matches[best][1])
-    return replace(answers[best], probability=probability / probability.sum(), unusual=unusual)
+    unusual = _unusual(model, encoded, best.match, best.hypothesis)
+    return replace(answers[int(weights.argmax())], probability=probability / probability.sum(), unusual=unusual)
+
+
+def _own_hypothesis(model: Model, encoded: Encoded) -> Hypothesis:
+    return "complete" if encoded.steps >= model.fitted.least else "prefix"
+
+
+def _matches(
+    model: Model,
+    levels: LevelArray,
+    hypotheses: Sequence[Hypothesis],
+    alone: Judgement,
+    held_out: int | None = None,
+) -> list[Matched]:
+    """The matches of a touch by each hypothesis that is likely enough to be judged.
+
+    held_out: the row of the kept touch that it is, if it is one.
+    """
+    matcher = model.matcher
+    assert matcher is not None
+    queries = [matcher.query(levels, whole=hypothesis == "paced", held_out=held_out) for hypothesis in hypotheses]
+    clean = found = [matcher.beside(query, CLEAN) for query in queries]
+    likeliest = max(range(len(found)), key=lambda i: found[i].gain)
+    row = alone.row if hypotheses[likeliest] != "paced" else model.fitted.paced
+    if row.unlikely(found[likeliest].excess, LIKELY):
+        found = [matcher.beside(query, None) for query in queries]
+    most, span = max(each.gain for each in found), -math.log(LEAST_SHARE) / COUNTED
+    return [
+        Matched(hypothesis, matcher.result(each), without.excess)
+        for hypothesis, each, without in zip(hypotheses, found, clean, strict=True)
+        if each.gain > most - span
+    ]
+
+
+def _paced(
+    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], stream: Stream, matched: Matched
+) -> Judgement:
+    """The judgement by the readouts of a touch as a whole one at another pace; novel as such touches are not."""
+    means = extractor.means(extractor.image(stream_of(_levels_of(stream), extractor.sensor)), model.views)
+    judgement, kept = model.judge(candidates, means, len(stream), "paced"), model.matcher
+    assert kept is not None
+    if (paces := paces_of(model, extractor)) is None:
+        return judgement
+    values = np.append(model.distances(judgement.row.scales, means, candidates), matched.clean)
+    pace = float(np.median(kept.kept.columns)) / len(stream)
+    return replace(judgement, novelty=paces.novelty(values, pace))
 
 
 def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> FloatArray:
@@ -154,35 +210,24 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
     return np.minimum(1.0, 2 * np.array(sums) / len(shares))
 
 
-def _by_readouts(model: Model, encoded: Encoded, alone: Judgement, hypothesis: Hypothesis) -> Judgement:
+def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     """The judgement by the readouts. For a novel touch its match names how it differs."""
     unusual = _of_length(model, encoded)
-    if model.matcher is not None and alone.novelty > alone.moment.threshold(1 - WITHIN):
-        unusual = _unusual(model, encoded, model.matcher.match(_levels_of(encoded.stream)), hypothesis)
-    return replace(alone, probability=tempered(alone.probability, alone.moment.model_outlier_rate), unusual=unusual)
+    if model.matcher is not None and alone.novelty > alone.row.calibration.threshold(1 - WITHIN):
+        match = model.matcher.match(_levels_of(encoded.stream), noise=None)
+        unusual = _unusual(model, encoded, match, _own_hypothesis(model, encoded))
+    return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
 
 
-def _fused(
-    matcher: TouchMatcher,
-    candidates: Sequence[str],
-    alone: Judgement,
-    match: Match,
-    *,
-    own_time: bool,
-) -> Judgement:
-    """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts.
-
-    own_time: whether it was matched with prefixes, and not with whole touches resampled to its length.
-    """
-    moment = alone.moment
-    distance_weight = moment.distance_weight(alone.distance, own_time)
-    logs = (1 - match.noise_share) * np.log(np.maximum(alone.probability, TINY))
-    match_weight = moment.match_weight_at(match, distance_weight)
-    logits = distance_weight * moment.model_weight * logs + match_scores(matcher, candidates, match) * match_weight
-    chances = np.exp(logits - logits.max())
-    chances = tempered(chances / chances.sum(), moment.outlier_rate)
-    novelty = (1 - match.noise_share) * alone.novelty + match.noise_share * moment.matched_novelty(match)
-    return replace(alone, probability=chances, novelty=float(novelty))
+def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: Matched) -> Judgement:
+    """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts."""
+    assert model.matcher is not None
+    match = matched.match
+    scores = match_scores(model.matcher, candidates, match)
+    chances = model.fitted.fused(matched.hypothesis, alone.probability, match, scores, alone.distance)
+    share = match.noise_share
+    novelty = (1 - share) * alone.novelty + share * alone.row.matched_novelty(match.excess_loss)
+    return replace(alone, probability=tempered(chances, alone.row.outliers), novelty=float(novelty))
 
 
 def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
@@ -199,7 +244,7 @@ def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesi
 
 
 def _of_length(model: Model, encoded: Encoded) -> tuple[Unusual, ...]:
-    if encoded.steps < model.least:
+    if encoded.steps < model.fitted.least:
         return ("shorter",)
     return ("longer",) if encoded.seconds < encoded.stream.seconds else ()
 
@@ -259,28 +304,26 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     The calibration was fitted to all of them, each one included; no other pace is tried, no dead channel filled in.
     false_alarms: as in `Settings`.
     """
-    fusion, answers = model.fusion, dict[int, HeldOutTouch]()
-    if fusion is None:
+    weighing, matcher, answers = model.weighing, model.matcher, dict[int, HeldOutTouch]()
+    if weighing is None:
         return []
-    matcher = fusion.matcher
     rows = {} if matcher is None else matcher.kept.rows()
-    for stage in range(len(model.calibrations) - 1, -1, -1):
-        calibration = model.calibration("complete", fusion.complete, stage)
-        scales, moment = model.scales("complete", stage), fusion.latest(stage)
-        found = StageScores(stage, model.sample, [model.held_out[scale] for scale in scales])
-        held = held_out_probabilities(found, scales, calibration)
+    for stage in range(len(weighing.rows) - 1, -1, -1):
+        row = weighing.row("complete", stage)
+        found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in row.scales])
+        held = held_out_probabilities(found, row.scales, row.calibration)
         for i, place in enumerate(held.places):
             if place in answers:
                 continue
-            material, key, _ = model.sample[place]
+            material, key, _ = weighing.sample[place]
             chances = np.exp(held.logs[i])
-            alone = Judgement(chances, float(held.novelty[i]), moment, float(held.distance[i]))
-            if matcher is not None and key in rows and not moment.suffices(float(chances.max()), alone.distance):
-                match = matcher.match(matcher.kept.levels(rows[key]), held_out=rows[key])
-                result = _fused(matcher, held.names, alone, match, own_time=True)
+            alone = Judgement(chances, float(held.novelty[i]), row, float(held.distance[i]))
+            if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):
+                [matched] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
+                result = _fused(model, held.names, alone, matched)
             else:
-                result = replace(alone, probability=tempered(chances, moment.model_outlier_rate))
-            threshold = moment.threshold(false_alarms)
+                result = replace(alone, probability=tempered(chances, row.readout_outliers))
+            threshold = row.calibration.threshold(false_alarms)
             names = tuple(held.names)
             answers[place] = HeldOutTouch(material, key, names, result.probability, result.novelty, threshold)
     return list(answers.values())

@@ -1,11 +1,16 @@
-"""The model: all that predictions need of a memory; `prediction.fitting` fits it, `Model.follow` updates it."""
+"""The model: all that answers need of a memory. `prediction.fitting` fits it; its means follow each touch.
+
+What was fitted is a `Weighing`: how far readouts and kept touches are to be believed at each length of a touch. Models
+of later states of the memory share it: their class means, kept touches and materials are those of now, the scatter and
+the weighing those of the last fit. Nothing of a model changes, so any thread may use it as long as it likes.
+"""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -13,24 +18,43 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.match import Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.memory.touch_rows import Added
-from scroll_tactile.prediction.moment_table import Fusion, Moment
 from scroll_tactile.readouts.calibration import Calibration
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.leave_one_out import HeldOutScores
-from scroll_tactile.readouts.readout import Change, Readout, ReadoutName
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
+from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
+from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Hypothesis", "Judgement", "Model", "enough_memory"]
+__all__ = [
+    "BESIDE",
+    "Hypothesis",
+    "Judgement",
+    "Model",
+    "Paces",
+    "Row",
+    "Trajectories",
+    "Weighing",
+    "enough_memory",
+    "held_out_of",
+    "match_scores",
+    "softmax",
+    "tempered",
+]
 
 FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["prefix", "complete", "paced"]
 """What a touch may be: the prefix of a complete one, a complete one, or a complete one at another pace."""
+
+WITHIN = 0.95  # the share of held-out touches within the limits
+SURE = 0.99  # a touch whose highest probability by the readouts is less is matched with kept ones
+BESIDE = 0.1  # the weight of kept touches beside sure readouts, of that by themselves: fitted ones were 0.03 to 0.28
+MOST_OCTAVES = 1.5  # to which what was measured an octave off is continued
+LEAST_DISTANCE_WEIGHT = 0.5  # the least weight at another pace, as a share of that at the distance limit
 
 
 @contextmanager
@@ -54,35 +78,151 @@ def enough_memory() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
+class Row:
+    """How touches are judged from a length on, by readouts and kept touches.
+
+    steps: that length; of a complete touch, that of most. scales: that judge. calibration: of their scores.
+    readout_outliers: ε of the readouts' own probabilities, the share of touches unlike all others of their material;
+    outliers: ε where kept touches judge beside them. distance_limit: the relative distance that 19 of 20 complete
+    touches stay below; infinite in the rows of prefixes. excess: mean and spread of the excess loss of known touches
+    beside the kept ones.
+    """
+
+    steps: int
+    scales: tuple[Scale, ...]
+    calibration: Calibration
+    readout_outliers: float
+    outliers: float
+    distance_limit: float = np.inf
+    excess: tuple[float, float] = (0.0, 1.0)
+
+    def suffices(self, probability: float, distance: float) -> bool:
+        """Whether the readouts are enough, by their highest probability and by how far off the touch is.
+
+        If no touch could be held out, any probability suffices: every new touch would look noisy to the kept ones.
+        """
+        return probability >= (SURE if self.readout_outliers else 0.0) and distance <= self.distance_limit
+
+    def unlikely(self, excess: float, spreads: float) -> bool:
+        """Whether an excess loss is so many spreads above that of known touches."""
+        return excess > self.excess[0] + spreads * self.excess[1]
+
+    def matched_novelty(self, excess: float) -> float:
+        """An excess loss in units of its spread over known touches, as novelty is."""
+        return (excess - self.excess[0]) / self.excess[1]
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Answers to N held-out touches at each of m lengths before they were complete; NaN where a touch ended before.
+
+    chances: probability of the C materials, (N, m, C). novelty: (N, m). targets: the material of each, (N,).
+    """
+
+    chances: FloatArray
+    novelty: FloatArray
+    targets: npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Paces:
+    """How known touches look at other paces: mean and spread of each view's distance, and of the excess loss, last.
+
+    own: at their own pace, (S' + 1, 2). others: at twice and at half of it, (2, S' + 1, 2).
+    """
+
+    own: FloatArray
+    others: FloatArray
+
+    def novelty(self, values: FloatArray, pace: float) -> float:
+        """The standardised novelty of distances and excess loss, (S' + 1,), of a touch so many times as fast."""
+        octaves = math.log2(pace)
+        moved = min(abs(octaves), MOST_OCTAVES) * (self.others[0 if octaves > 0 else 1] - self.own)
+        mean, spread = (self.own + moved).T
+        return float(((values - mean) / np.maximum(spread, self.own[:, 1] / 2)).mean())
+
+
+@dataclass(eq=False)
+class Weighing:
+    """What a fit found out of held-out touches: how readouts and kept touches are to be weighed.
+
+    rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
+    another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
+    of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
+    to. sample: those that were held out. held_out, trajectories, paces: see `Model.held_out`, `fitting.rehearse` and
+    `fitting.paces_of`; made when they are first asked for.
+    """
+
+    rows: tuple[Row, ...]
+    complete: Row
+    paced: Row
+    tau: float
+    dependence: Dependence
+    least: int
+    touches: int
+    sample: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
+    held_out: dict[Scale, HeldOutScores] | None = None
+    trajectories: Trajectories | None = None
+    paces: Paces | None = None
+
+    def row(self, hypothesis: Hypothesis, stage: int) -> Row:
+        """How a touch is judged at a stage."""
+        if hypothesis == "paced":
+            return self.paced
+        return self.complete if hypothesis == "complete" and stage == len(self.rows) - 1 else self.rows[stage]
+
+    @property
+    def early(self) -> list[Row]:
+        """The rows of prefixes alone, which are shorter than complete touches."""
+        return [row for row in self.rows if row.steps < self.least]
+
+    def distance_weight(self, hypothesis: Hypothesis, distance: float) -> float:
+        """The weight of the readouts for a touch at a relative distance, in (0, 1]: less, the further it is off.
+
+        Of a complete touch at least 1 / limit, at another pace half of that; of a prefix it is 1.
+        """
+        limit = self.complete.distance_limit
+        if hypothesis == "prefix" or not np.isfinite(limit):
+            return 1.0
+        least = (1.0 if hypothesis == "complete" else LEAST_DISTANCE_WEIGHT) / max(limit, 1.0)
+        return float(np.clip(1.0 / max(distance, 1e-9), least, 1.0))
+
+    def fused(
+        self, hypothesis: Hypothesis, chances: FloatArray, match: Match, scores: FloatArray, distance: float
+    ) -> FloatArray:
+        """The probabilities by readouts and kept touches together, before outliers, (C,).
+
+        chances: by the readouts; scores: log-likelihoods by the kept touches; both (C,).
+        """
+        weight, clear = self.distance_weight(hypothesis, distance), 1 - match.noise_share
+        sure = clear * weight
+        beta = (BESIDE * sure + (1 - sure)) / (1 + (1 / self.tau - 1) * match.information)
+        return softmax(sure * np.log(np.maximum(chances, 1e-300)) + beta * scores)
+
+
+@dataclass(frozen=True)
 class Judgement:
     """The judgement of a touch by the readouts alone, or with the kept touches.
 
-    probability: of each candidate, shape (C,). novelty: see Prediction. moment: the row of the table whose threshold
-    the novelty is compared with.
+    probability: of each candidate, shape (C,). novelty: see Prediction. row: whose threshold it is compared with.
     distance: the diagonal distance to the best-scoring material, divided by its median over held-out touches; the
     smallest over the scales that measure novelty, 0 where none was measured. unusual: see Prediction.
     """
 
     probability: FloatArray
     novelty: float
-    moment: Moment
+    row: Row
     distance: float = 0.0
     unusual: tuple[Unusual, ...] = ()
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Model:
-    """Everything that predictions need of one state of a memory.
+    """Everything that predictions need of one state of a memory; it never changes.
 
     names: the materials, in alphabetical order; known: the same names, as a set. stages: for each, the windows that
-    judge there. views:
-    the views that judge beside them. readouts: scale → its readout. calibrations: how the scores of a stage are read,
-    as far as any touch reached it. fusion: the weights of readouts and kept touches; None where nothing was learned.
-    conformal: conformal p-values by the kept touches. held_out: scale → scores of the sampled touches, each held out;
-    sample: these touches. dependence: the correlations of touches of one thing. least: the 5th percentile of the
-    learned touches' lengths in steps, longest: the maximum. fitted_to: the touches that it was fitted to.
-
-    Several threads may use it at once. `follow` changes it in place: update a copy while another thread uses it.
+    judge there. views: the views that judge beside them. readouts: scale → its readout. weighing: None where nothing
+    was learned. matcher, conformal: of the kept touches. longest: the longest learned touch, in steps.
     """
 
     kind: ReadoutName
@@ -91,102 +231,67 @@ class Model:
     stages: list[list[Scale]]
     views: list[Scale]
     readouts: dict[Scale, Readout]
-    calibrations: list[Calibration]
-    held_out: dict[Scale, HeldOutScores]
-    sample: list[tuple[str, bytes, SampledTouch]]
-    fusion: Fusion | None
-    dependence: Dependence
+    weighing: Weighing | None
+    matcher: TouchMatcher | None
     conformal: Conformal | None
-    least: int
     longest: int
-    fitted_to: int
+    known: frozenset[str] = field(init=False)
+    _of_all: dict[Scale, npt.NDArray[np.intp]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.known = frozenset(self.names)
-        self._of_all: dict[Scale, npt.NDArray[np.intp]] = {}
+        object.__setattr__(self, "known", frozenset(self.names))
 
     @property
-    def matcher(self) -> TouchMatcher | None:
-        """The kept touches."""
-        return None if self.fusion is None else self.fusion.matcher
+    def fitted(self) -> Weighing:
+        """The weighing, where something was learned."""
+        assert self.weighing is not None
+        return self.weighing
 
-    def copy(self, readouts: dict[Scale, Readout] | None = None) -> Model:
-        """A copy that follows independently; both share the parts that `follow` never changes.
+    @property
+    def held_out(self) -> dict[Scale, HeldOutScores]:
+        """Each scale's scores of the sampled touches, each held out of its readout."""
+        weighing = self.fitted
+        if weighing.held_out is None:
+            with one_thread():
+                weighing.held_out = held_out_of(self.readouts, weighing.sample, self.stages, self.views, self.kind)
+        return weighing.held_out
 
-        readouts: in place of copies of its own.
+    @property
+    def touches(self) -> int:
+        """The touches that it was fitted to."""
+        return 0 if self.weighing is None else self.weighing.touches
+
+    def followed(self, memory: Memory, changed: Collection[str]) -> Model | None:
+        """The model of the memory as it is now, some materials of which have changed; None where one must be fitted.
+
+        The class means are those of all observations, the scatter and the weighing stay as they were fitted.
         """
-        other = copy.copy(self)
-        if readouts is None:
-            readouts = {scale: readout.copy() for scale, readout in self.readouts.items()}
-        other.readouts, other._of_all = readouts, {}
-        if self.fusion is not None and self.fusion.matcher is not None and self.conformal is not None:
-            other.fusion = replace(self.fusion, matcher=self.fusion.matcher.copy())
-            other.conformal = self.conformal.copy()
-        return other
-
-    def follow(self, memory: Memory, added: Sequence[Added]) -> bool:
-        """Update by touches that were observed or retracted, which the memory has already; False where it cannot.
-
-        The readouts then rest on all observations; calibration and shrinkage stay as they were fitted.
-        """
-        for scale in memory.statistics.scales:
-            changes = _changes(scale, added)
-            if not changes or (scale in memory.plan.views and scale not in self.views):
-                continue
-            if scale not in self.readouts or not self.readouts[scale].follow(changes):
-                return False
-        if self.matcher is not None and not self._follow_kept(memory, self.matcher):
-            return False
-        self.names, self.longest = list(memory.statistics.materials), memory.statistics.longest
-        self.known = frozenset(self.names)
-        self._of_all = {}
-        return True
-
-    def _follow_kept(self, memory: Memory, matcher: TouchMatcher) -> bool:
-        """Update the kept touches to those of the memory; False where none are left."""
-        assert self.conformal is not None and self.fusion is not None and memory.kept is not None
-        kept, held = {(material, key) for material, key, _ in memory.kept}, matcher.kept.held
-        added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
-        if not kept:
-            return False
-        if matcher.kept.follow(added, held - kept):
-            self.conformal.follow(added, held - kept)
-        else:  # one is longer than all before: the arrays are made anew, their natural deviation stays
-            touches = memory.kept.touches()
-            self.fusion = replace(self.fusion, matcher=TouchMatcher(KeptArrays.of(touches), matcher.deviation))
-            self.conformal = Conformal.of(touches)
-        return True
-
-    def needs_renewal(self, behind: Sequence[Added]) -> bool:
-        """Whether a readout, with the touches still to be taken in, has used five eighths of its room for columns."""
+        readouts = {}
         for scale, readout in self.readouts.items():
-            columns = sum(len(codes[scale]) for _, codes, *_ in behind if scale in codes)
-            if 3 * (readout.system.rank + columns) > 5 * (readout.system.room - columns):
-                return True
-        return False
+            if (own := readout.followed(memory.statistics, changed)) is None:
+                return None
+            readouts[scale] = own
+        matcher, conformal = self.matcher, self.conformal
+        if matcher is not None and conformal is not None and memory.kept is not None:
+            kept, held = {(material, key) for material, key, _ in memory.kept}, set(matcher.kept.touches)
+            if kept != held:
+                added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
+                if (arrays := matcher.kept.followed(added, held - kept)) is None:
+                    return None
+                matcher, conformal = matcher.followed(arrays), conformal.followed(added, held - kept)
+        statistics = memory.statistics
+        return replace(
+            self,
+            names=list(statistics.materials),
+            readouts=readouts,
+            matcher=matcher,
+            conformal=conformal,
+            longest=statistics.longest,
+        )
 
     def is_last(self, steps: int) -> bool:
         """Whether a touch of so many steps is judged at the last stage, whose scores f* gives."""
-        return min(len(self.plan.stages(steps)), len(self.calibrations)) == len(self.stages)
-
-    def scales(self, hypothesis: Hypothesis, stage: int) -> list[Scale]:
-        """The scales that judge a touch at a stage.
-
-        Windows judge a prefix, views judge a touch at another pace, and both judge a complete one. Before the last
-        stage, and without views, windows alone judge.
-        """
-        if hypothesis == "prefix" or not self.views or stage < len(self.calibrations) - 1:
-            return list(self.stages[stage])
-        return list(self.views) if hypothesis == "paced" else [*self.stages[stage], *self.views]
-
-    def moment(self, hypothesis: Hypothesis, steps: int) -> Moment:
-        """The row of the table by which a touch of so many steps is judged."""
-        assert self.fusion is not None
-        if hypothesis == "prefix":
-            return self.fusion.at(steps)
-        if hypothesis == "complete":
-            return self.fusion.complete
-        return self.fusion.at_pace(steps)
+        return min(len(self.plan.stages(steps)), len(self.fitted.rows)) == len(self.stages)
 
     def scales_for(self, candidates: Sequence[str], steps: int) -> list[Scale]:
         """The scales that are read to judge these candidates for a touch of so many steps."""
@@ -207,12 +312,10 @@ class Model:
         hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
 
         Each stage that is the last one of some candidate weighs the candidates that have rows there. Those without rows
-        at a later stage keep their
-        probability; the later stages divide the remaining probability among the others.
+        at a later stage keep their probability; the later stages divide the remaining probability among the others.
         """
-        moment = self.moment(hypothesis, steps)
         if hypothesis == "paced":  # every touch has views, of all of it
-            decided: list[tuple[int, Sequence[int]]] = [(len(self.calibrations) - 1, range(len(candidates)))]
+            decided: list[tuple[int, Sequence[int]]] = [(len(self.fitted.rows) - 1, range(len(candidates)))]
         else:
             decided = self._decided(candidates, len(self.plan.stages(steps)))
         probability, mass, distance = np.ones(len(candidates)), 1.0, 0.0
@@ -221,20 +324,18 @@ class Model:
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
             else:
-                logits, distance = self._weighted(hypothesis, moment, stage, means, names)
-            probability[np.asarray(members)] = _chances(logits) * mass
+                logits, distance = self._weighted(self.fitted.row(hypothesis, stage), means, names, steps)
+            probability[np.asarray(members)] = softmax(logits) * mass
             later = np.asarray(decided[i + 1][1] if i + 1 < len(decided) else [], dtype=np.intp)
             mass = float(probability[later].sum())
         best = int(np.argmax(probability))
-        stage = max(stage for stage, members in decided if best in members)
-        novelty = self._novelty(hypothesis, moment, stage, means, candidates)
-        return Judgement(probability, novelty, moment, distance)
+        row = self.fitted.row(hypothesis, max(stage for stage, members in decided if best in members))
+        return Judgement(probability, float(self.novelty(row, means, candidates)), row, distance)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
         """(stage, places of the candidates weighed there), for each stage that is the last one of any candidate."""
-        groups = [
-            self._observed_at(scales, candidates) for scales in self.stages[: min(reached, len(self.calibrations))]
-        ]
+        stages = self.stages[: min(reached, len(self.fitted.rows))]
+        groups = [self._observed_at(scales, candidates) for scales in stages]
         return [
             (stage, members)
             for stage, members in enumerate(groups)
@@ -258,71 +359,62 @@ class Model:
         return self._of_all[scale]
 
     def _weighted(
-        self,
-        hypothesis: Hypothesis,
-        moment: Moment,
-        stage: int,
-        means: Mapping[Scale, FloatArray],
-        names: Sequence[str],
+        self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str], steps: int
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
-        scales, calibration = self.scales(hypothesis, stage), self.calibration(hypothesis, moment, stage)
-        readouts, features = [self.readouts[scale] for scale in scales], [means[scale] for scale in scales]
-        places = [self._places(scale, names) for scale in scales]
+        readouts, features = [self.readouts[scale] for scale in row.scales], [means[scale] for scale in row.scales]
+        places = [self._places(scale, names) for scale in row.scales]
         found = [
             readout.scores(own, among, self.kind)
             for readout, own, among in zip(readouts, features, places, strict=True)
         ]
-        weights, distance = calibration.weights, 0.0
-        if np.isfinite(calibration.median_distances).all():
+        weights, distance = row.calibration.weights, 0.0
+        if np.isfinite(row.calibration.median_distances).all():
             nearest = [int(among[int(scores.argmax())]) for among, scores in zip(places, found, strict=True)]
             away = [
                 readout.diagonal_distance(own, place)
                 for readout, own, place in zip(readouts, features, nearest, strict=True)
             ]
-            weights = calibration.weights_at(np.array(away))
-            distance = float(calibration.relative(np.array(away))[measuring(scales)].min())
-        return np.asarray(sum(weight * scores for weight, scores in zip(weights, found, strict=True))), distance
+            weights = row.calibration.weights_at(np.array(away))
+            distance = float(row.calibration.relative(np.array(away))[measuring(row.scales)].min())
+        # A beginning shorter than the first stage is read by fewer readings than the scores are calibrated for.
+        begun = min(1.0, steps / row.steps) ** 2
+        return begun * np.asarray(sum(weight * scores for weight, scores in zip(weights, found, strict=True))), distance
 
-    def calibration(self, hypothesis: Hypothesis, moment: Moment, stage: int) -> Calibration:
-        """The calibration by which scores are read at a stage: the moment's, if it is of this stage.
+    def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> FloatArray:
+        """The standardised novelty of a touch judged by a row, among these materials."""
+        return row.calibration.novelty(self.distances(row.scales, means, names))
 
-        Otherwise the stage's own: for materials whose touches ended at an earlier stage, and for a prefix where
-        "complete" is the only row.
-        """
-        assert self.fusion is not None
-        begun = hypothesis == "prefix" and moment is self.fusion.complete
-        return self.calibrations[stage] if begun or stage != moment.stage else moment.calibration
-
-    def _novelty(
-        self,
-        hypothesis: Hypothesis,
-        moment: Moment,
-        stage: int,
-        means: Mapping[Scale, FloatArray],
-        names: Sequence[str],
-    ) -> float:
-        """The standardised novelty of a touch judged at a stage, among these materials."""
-        distances = self._distances(self.scales(hypothesis, stage), means, names)
-        return float(self.calibration(hypothesis, moment, stage).novelty(distances))
-
-    def novelty(self, stage: int, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
-        """The standardised novelty of a touch by the windows of a stage alone."""
-        return float(self.calibrations[stage].novelty(self._distances(self.stages[stage], means, names)))
-
-    def _distances(
-        self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]
-    ) -> FloatArray:
+    def distances(self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]) -> FloatArray:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
         novel = [scales[place] for place in measuring(scales)]
         return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
 
 
-def _changes(scale: Scale, added: Sequence[Added]) -> list[Change]:
-    """The changes at one scale by touches that came and went."""
-    return [(name, codes[scale], sign) for name, codes, sign, _ in added if len(codes.get(scale, ()))]
+def held_out_of(
+    readouts: Mapping[Scale, Readout],
+    sample: list[tuple[str, bytes, SampledTouch]],
+    stages: Sequence[Sequence[Scale]],
+    views: Sequence[Scale],
+    kind: ReadoutName,
+) -> dict[Scale, HeldOutScores]:
+    """Each scale's scores of sampled touches, each held out of its readout."""
+    viewed = [[*stage, *views] for stage in stages]
+    return {scale: held_out_scores(readout, sample, viewed, kind) for scale, readout in readouts.items()}
 
 
-def _chances(logits: FloatArray) -> FloatArray:
-    chances = np.exp(logits - logits.max())
-    return np.asarray(chances / chances.sum())
+def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:
+    """The kept touches' scores of some materials, (C,); the least of all for materials of which none is kept."""
+    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(match.scores.min())
+    return np.array([match.scores[places[name]] if name in places else least for name in names])
+
+
+def tempered(chances: FloatArray, outliers: float) -> FloatArray:
+    """Probabilities (…, C) mixed with a uniform share, the rate of outliers."""
+    return np.asarray((1 - outliers) * chances + outliers / chances.shape[-1])
+
+
+def softmax(logits: FloatArray) -> FloatArray:
+    """Probabilities (…, C) of logits."""
+    chances = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return np.asarray(chances / chances.sum(axis=-1, keepdims=True))

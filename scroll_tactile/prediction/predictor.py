@@ -13,23 +13,22 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.embeddings.protocol import capabilities_of
-from scroll_tactile.errors import AnnotationError, EmbeddingMismatchError, InputError, ScrollTactileError
+from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.contents import ListedContents
-from scroll_tactile.persistence.ledger import AxisLedger, Ledger, axis_name
+from scroll_tactile.persistence.ledger import AxisLedger, Ledger
 from scroll_tactile.persistence.replaying import exemplar_candidates, load
 from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.current import CurrentModel, FrozenModel
+from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import Touch, answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
-from scroll_tactile.prediction.stored import NAME
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.results import Composition, Constituent, Estimate, Prediction
@@ -65,7 +64,7 @@ class Predictor:
 
     def __init__(self, recipe: Recipe, extractor: FeatureExtractor, ledger: Ledger) -> None:
         self.recipe, self.extractor, self.ledger = recipe, extractor, ledger
-        self.current = CurrentModel(recipe.settings, extractor)
+        self.current = CurrentModel(recipe.settings)
         self.tuned_reader: LogitsReader | None = None
         self.replaced = False
         self._axes: dict[str, Predictor] = {}
@@ -146,19 +145,19 @@ class Predictor:
             raise InputError("expected a stream to predict, or several of one thing; came none")
         touches = [self.stream(stream) for stream in streams]
 
-        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Prediction]:
+        def begin(model: Model) -> Callable[[], Prediction]:
             reader = None if reader_of is None else reader_of(self)
             candidates = candidates_of(scene, model.names, model.known)
             if not candidates:
                 return partial(nothing_known, math.fsum({touch.key: touch.seconds for touch in touches}.values()))
 
             def read(touch: Stream) -> Touch:
-                encoded = extractor.encode(touch, model.longest, lambda steps: model.scales_for(candidates, steps))
+                encoded = self.extractor.encode(touch, model.longest, lambda steps: model.scales_for(candidates, steps))
                 if reader is None or not model.is_last(encoded.steps):
                     return encoded, None
                 return encoded, reader.logits_of(encoded.image, candidates)
 
-            return lambda: self._answer(model, extractor, candidates, [read(touch) for touch in touches])
+            return lambda: self._answer(model, candidates, [read(touch) for touch in touches])
 
         return self._of_one_state(begin)
 
@@ -166,7 +165,7 @@ class Predictor:
         """As `TactileLearner.compose`."""
         touch = self.stream(readings)
 
-        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], Composition]:
+        def begin(model: Model) -> Callable[[], Composition]:
             wanted = require_constituents(self.ledger.memory.descriptions, constituents)
             if not model.names:
                 nothing = tuple(
@@ -174,12 +173,13 @@ class Predictor:
                     for name in wanted
                 )
                 return lambda: Composition(nothing, 1.0, nothing_known(touch.seconds))
-            composer = self.current.composer(self.ledger, model)
+            composer = self.current.composer(self.ledger)
+            model = composer.model
             scales_for = _scales_for([(model, model.names)], composer)
 
             def composed() -> Composition:
-                encoded = extractor.encode(touch, model.longest, scales_for)
-                prediction = self._answer(model, extractor, model.names, [(encoded, None)])
+                encoded = self.extractor.encode(touch, model.longest, scales_for)
+                prediction = self._answer(model, model.names, [(encoded, None)])
                 made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
                 return Composition(made_of, new, prediction)
 
@@ -203,95 +203,69 @@ class Predictor:
         """
         touch = self.stream(readings)
 
-        def begin(model: Model, extractor: FeatureExtractor) -> Callable[[], tuple[Prediction, dict[str, Estimate]]]:
+        def begin(model: Model) -> Callable[[], tuple[Prediction, dict[str, Estimate]]]:
             estimator = self.current.estimator(self.ledger)
             names, by = estimator.wanted(wanted), self if axis is None else self.of_axis(axis)
-            frozen = by.current.frozen(by.ledger)  # this object keeps its model unchanged
-            candidates = candidates_of(scene, frozen.model.names, frozen.model.known)
-            scales_for = _scales_for([(model, model.names), (frozen.model, candidates)], estimator)
+            other = by.current.present(by.ledger)
+            candidates = candidates_of(scene, other.names, other.known)
+            scales_for = _scales_for([(model, model.names), (other, candidates)], estimator)
 
             def estimated() -> tuple[Prediction, dict[str, Estimate]]:
                 nothing = nothing_known(touch.seconds)
                 if not model.names:
-                    return nothing, estimates_of(estimator, names, None, extractor, nothing, risk, known)
-                encoded = extractor.encode(touch, model.longest, scales_for)
-                prediction = self._answer(model, extractor, model.names, [(encoded, None)])
-                found = estimates_of(estimator, names, encoded, extractor, prediction, risk, known)
+                    return nothing, estimates_of(estimator, names, None, self.extractor, nothing, risk, known)
+                encoded = self.extractor.encode(touch, model.longest, scales_for)
+                prediction = self._answer(model, model.names, [(encoded, None)])
+                found = estimates_of(estimator, names, encoded, self.extractor, prediction, risk, known)
                 if by is not self or candidates != model.names:
-                    if frozen.model.longest != model.longest:
-                        encoded = extractor.encode(touch, frozen.model.longest, scales_for)
-                    prediction = by.answer_of(frozen.model, extractor, candidates, [encoded]) if candidates else nothing
+                    if other.longest != model.longest:
+                        encoded = self.extractor.encode(touch, other.longest, scales_for)
+                    prediction = by.answer_of(other, candidates, [encoded]) if candidates else nothing
                 return prediction, found
 
             return estimated
 
         return self._of_one_state(begin)
 
-    def _of_one_state(self, begin: Callable[[Model, FeatureExtractor], Callable[[], Answer]]) -> Answer:
+    def _of_one_state(self, begin: Callable[[Model], Callable[[], Answer]]) -> Answer:
         """An answer from one state of the memory, which others may change while a touch is embedded.
 
         begin: called with the lock held; reads from the memory, and returns a function that embeds the touch and
         answers, which is called without the lock.
         """
-        reading = self._reading()
-        try:
-            with reading.verifying(), enough_memory():
-                with self.ledger.lock:
-                    frozen = self.current.frozen(self.ledger)
-                    answered = begin(frozen.model, reading)
-                return answered()
-        except EmbeddingMismatchError as error:
-            self._discard_stored(reading, error)
-            return self._of_one_state(begin)
+        with self.extractor.verifying(), enough_memory():
+            with self.ledger.lock:
+                answered = begin(self.current.present(self.ledger))
+            return answered()
 
-    def _answer(
-        self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Touch]
-    ) -> Prediction:
-        return answer(model, extractor, candidates, touches, self.recipe.settings.false_alarms)
-
-    def _reading(self) -> FeatureExtractor:
-        with self.ledger.lock:
-            return self.current.reading(self.ledger)
-
-    def _discard_stored(self, reading: FeatureExtractor, error: EmbeddingMismatchError) -> None:
-        """Drop the stored model and banks; raise the error if none were in use."""
-        if reading is self.extractor:
-            raise error
-        with self.ledger.lock:
-            self.current.discard_stored()
-
-    def reading(self) -> FeatureExtractor:
-        """The extractor for touches to be predicted, with its fingerprint verified."""
-        reading = self._reading()
-        try:
-            with reading.verifying():
-                return reading
-        except EmbeddingMismatchError as error:
-            self._discard_stored(reading, error)
-            return self.extractor.verified()
+    def _answer(self, model: Model, candidates: Sequence[str], touches: Sequence[Touch]) -> Prediction:
+        return answer(model, self.extractor, candidates, touches, self.recipe.settings.false_alarms)
 
     def estimator(self) -> Estimator | None:
         """What estimates quantities in the present memory; None where none was declared."""
         with self.ledger.lock:
             return self.current.estimator(self.ledger) if self.ledger.memory.quantities else None
 
-    def frozen(self) -> FrozenModel:
-        """The model of the present memory, unchanged for as long as the returned object lives."""
+    def present(self) -> Model:
+        """The model of the present memory, which never changes."""
         with self.ledger.lock, enough_memory():
-            return self.current.frozen(self.ledger)
+            return self.current.present(self.ledger)
 
-    def answer_of(
-        self, model: Model, extractor: FeatureExtractor, candidates: Sequence[str], touches: Sequence[Encoded]
-    ) -> Prediction:
-        """The prediction of a frozen model for touches of one thing."""
+    def rehearsed(self) -> Model:
+        """As `present`, for live sessions: with what `fitting.rehearse` finds."""
+        with self.ledger.lock, enough_memory():
+            return self.current.rehearsed(self.ledger)
+
+    def answer_of(self, model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
+        """The prediction of a model for touches of one thing."""
         with enough_memory():
-            return self._answer(model, extractor, candidates, [(touch, None) for touch in touches])
+            return self._answer(model, candidates, [(touch, None) for touch in touches])
 
     def settle(self) -> None:
         """As `TactileLearner.settle`."""
         with self.ledger.lock, enough_memory():
-            self.current.settle(self.ledger)
-            for predictor in self._axes.values():
+            self.ledger.memory.weighings.clear()  # an axis that is asked later is fitted, too
+            for predictor in (self, *self._axes.values()):
                 predictor.current.settle(predictor.ledger)
 
     def prepare(self) -> None:
@@ -300,41 +274,20 @@ class Predictor:
             for predictor in (self, *self._axes.values()):
                 predictor.current.prepare(predictor.ledger)
 
-    def prepare_to_store(self) -> None:
-        """Fit the models that do not exist yet, so that `close` stores them and later processes read them.
-
-        For a writer that learned many touches and predicted none. Where a fit fails, as without memory for it, the
-        touches are learned all the same, and a warning is logged.
-        """
-        try:
-            self.frozen()
-            for axis in sorted(self.ledger.memory.targets.axes):
-                self.of_axis(axis).frozen()
-        except ScrollTactileError as error:
-            logger.warning("the touches are learned, but not all models are stored beside them: %s", error)
-
     def close(self) -> None:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
-            models = {NAME: self, **{axis_name(NAME, axis): predictor for axis, predictor in self._axes.items()}}
-            derived = {name: partial(own.current.arrays_to_store, own.ledger) for name, own in models.items()}
-            self.ledger.close({**derived, HEALTH: partial(health_to_store, self.ledger)})
-            for predictor in models.values():
+            predictors = {"": self, **self._axes}
+            for predictor in predictors.values():
                 predictor.current.close()
+            texts = {axis: predictor.current.stored(predictor.ledger) for axis, predictor in predictors.items()}
+            weighings = {axis: text for axis, text in texts.items() if text is not None}
+            self.ledger.close({HEALTH: partial(health_to_store, self.ledger)}, weighings)
 
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""
         with self.ledger.lock, enough_memory():
-            return Draft.of(self.ledger.memory, self.recipe.settings.readout).fit(self.extractor)
-
-    def examined(self) -> Model:
-        """A copy of the answering model with the scores of its sampled touches, each held out, for pages. It fits a
-        model only if there is none.
-
-        Raises what `frozen` raises.
-        """
-        with self.ledger.lock, enough_memory():
-            return self.current.examined(self.ledger)
+            return Draft.of(self.ledger.memory, self.recipe.settings.readout).fit()
 
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store.records import LateArray
 
-from scroll_tactile.memory.state import ANNOTATED, MOST_CORRECTIONS
+from scroll_tactile.memory.state import ANNOTATED, MOST_CORRECTIONS, WEIGHINGS
 from scroll_tactile.memory.touch_rows import LABELS, VALUES, Arrays
 from scroll_tactile.quantities import MOST_QUANTITIES, Quantity
 from scroll_tactile.sensors import Sensor
@@ -93,6 +94,8 @@ class CheckpointChecks:
             whole("tuned_last_sequence", attributes.get("tuned_last_sequence"), 0, last_sequence or 2**63 - 1)
         if "tuned" in attributes:
             self._check_tuned(arrays, attributes["tuned"])
+        if WEIGHINGS in arrays:
+            _check_weighings(arrays)
         if "corrections" in attributes:
             self._check_corrections(attributes["corrections"], last_sequence)
 
@@ -281,6 +284,17 @@ class CheckpointChecks:
         _check_finite("tuned-bias", array(arrays, "tuned-bias", ("float64",), (len(names),)))
         for field in (field for field in arrays if field.startswith("tuned-net-")):
             _check_finite(field, array(arrays, field, ("float32",), arrays[field].shape))
+
+
+def _check_weighings(arrays: Arrays) -> None:
+    """Check that they are texts by axis; what is in them is read where it is used."""
+    text = array(arrays, WEIGHINGS, ("uint8",), (None,)).tobytes()
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = None
+    sound = isinstance(found, dict) and all(isinstance(each, str) for each in found.values())
+    expect(sound, WEIGHINGS, "texts by axis", text[:50])
 
 
 def _check_ascending(field: str, values: npt.NDArray[np.int32]) -> None:

@@ -166,7 +166,7 @@ def test_a_file_cut_off_or_of_something_else_is_refused(state, tmp_path, suffix,
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    monkeypatch.setenv(weights.CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setenv("SCROLL_TACTILE_CACHE", str(tmp_path))
     return tmp_path / "weights"
 
 

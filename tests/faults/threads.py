@@ -14,7 +14,8 @@ same in one thread.
 In every other round few touches are sampled and few changes are followed, as if there were thousands. What is solved
 for comes in another order then, and the bits of probability and novelty depend on that.
 
-Nothing may be raised but what is named here for each call. A call that takes longer than two minutes hangs.
+Nothing may be raised but what is named here for each call. A call that takes longer than two minutes hangs; a machine
+that stands still meanwhile does not count.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -64,7 +66,7 @@ FEWEST, MOST = 24, 56  # touches in the memory
 NEW_AGAIN = 0.2  # of observations are of a material that comes and goes
 SAID = ({"silk": 1.0}, {"silk": 0.25, "wool": 0.75}, {"wool": 1.0})
 TAKEN_OUT = 8  # touches to calibrate on, in place of 96: many short fits, and not a few long ones
-HANGS = 120.0  # seconds
+TICK, HANGS = 0.1, 1200  # seconds between two looks; looks that a call may last
 SHOWN = 20  # failures of a round
 FEW = 2  # changes and touches, in place of a thousand
 
@@ -86,7 +88,7 @@ def rest(seed: int, readings: int) -> Array:
 
 @dataclass
 class Round:
-    """A memory under eight threads, until `stop`."""
+    """A memory under eight threads, until `stop`. It has no lock: each note in it is a single step of Python."""
 
     learner: TactileLearner
     reader: TactileLearner
@@ -97,33 +99,15 @@ class Round:
     told: list[Told | LiveTold] = field(default_factory=list)
     readings: dict[bytes, Array] = field(default_factory=dict)
     groups: list[tuple[int, int]] = field(default_factory=list)
-    calls: Counter[str] = field(default_factory=Counter)
-    busy: dict[str, tuple[str, float]] = field(default_factory=dict)
-    acknowledged: int = 0
-    made: int = 0
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    calls: list[str] = field(default_factory=list)
+    busy: dict[str, tuple[str, int]] = field(default_factory=dict)
+    looks: int = 0
+    acknowledged: list[int] = field(default_factory=list)
+    made: Iterator[int] = field(default_factory=lambda: count(1))
 
     def fresh(self, material: str) -> Array:
         """A touch that was never made before."""
-        with self.lock:
-            self.made += 1
-            seed = self.made
-        return touch(material, 1000 * self.seed + seed)
-
-    def fail(self, text: str) -> None:
-        """Something was wrong."""
-        with self.lock:
-            self.failures.append(text)
-
-    def tell(self, told: Told | LiveTold) -> None:
-        """Keep what a call said."""
-        with self.lock:
-            self.told.append(told)
-
-    def acknowledge(self, row: int) -> None:
-        """A call has returned that made this row."""
-        with self.lock:
-            self.acknowledged = max(self.acknowledged, row)
+        return touch(material, 1000 * self.seed + next(self.made))
 
 
 def row_of(learner: TactileLearner) -> int:
@@ -178,15 +162,14 @@ class Worker:
         """Call after call."""
         while not self.round.stop.is_set():
             kind = self.rng.choice(self.kinds)
-            self.round.busy[self.name] = kind, time.monotonic()
+            self.round.busy[self.name] = kind, self.round.looks
             try:
                 self.call(kind)
             except Exception as error:  # what a call may raise is caught there
                 frames = traceback.extract_tb(error.__traceback__)[-4:]
                 at = ", ".join(f"{Path(frame.filename).name}:{frame.lineno}" for frame in frames)
-                self.round.fail(f"{kind}: {type(error).__name__}: {error} ({at})")
-            with self.round.lock:
-                self.round.calls[kind] += 1
+                self.round.failures.append(f"{kind}: {type(error).__name__}: {error} ({at})")
+            self.round.calls.append(kind)
             self.round.busy.pop(self.name, None)
 
     def call(self, kind: str) -> None:
@@ -197,7 +180,7 @@ class Worker:
             # A reader may be behind.
             with suppress(CompactedError) if self.learner is self.round.reader else nullcontext():
                 what = ask(self.learner)
-                self.round.tell(Told(of, since, row_of(self.learner), what, self.inside))
+                self.round.told.append(Told(of, since, row_of(self.learner), what, self.inside))
         else:
             getattr(self, kind)()
 
@@ -221,9 +204,8 @@ class Worker:
             before = row_of(self.learner)
             yield
             after = row_of(self.learner)
-            with self.round.lock:
-                self.round.groups.append((before + 1, after))
-            self.round.acknowledge(after)
+            self.round.groups.append((before + 1, after))
+            self.round.acknowledged.append(after)
 
     # What changes the memory
 
@@ -234,11 +216,10 @@ class Worker:
             return
         material = self.material()
         readings = self.round.fresh(material)
-        with self.round.lock:
-            self.round.readings[self.learner.stream(readings).key] = readings
+        self.round.readings[self.learner.stream(readings).key] = readings
         receipt = self.learner.observe(material, readings)
         if not self.inside:
-            self.round.acknowledge(receipt.sequence)
+            self.round.acknowledged.append(receipt.sequence)
 
     def _loose(self) -> int | None:
         if sum(self.learner.materials.values()) < FEWEST:
@@ -308,7 +289,7 @@ class Worker:
     def _predict(self, touches: Sequence[Array], ask: Callable[..., Prediction] | None = None) -> None:
         since, said = row_of(self.learner), (ask or self.learner.predict)(*touches)
         until, streams = row_of(self.learner), [self.learner.stream(one) for one in touches]
-        self.round.tell(Told("prediction", since, until, said, self.inside, streams, LOCAL.learned))
+        self.round.told.append(Told("prediction", since, until, said, self.inside, streams, LOCAL.learned))
 
     def settle(self) -> None:
         """All fitted to what is there."""
@@ -316,10 +297,12 @@ class Worker:
 
     def refresh(self) -> None:
         """A reader takes in what was acknowledged."""
-        acknowledged = self.round.acknowledged
+        acknowledged = max(self.round.acknowledged)
         self.learner.refresh()
         if row_of(self.learner) < acknowledged:
-            self.round.fail(f"a reader refreshed to row {row_of(self.learner)}; {acknowledged} was acknowledged")
+            self.round.failures.append(
+                f"a reader refreshed to row {row_of(self.learner)}; {acknowledged} was acknowledged"
+            )
 
     # Live
 
@@ -371,14 +354,13 @@ class Worker:
         live = LiveTold([Told("prediction", *window, what, learned=learned) for what, learned in said])
         streams = [*ended.earlier, ended.stream]
         live.said.append(Told("prediction", *window, ended.prediction, streams=streams, learned=LOCAL.learned))
-        self.round.tell(live)
+        self.round.told.append(live)
 
     def _observe_live(self, stream: Stream | None) -> None:
         if stream is None or self.full or len(stream) != LENGTH:
             return
-        with self.round.lock:
-            self.round.readings[stream.key] = stream.readings.astype(np.float64)
-        self.round.acknowledge(self.round.learner.observe(self.rng.choice(FIRST), stream).sequence)
+        self.round.readings[stream.key] = stream.readings.astype(np.float64)
+        self.round.acknowledged.append(self.round.learner.observe(self.rng.choice(FIRST), stream).sequence)
 
 
 ROWS: dict[int, int] = {}  # of a touch at each scale, once that is known
@@ -420,7 +402,7 @@ def begun(home: Path, seed: int) -> Round:
         for material in FIRST:
             readings = round_.fresh(material)
             round_.readings[learner.stream(readings).key] = readings
-            round_.acknowledge(learner.observe(material, readings).sequence)
+            round_.acknowledged.append(learner.observe(material, readings).sequence)
     for number in range(3):
         round_.others.append(home / f"other-{number}")
         with TactileLearner.open(round_.others[-1], **SETTINGS) as other:
@@ -446,19 +428,20 @@ def under_threads(round_: Round, seconds: float, threads: int) -> bool:
     end = time.monotonic() + seconds
     try:
         while any(thread.is_alive() for thread in running):
-            time.sleep(0.1)
-            now = time.monotonic()
-            if now > end or len(round_.failures) >= SHOWN:
+            time.sleep(TICK)
+            round_.looks += 1
+            if time.monotonic() > end or len(round_.failures) >= SHOWN:
                 round_.stop.set()
-            hung = {name: kind for name, (kind, since) in dict(round_.busy).items() if now - since > HANGS}
+            hung = {name: kind for name, (kind, since) in dict(round_.busy).items() if round_.looks - since > HANGS}
             if hung:
                 faulthandler.dump_traceback()
-                round_.fail(f"hangs for {HANGS:g} s: {hung}")
+                faulthandler.dump_traceback_later(60, exit=True)  # Python would wait for pools whose threads hang
+                round_.failures.append(f"hang for {TICK * HANGS:g} s: {hung}")
                 return False
     except KeyboardInterrupt:
         round_.stop.set()
         for thread in running:
-            thread.join(HANGS)
+            thread.join(TICK * HANGS)
         raise
     return True
 
@@ -557,7 +540,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
             with few_sampled() if many else nullcontext():
                 same: Same = to_rounding if many else operator.eq
                 round_ = begun(where, seed)
-                with watched(round_.fail, same):
+                with watched(round_.failures.append, same):
                     try:
                         whole = under_threads(round_, seconds, options.threads)
                     except KeyboardInterrupt:
@@ -570,7 +553,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
                     round_.reader.close()
                     round_.learner.close()
             failures += [f"seed {seed}: {text}" for text in found[:SHOWN]]
-            calls += round_.calls
+            calls.update(round_.calls)
             rounds += 1
             done = f"{sum(calls.values())} calls, {sum(answers.values())} answers, {len(failures)} failures"
             progress(f"round {rounds}: {done}")

@@ -269,3 +269,14 @@ def test_touches_of_other_lengths_and_one_touch_alone():
         ragged.match(np.zeros((3, 10), np.uint8))
     single = matcher_of(kept(each=1)[:1])
     assert single.match(touch(0, 100)).scores.shape == (1,)
+
+
+@pytest.mark.parametrize("noise", [CLEAN, None])
+@pytest.mark.parametrize("whole", [False, True])
+def test_the_only_kept_touch_held_out_leaves_nothing_to_compare_with(noise, whole):
+    """As where one kept touch alone has a label of an axis (`predict(of=)`): every answer is the same."""
+    single = matcher_of(kept(each=1)[:1])
+    found = single.match(single.kept.levels(0), whole=whole, held_out=0, noise=noise)
+    assert found.scores.tolist() == [0.0]
+    assert np.isnan(found.expected).all()
+    assert (found.noise_share, found.log_likelihood_gain, found.excess_loss, found.moved) == (0.0, 0.0, 0.0, False)

@@ -62,7 +62,7 @@ def learn(
 
     Episodes name themselves where a recording says what they are. The exit code is 1 where something was refused.
     """
-    from scroll_tactile.clients.learning.learning import learn_sources, store_model
+    from scroll_tactile.clients.learning.learning import learn_sources
     from scroll_tactile.clients.learning.sources import find_sources, has_touches
     from scroll_tactile.learner import TactileLearner
 
@@ -77,7 +77,6 @@ def learn(
             opening = nullcontext(TactileLearner(sensor=chosen))
         with opening as learner:
             done = learn_sources(learner, found, options, progress)
-            store_model(learner, progress)
             held = sum(learner.materials.values())
     done.refused[:0] = missing
     _report_learned(done, held, as_json)

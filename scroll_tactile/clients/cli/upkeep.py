@@ -315,11 +315,8 @@ def merge(
     ],
 ) -> None:
     """Make a memory the one that observed all that both did, exactly; what both observed counts once."""
-    from scroll_tactile.clients.learning.learning import store_model
-
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         done = learner.merge(other, progress=progress)
-        store_model(learner, progress)
         digest, count = learner.digest(), sum(learner.materials.values())
     say(
         f"{counted(done.observations, 'observation')} came in, {counted(done.shared, 'stream')} observed by both; "

@@ -32,7 +32,7 @@ from typing import Any
 from scroll_tactile_store import DamageError, Head, NotAStoreError, StoreError, StoreFullError, VersionError
 from scroll_tactile_store.files import remove_tree
 
-from scroll_tactile.clients.learning.learning import learn_sources, store_model
+from scroll_tactile.clients.learning.learning import learn_sources
 from scroll_tactile.clients.learning.runfile import alone_in
 from scroll_tactile.clients.learning.sources import (
     Refused,
@@ -397,7 +397,6 @@ class Destination:
             raise InputError(f"nothing was learned, and no memory made: {len(refused)} sources were refused{first}")
         self._report.held, self._report.digest = sum(self.learner.materials.values()), self.learner.digest()
         self.learner._ledger.saves = True
-        store_model(self.learner, progress)
         self.learner.close()
 
 

@@ -19,7 +19,7 @@ from scroll_tactile.persistence.contents import refusal
 from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.signals.ranges import all_clipped, range_problem
 
-__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources", "store_model"]
+__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources"]
 
 BATCH_TOUCHES = 256  # become durable together: what a kill can cost …
 BATCH_BYTES = 1 << 25  # … unless their readings would be more than this, or the first was read so long ago:
@@ -80,16 +80,6 @@ def learn_sources(
     batch.observe(done)
     progress(f"{done.learned.total()} touches", len(sources), len(sources))
     return done
-
-
-def store_model(learner: TactileLearner, progress: Progress) -> None:
-    """Fit a model that the learner stores when it is closed, so that the processes that open the memory fit none.
-
-    progress: called with (what is being done, 0, 1). Without a path, and without a touch, nothing is fitted.
-    """
-    if learner.path is not None and learner.materials:
-        progress("fitting the model", 0, 1)
-        learner._predictor.prepare_to_store()
 
 
 class _Batch:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Container, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -31,11 +30,12 @@ from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
-from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches
-from scroll_tactile.prediction.model import Model, enough_memory
+from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.readouts.leave_one_out import rows_at
+from scroll_tactile.readouts.task import Task
 from scroll_tactile.results import Observation, Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 from scroll_tactile.statistics.moments import one_thread
@@ -59,11 +59,12 @@ def separations(statistics: Statistics, model: Model) -> tuple[list[str], FloatA
     calibration believes it. Materials that were never touched long enough are left out. None are there before a
     calibration is.
     """
-    if model.fusion is None:
+    if model.weighing is None:
         return [], np.zeros((0, 0))
-    scales = model.scales("complete", len(model.calibrations) - 1)
+    complete = model.weighing.complete
+    scales = complete.scales
     lda = model.kind == "lda"
-    weights = model.fusion.complete.calibration.weights if lda else np.full(len(scales), PRIOR / len(scales))
+    weights = complete.calibration.weights if lda else np.full(len(scales), PRIOR / len(scales))
     names = [name for name in model.names if all(name in model.readouts[scale].places for scale in scales)]
     total = np.zeros((len(names), len(names)))
     with one_thread():
@@ -219,12 +220,13 @@ class Soon:
 
 def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float) -> Soon | None:
     """How soon answers come, by prefixes of held-out touches; None where too few touches were held out."""
-    if model.fusion is None or len(model.fusion.trajectories.targets) < FEWEST:
+    weighing = model.weighing
+    if weighing is None or weighing.trajectories is None or len(weighing.trajectories.targets) < FEWEST:
         return None
-    held_out, moments, rate = model.fusion.trajectories, model.fusion.moments[:-1], extractor.sensor.rate
+    held_out, rows, rate = weighing.trajectories, weighing.early, extractor.sensor.rate
     done, wrong = np.zeros((2, len(held_out.targets)), bool)
     right, decided, mistaken = [], [], []
-    for i, moment in enumerate(moments):
+    for i, row in enumerate(rows):
         chances, novelty = held_out.chances[:, i], held_out.novelty[:, i]
         reached = np.isfinite(novelty)
         best = np.where(reached, np.nan_to_num(chances).argmax(axis=1), -1)
@@ -235,16 +237,16 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
                 probability=chance,
                 ranking=((name, chance),),
                 novelty=float(novelty[touch]),
-                known=bool(novelty[touch] <= moment.threshold(false_alarms)),
-                seconds=moment.steps / rate,
+                known=bool(novelty[touch] <= row.calibration.threshold(false_alarms)),
+                seconds=row.steps / rate,
             )
-            if rule.decided(prediction, moment.steps):
+            if rule.decided(prediction, row.steps):
                 done[touch], wrong[touch] = True, not prediction.known or best[touch] != held_out.targets[touch]
         right.append(float((best == held_out.targets)[reached].mean()) if reached.any() else 0.0)
         decided.append(float(done.mean()))
         mistaken.append(float(wrong.mean()))
     return Soon(
-        seconds=tuple(moment.steps / rate for moment in moments),
+        seconds=tuple(row.steps / rate for row in rows),
         right=tuple(right),
         decided=tuple(decided),
         wrong=tuple(mistaken),
@@ -267,7 +269,7 @@ def chosen(held_out: Sequence[HeldOutTouch], keys: Container[bytes], camera: boo
 
 
 def growing(
-    model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float, touches: Streams
+    model: Model, memory: Memory, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float, touches: Streams
 ) -> list[Growing]:
     """The answers to some touches, each as if it had never been observed, at the rule's moments or at parts of it.
 
@@ -280,38 +282,35 @@ def growing(
         parts = [round(part * len(stream)) for part in (CAMERA_PARTS if sensor.camera else PARTS)]
         moments = [*(rule.moments if len(rule.moments) > 1 else parts), len(stream)]
         least = max(fewest_readings(sensor), first + 1)
-        with _without(model, touch) as other:
-            for count in sorted({min(max(least, moment), len(stream)) for moment in moments}):
-                prefix = stream.first(count / sensor.rate)
-                encoded = extractor.encode(prefix, other.longest, lambda steps: model.scales_for(names, steps))
-                predictions.append(answer(other, extractor, names, [(encoded, None)], false_alarms))
-                if decided is None and rule.decided(predictions[-1], encoded.steps):
-                    decided = len(predictions) - 1
+        other = _without(model, memory, touch)
+        for count in sorted({min(max(least, moment), len(stream)) for moment in moments}):
+            prefix = stream.first(count / sensor.rate)
+            encoded = extractor.encode(prefix, other.longest, lambda steps: model.scales_for(names, steps))
+            predictions.append(answer(other, extractor, names, [(encoded, None)], false_alarms))
+            if decided is None and rule.decided(predictions[-1], encoded.steps):
+                decided = len(predictions) - 1
         found.append(Growing(touch.material, tuple(predictions), decided))
     return found
 
 
-@contextmanager
-def _without(model: Model, touch: HeldOutTouch) -> Iterator[Model]:
-    """The model as if it had never observed a touch, nor kept it, but for how it is calibrated."""
-    sampled = next(item for material, key, item in model.sample if (material, key) == (touch.material, touch.key))
+def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
+    """The model as if it had never observed a touch, nor kept it, but for how it is weighed."""
+    weighing, own = model.fitted, (touch.material, touch.key)
+    sampled = next(item for *which, item in weighing.sample if tuple(which) == own)
     stages, readouts = [[*stage, *model.views] for stage in model.stages], dict(model.readouts)
-    with one_thread():
-        for scale, readout in model.readouts.items():
-            if own := rows_at(sampled, stages, scale):
-                # As many rows as it added: of windows that are learned one by one the sample has the mean.
-                times = max(1, round(sampled.pairs[own[0], 2] / len(own)))
-                readouts[scale] = readout.without(touch.material, np.repeat(sampled.rows[own], times, axis=0))
-    other, matcher = replace(model, readouts=readouts), model.matcher
-    if matcher is None or (touch.material, touch.key) not in matcher.kept.held:
-        yield other
-        return
-    kept = KeptTouch(touch.material, touch.key, matcher.kept.levels(matcher.kept.rows()[touch.key]))
-    matcher.kept.follow((), [(touch.material, touch.key)])
-    try:
-        yield other
-    finally:
-        matcher.kept.follow([kept])
+    for scale, readout in model.readouts.items():
+        if rows := rows_at(sampled, stages, scale):
+            # As many rows as it added: of windows that are learned one by one the sample has the mean.
+            times = max(1, round(sampled.pairs[rows[0], 2] / len(rows)))
+            task = Task.of(memory.statistics, scale, readout.reference, model.plan.shrinkage)
+            readouts[scale] = task.without(touch.material, np.repeat(sampled.rows[rows], times, axis=0)).solve()
+    other, matcher, conformal = replace(model, readouts=readouts), model.matcher, model.conformal
+    if matcher is None or conformal is None or own not in matcher.kept.touches:
+        return other
+    kept = matcher.kept.followed((), [own])
+    if kept is None:
+        return replace(other, matcher=None, conformal=None)
+    return replace(other, matcher=matcher.followed(kept), conformal=conformal.followed((), {own}))
 
 
 @dataclass
@@ -319,15 +318,13 @@ class MemoryFacts:
     """What a memory knows.
 
     risk: the share of wrong answers among those decided. of: an axis, whose labels it then knows in place of materials.
-    missing: what the page lacks and why, filled as it is made. unread: whether the
-    embedding is not at hand, and nothing was fitted to beginnings.
+    missing: what the page lacks and why, filled as it is made.
     """
 
     learner: TactileLearner
     risk: float
     of: str | None = None
     missing: list[str] = field(default_factory=list)
-    unread: bool = False
 
     def lacks(self, what: str, why: str) -> str:
         """Note that something is missing, and say so in its place."""
@@ -354,15 +351,13 @@ class MemoryFacts:
 
     @cached_property
     def model(self) -> Model | None:
-        """The model that answers, touches held out of it; None of an empty memory, and where none can be fitted."""
+        """The model fitted to the memory as it is; None of an empty memory, and where none can be fitted."""
         try:
-            try:
-                return self.learner._by(self.of).examined() if self.counts else None
-            except CANNOT_EMBED as error:
-                self.missing.append(f"When answers are decided: {error}")
-                self.unread = True
-                with enough_memory():
-                    return Draft.of(self.memory, self.learner.settings.readout).fit(None)
+            if not self.counts:
+                return None
+            model = self.learner._by(self.of).fitted()
+            rehearse(model)
+            return model
         except CapacityError:
             raise
         except ScrollTactileError as error:  # sums that came from elsewhere have no readout, and the ridge has a limit
@@ -406,7 +401,7 @@ class MemoryFacts:
     @cached_property
     def rule(self) -> DecisionRule | None:
         """When an answer is safe to act on; None where nothing can be left out, or embedded."""
-        if self.model is None or not self.held_out or self.unread:
+        if self.model is None or not self.held_out:
             return None
         return decision_rule(self.model, self.risk)
 
@@ -423,7 +418,7 @@ class MemoryFacts:
         if self.model is None or not self.held_out:
             return [], self.nothing_left_out
         if self.rule is None:
-            return [], "the embedding is not at hand; see below."
+            return [], self.nothing_left_out
         sensor, kept = self.learner.sensor, {touch.key: touch for touch in self.kept}
         held = {} if kept else {exemplar.key: exemplar for own in self.exemplars.values() for exemplar in own}
         streams = [
@@ -433,7 +428,9 @@ class MemoryFacts:
         if not streams:
             return [], "of no touch that could be left out the readings are kept."
         try:
-            return growing(self.model, self.extractor, self.rule, self.learner.settings.false_alarms, streams), ""
+            return growing(
+                self.model, self.memory, self.extractor, self.rule, self.learner.settings.false_alarms, streams
+            ), ""
         except CANNOT_EMBED as error:
             return [], str(error)
 

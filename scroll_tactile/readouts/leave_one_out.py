@@ -1,7 +1,7 @@
 """Leave-one-out scores: each sampled touch is scored by a readout that never observed it.
 
 The touch's rows are taken out of the statistics. A touch of k rows with mean x̄, of a material of n rows with mean m,
-adds to S_w the columns U of `system`: its rows about their mean and the scaled shift √(n k / (n − k)) (x̄ − m). Without
+adds to S_w the columns U: its rows about their mean and the scaled shift √(n k / (n − k)) (x̄ − m). Without
 it, by Sherman, Morrison and Woodbury (1950; Bartlett 1951 for a row),
 
     K'⁻¹ = K⁻¹ − K⁻¹ Uᵀ E U K⁻¹,    E = (U K⁻¹ Uᵀ − I)⁻¹,    m' = m − k / (n − k) (x̄ − m),
@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.readouts.readout import Readout, ReadoutName
-from scroll_tactile.readouts.system import contrasts
+from scroll_tactile.readouts.triangle import contrasts
 from scroll_tactile.signals.windows import Scale, measuring
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
@@ -183,7 +183,7 @@ class _Leaving:
         # The total scatter is that of the reference materials, scaled to the rows of all materials.
         self.excess = float(readout.counts.sum()) / self.total
         with one_thread():
-            self.basis, upper = np.linalg.qr(readout.system.whiten(np.asarray(readout.near.means, np.float64)).T)
+            self.basis, upper = np.linalg.qr(readout.triangle.times(readout.near.means).T)
             self.means = np.pad(upper.T, ((0, 0), (0, beyond)))
             self.center = readout.shares @ self.means
             spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
@@ -192,7 +192,7 @@ class _Leaving:
 
     def _coordinates(self, vectors: FloatArray) -> FloatArray:
         """The coordinates of each touch's vectors about the origin, (M, k, d) to (M, k, D)."""
-        white = self.readout.system.whiten(vectors.reshape(-1, vectors.shape[2]))
+        white = self.readout.triangle.times(vectors.reshape(-1, vectors.shape[2]))
         near = white @ self.basis
         rest = (white - near @ self.basis.T).reshape(vectors.shape)
         # The triangle of a QR, which equal rows do not make singular, as they make their Gram matrix.

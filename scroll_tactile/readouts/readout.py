@@ -1,4 +1,4 @@
-"""Readouts: discriminants of one scale, solved once from the exact statistics and followed from touch to touch.
+"""Readouts: discriminants of one scale, solved from the exact statistics; between two solutions their means follow.
 
 With class means m_y, the scatter within classes S_w of N rows and its shrinkage ρ (see `task`), Σ⁻¹ = γ K⁻¹ with
 K = S_w + P I, P = ρ / (1 − ρ) tr S_w / d and γ = N / (1 − ρ). All that answers need of a row x are
@@ -17,96 +17,135 @@ are taken about the nearest of the reference materials, n: with v the z of x −
 its mean, the scores are e_n + H v and the distance is −2 (max_y s_y − s_n) + vᵀ H v − (1 / p_n − 1) / (1 − ρ), as
 H G = I − H ((1 − ρ) P)⁻¹ and H 1 = (1 − ρ) p.
 
-`System` follows K⁻¹ as touches come and go; means and what is solved for them follow with it.
+Between two solutions the means m_y and their shares follow the touches that came and went, exactly; S_w, ρ and N stay
+as they were solved. Measured, such a readout is right about as many touches as one that is solved anew.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.system import System, columns_of
+from scroll_tactile.readouts.triangle import InverseTriangle
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import one_thread
+from scroll_tactile.statistics.moments import Sums, one_thread
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["Change", "Means", "Numbers", "Readout", "ReadoutName"]
+__all__ = ["BLOCK", "Means", "Readout", "ReadoutName", "Solution"]
 
 FloatArray = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.floating]
+IntArray = npt.NDArray[np.int64]
 Places = npt.NDArray[np.intp]
 ReadoutName = Literal["lda", "ridge"]
-Change = tuple[str, npt.NDArray[np.int32], int]
-"""A material, the rows of codes (k, d) of a touch of it at one scale, and 1 where they came or -1 where they went."""
 
-FARTHEST = 1e100  # diagonal distance from a mean of another's stored model that is no number
+BLOCK = 512  # materials beyond the reference that are held and solved for together: in single precision 2 MB
 
 
-class Numbers(NamedTuple):
-    """The numbers that a readout was solved with.
+class Solution(NamedTuple):
+    """What of a readout stays as it was solved.
 
-    origin: shape (d,), in grid units. counts: rows, shape (C,). share: ρ. penalty: P. precision: one over the variance
-    of each feature within materials as it was solved, shape (d,).
+    origin: the mean of all rows, shape (d,), in grid units. triangle: L⁻¹ of K. rows: N. share: ρ. penalty: P.
+    precision: one over the variance of each feature within materials, shape (d,).
     """
 
     origin: FloatArray
-    counts: FloatArray
+    triangle: InverseTriangle
+    rows: int
     share: float
     penalty: float
     precision: FloatArray
 
 
-@dataclass
 class Means:
-    """The means m of n materials about a readout's origin, and what is solved for them.
+    """The means m of n materials, n ≥ 0, about a readout's origin, and what is solved for them: it never changes.
 
-    means: m, solved: K⁻¹ m, both (n, d), in double or in single precision. sizes: mᵀ K⁻¹ m, (n,).
+    counts: rows, shape (n,), sums: of their codes, (n, d), both exact. single: whether K⁻¹ m is held in single
+    precision. It is solved for when it is first asked for; of threads that ask at once each solves, to the same bits.
     """
 
-    means: Floats
-    solved: Floats
-    sizes: FloatArray
+    def __init__(self, counts: IntArray, sums: Sums, solution: Solution, *, single: bool = False) -> None:
+        self.counts, self.sums, self.single = counts, sums, single
+        self._solution = solution
+        self._solved: tuple[Floats, FloatArray] | None = None
 
     def __len__(self) -> int:
-        return len(self.sizes)
+        return len(self.counts)
 
-    def put(self, rows: slice | Sequence[int], means: FloatArray, solved: FloatArray) -> None:
-        """Replace materials."""
-        self.means[rows], self.solved[rows] = means, solved
-        self.sizes[rows] = np.einsum("nd,nd->n", means, solved)
+    @property
+    def means(self) -> FloatArray:
+        """m, shape (n, d), formed anew each time."""
+        return self.means_at(slice(None))
 
-    def append(self, mean: FloatArray, solved: FloatArray) -> None:
-        """Add a material, shapes (1, d)."""
-        kind = self.means.dtype
-        self.means = np.concatenate([self.means, mean.astype(kind)])
-        self.solved = np.concatenate([self.solved, solved.astype(kind)])
-        self.sizes = np.append(self.sizes, np.einsum("nd,nd->n", mean, solved))
+    @property
+    def solved(self) -> Floats:
+        """K⁻¹ m, shape (n, d)."""
+        return self._solve()[0]
 
-    def border(self, leaving: FloatArray, corner: FloatArray) -> None:
-        """Follow K⁻¹, which falls by Wᵀ C W; see `System.border`."""
-        kind = self.means.dtype
-        leaving = leaving.astype(kind, copy=False)
-        onto = self.means @ leaving.T
-        moved = onto @ corner.astype(kind, copy=False)
-        self.solved -= moved @ leaving
-        self.sizes -= (moved * onto).sum(axis=1)
+    @property
+    def sizes(self) -> FloatArray:
+        """mᵀ K⁻¹ m, shape (n,)."""
+        return self._solve()[1]
+
+    def means_at(self, rows: slice | Sequence[int]) -> FloatArray:
+        """m of some of them, shape (k, d)."""
+        return about(self.counts[rows], self.sums[rows], self._solution.origin)
 
     def scores(self, row: FloatArray, rows: slice | Places = slice(None)) -> FloatArray:
         """mᵀ K⁻¹ x − mᵀ K⁻¹ m / 2 of some of them, for a row x of shape (d,) about the origin."""
-        return np.asarray(self.solved[rows] @ row.astype(self.solved.dtype, copy=False) - self.sizes[rows] / 2)
+        solved, sizes = self._solve()
+        return np.asarray(solved[rows] @ row.astype(solved.dtype, copy=False) - sizes[rows] / 2)
 
-    def copy(self) -> Means:
-        """A copy that changes independently."""
-        return Means(self.means.copy(), self.solved.copy(), self.sizes.copy())
+    def changed(self, rows: Sequence[int], counts: IntArray, sums: Sums) -> Means:
+        """The same with other counts (k,) and sums (k, d) at some rows.
+
+        Rows past the end are appended; materials without rows any more are taken out.
+        """
+        size, live = max(len(self), *(row + 1 for row in rows)), [row for row, n in zip(rows, counts, strict=True) if n]
+        own = np.empty(size, np.int64), np.empty((size, sums.shape[1]), np.result_type(self.sums, sums))
+        for into, held, new in zip(own, (self.counts, self.sums), (counts, sums), strict=True):
+            into[: len(self)] = held
+            into[rows] = new
+        other = Means(*own, self._solution, single=self.single)
+        stay = other.counts > 0
+        if self._solved is not None:
+            parts = [np.empty((size, *held.shape[1:]), held.dtype) for held in self._solved]
+            for into, held, new in zip(parts, self._solved, other._solve_at(live), strict=True):
+                into[: len(self)] = held
+                into[live] = new
+            other._solved = parts[0][stay], parts[1][stay]
+        other.counts, other.sums = other.counts[stay], other.sums[stay]
+        return other
+
+    def _solve(self) -> tuple[Floats, FloatArray]:
+        if self._solved is None:
+            self._solved = self._solve_at(slice(None))
+        return self._solved
+
+    def _solve_at(self, rows: slice | Sequence[int]) -> tuple[Floats, FloatArray]:
+        with one_thread():
+            means = self.means_at(rows)
+            solved = self._solution.triangle.solve(means)
+            sizes = np.einsum("nd,nd->n", means, solved)
+        return solved.astype(np.float32 if self.single else np.float64, copy=False), sizes
+
+
+def about(counts: IntArray, sums: Sums, origin: FloatArray) -> FloatArray:
+    """Means of materials about an origin, (n, d) in grid units, of their counts (n,) and sums (n, d)."""
+    # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
+    near = np.rint(origin)
+    return np.asarray((sums - np.outer(counts, near.astype(np.int64))) / counts[:, None] - (origin - near))
 
 
 @dataclass(frozen=True)
 class Derived:
-    """The matrices that ridge and novelty need of a readout in its present state.
+    """The matrices that ridge and novelty need of a readout.
 
     gram: G of the reference materials about their mean, shape (R, R). background: H. towards: subtracted from z, after
     its mean, to move its origin to the mean of the reference materials, shape (R,).
@@ -118,22 +157,53 @@ class Derived:
 
 
 class Readout:
-    """The readout of one scale: solved from a task, then updated by the touches that came and went since.
+    """The readout of one scale: solved from a task, or the one that followed such a one. It never changes.
 
     names: the materials; a place is an index into them. near: the reference materials, which are the first. others:
-    those after them. The other attributes are those of `Numbers`.
+    those after them, in blocks. counts: rows, shape (C,). The other attributes are those of `Solution`.
 
-    Any number of threads may read it at once. `follow` changes it in place: while any thread reads it, a copy follows.
+    Any number of threads may use it at once.
     """
 
     def __init__(
-        self, scale: Scale, names: Sequence[str], system: System, near: Means, others: Means, numbers: Numbers
+        self, scale: Scale, names: Sequence[str], near: Means, others: Sequence[Means], solution: Solution
     ) -> None:
-        self.scale, self.names, self.system, self.near, self.others = scale, list(names), system, near, others
-        self.places = {name: place for place, name in enumerate(names)}
-        self.origin, self.counts, self.share, self.penalty, self.precision = numbers
+        self.scale, self.names, self.near, self.solution = scale, list(names), near, solution
+        self.others = tuple(block for block in others if len(block))
+        self.places = {name: place for place, name in enumerate(self.names)}
+        self.counts = np.concatenate([part.counts for part in self._parts]).astype(np.float64)
+        self._firsts = [0, *accumulate(len(part) for part in self._parts)]
         self._derived: Derived | None = None
         self._scored: tuple[FloatArray, FloatArray] | None = None  # the last touch, and its scores of all materials
+
+    @property
+    def _parts(self) -> tuple[Means, ...]:
+        return (self.near, *self.others)
+
+    @property
+    def origin(self) -> FloatArray:
+        """The origin that features and means are taken about, shape (d,)."""
+        return self.solution.origin
+
+    @property
+    def triangle(self) -> InverseTriangle:
+        """L⁻¹, by which K⁻¹ solves."""
+        return self.solution.triangle
+
+    @property
+    def share(self) -> float:
+        """ρ."""
+        return self.solution.share
+
+    @property
+    def penalty(self) -> float:
+        """P."""
+        return self.solution.penalty
+
+    @property
+    def precision(self) -> FloatArray:
+        """One over the variance of each feature within materials, shape (d,)."""
+        return self.solution.precision
 
     @property
     def reference(self) -> list[str]:
@@ -143,7 +213,7 @@ class Readout:
     @property
     def gamma(self) -> float:
         """γ, by which K⁻¹ becomes Σ⁻¹."""
-        return float(self.counts.sum()) / (1 - self.share)
+        return self.solution.rows / (1 - self.share)
 
     @property
     def shares(self) -> FloatArray:
@@ -151,91 +221,55 @@ class Readout:
         counts = self.counts[: len(self.near)]
         return np.asarray(counts / counts.sum())
 
-    @property
-    def nearly_full(self) -> bool:
-        """Whether the system has taken in more than three quarters of the columns that it has room for."""
-        return self.system.rank > 3 * self.system.room
+    def followed(self, statistics: Statistics, changed: Collection[str]) -> Readout | None:
+        """The readout of the present statistics, with what `Solution` has as it was solved; None without a reference.
 
-    def follow(self, changes: Sequence[Change]) -> bool:
-        """Take in touches that came and went.
-
-        Returns False where all has to be solved again: the touches are too many, they outweigh the scatter that it was
-        solved from, or a material lost its last one.
+        changed: materials of which touches came or went since this one was solved or followed; of others no sum may
+        have changed. A new one joins the reference where that is all materials. The caller holds the statistics' lock.
         """
-        if sum(len(rows) for _, rows, _ in changes) > self.system.room:
-            return False
-        self._derived = self._scored = None
-        come: dict[str, list[FloatArray]] = {}
-        for material, rows, sign in changes:
-            if sign > 0:
-                come.setdefault(material, []).append(rows - self.origin)
-        try:
-            with one_thread():
-                self._follow({material: np.concatenate(rows) for material, rows in come.items()}, 1)
-                for material, rows, sign in changes:
-                    if sign < 0:
-                        place = self.places.get(material)
-                        if place is None or self.counts[place] <= len(rows):
-                            return False
-                        self._follow({material: rows - self.origin}, -1)
-        except np.linalg.LinAlgError:  # nearly all touches that it was solved from were retracted
-            return False
-        return self.system.sound
+        names = sorted(set(changed))
+        counts = statistics.counts(self.scale, names)
+        _, there = statistics.totals(self.scale, [name for name, count in zip(names, counts, strict=True) if count])
+        sums = np.zeros((len(names), len(self.origin)), there.dtype)
+        sums[counts > 0] = there
+        moved: list[dict[int, int]] = [{} for _ in self._parts]  # row → place among the names
+        come = []
+        for i, name in enumerate(names):
+            if name in self.places:
+                number, row = self._at(self.places[name])
+                part = self._parts[number]
+                if part.counts[row] != counts[i] or (part.sums[row] != sums[i]).any():
+                    moved[number][row] = i
+            elif counts[i]:
+                come.append(i)
+        room = BLOCK - len(self.others[-1]) if self.others else len(come)
+        moved[-1].update(enumerate(come[:room], len(self._parts[-1])))
+        parts = [
+            part.changed(list(rows), counts[list(rows.values())], sums[list(rows.values())]) if rows else part
+            for part, rows in zip(self._parts, moved, strict=True)
+        ]
+        for own in (come[first : first + BLOCK] for first in range(room, len(come), BLOCK)):
+            parts.append(Means(counts[own], sums[own], self.solution, single=parts[-1].single))
+        if not len(parts[0]):
+            return None
+        gone = {name for name, count in zip(names, counts, strict=True) if not count}
+        left = [name for name in self.names if name not in gone]
+        return Readout(self.scale, [*left, *(names[i] for i in come)], parts[0], parts[1:], self.solution)
 
-    def copy(self) -> Readout:
-        """A copy that follows independently."""
-        other = copy.copy(self)
-        other.names, other.places, other.counts = list(self.names), dict(self.places), self.counts.copy()
-        other.system, other.near, other.others = self.system.branch(), self.near.copy(), self.others.copy()
-        return other
+    def _at(self, place: int) -> tuple[int, int]:
+        """Which part holds a material, and its row there."""
+        number = bisect_right(self._firsts, place) - 1
+        return number, place - self._firsts[number]
 
-    def without(self, material: str, rows: npt.NDArray[np.float64]) -> Readout:
-        """A copy that never observed a touch of these rows, codes (k, d); its material has other touches.
-
-        The caller has set BLAS to one thread.
-        """
-        other = self.copy()
-        other._derived = other._scored = None
-        other._follow({material: rows - self.origin}, -1)
-        return other
-
-    def _at(self, place: int) -> tuple[Means, int]:
-        """Where a material is held, and its row there."""
-        return (self.near, place) if place < len(self.near) else (self.others, place - len(self.near))
-
-    def _follow(self, changed: Mapping[str, FloatArray], sign: int) -> None:
-        """Take in rows of several materials, (k, d) about the origin, in one product: that is faster."""
-        columns, known, fresh = [], [], []
-        for material, came in changed.items():
-            place, mean = self.places.get(material), came.mean(axis=0)
-            if place is None:
-                columns.append(columns_of(came, None))
-                fresh.append((material, mean, len(came)))
-                continue
-            (held, row), before = self._at(place), self.counts[place]
-            self.counts[place] = after = before + sign * len(came)
-            step = mean - held.means[row]
-            columns.append(columns_of(came, np.sqrt(before * len(came) / after) * step))
-            known.append((held, row, sign * len(came) / after * step))
-        added = np.concatenate([self.near.means[:0], *columns])
-        if len(added):
-            leaving, corner = self.system.border(added, sign)
-            for held in (self.near, self.others):
-                held.border(leaving, corner)
-        for held in (self.near, self.others):
-            if moved := [(row, step) for own, row, step in known if own is held]:
-                means = np.array([held.means[row] + step for row, step in moved])
-                held.put([row for row, _ in moved], means, self.system.solve(means))
-        for material, mean, count in fresh:
-            # Where the reference is all materials, the new one joins it.
-            held = self.near if len(self.near) == len(self.names) else self.others
-            held.append(mean[None], self.system.solve(mean[None]))
-            self.places[material] = len(self.names)
-            self.names.append(material)
-            self.counts = np.append(self.counts, float(count))
+    def _among(self, places: Places) -> Iterator[tuple[npt.NDArray[np.bool_], Means, Places]]:
+        """For each part that holds some of the places: which ones, the part, and their rows there."""
+        for part, first in zip(self._parts, self._firsts, strict=False):
+            own = (places >= first) & (places < first + len(part))
+            if own.any():
+                yield own, part, places[own] - first
 
     def derived(self) -> Derived:
-        """The matrices of the present state, made again after a change."""
+        """The matrices that ridge and novelty need, made when they are first asked for."""
         if self._derived is None:
             shares, means, solved = self.shares, self.near.means, self.near.solved
             with one_thread():
@@ -258,12 +292,9 @@ class Readout:
             return np.asarray(scores[chosen])
         if 4 * len(chosen) > len(self.names):  # picking rows copies them
             return np.asarray(self.gamma * self._scores_of_all(features)[chosen])
-        row, near_ones = features - self.origin, chosen < len(self.near)
-        if near_ones.all():
-            return np.asarray(self.gamma * self.near.scores(row, chosen))
-        scores = np.empty(len(chosen))
-        scores[near_ones] = self.near.scores(row, chosen[near_ones])
-        scores[~near_ones] = self.others.scores(row, chosen[~near_ones] - len(self.near))
+        row, scores = features - self.origin, np.empty(len(chosen))
+        for own, part, rows in self._among(chosen):
+            scores[own] = part.scores(row, rows)
         return np.asarray(self.gamma * scores)
 
     def _scores_of_all(self, features: FloatArray) -> FloatArray:
@@ -271,7 +302,7 @@ class Readout:
         scored = self._scored
         if scored is None or scored[0] is not features:
             row = features - self.origin
-            scored = self._scored = features, np.concatenate([self.near.scores(row), self.others.scores(row)])
+            scored = self._scored = features, np.concatenate([part.scores(row) for part in self._parts])
         return scored[1]
 
     def diagonal_distance(self, features: FloatArray, place: int) -> float:
@@ -280,17 +311,17 @@ class Readout:
         It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
         differs in.
         """
-        held, row = self._at(place)
-        away = features - self.origin - held.means[row]
-        return float(np.fmin(np.square(away) @ self.precision, FARTHEST))
+        number, row = self._at(place)
+        away = features - self.origin - self._parts[number].means_at([row])[0]
+        return float(np.square(away) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
         """The scores of materials as weights (d, k) of features about the origin, and offsets (k,); see `scores`."""
         places = [self.places[name] for name in names]
         if kind == "lda":
-            found = [self._at(place) for place in places]
-            solved = np.array([held.solved[row] for held, row in found], dtype=np.float64)
-            return self.gamma * solved.T, -self.gamma * np.array([held.sizes[row] for held, row in found]) / 2
+            found = [(self._parts[number], row) for number, row in map(self._at, places)]
+            solved = np.array([part.solved[row] for part, row in found], dtype=np.float64)
+            return self.gamma * solved.T, -self.gamma * np.array([part.sizes[row] for part, row in found]) / 2
         derived, weights = self.derived(), self.gamma * self.near.solved.T
         background = derived.background[places]
         mixing = background - np.outer(background.sum(axis=1), self.shares)
@@ -313,6 +344,6 @@ class Readout:
         """The nearest of the reference materials, by its place, and v, shape (R,)."""
         row = features - self.origin
         near = int(self.near.scores(row).argmax())
-        beyond = self.gamma * (self.near.solved @ (row - self.near.means[near]))
+        beyond = self.gamma * (self.near.solved @ (row - self.near.means_at([near])[0]))
         beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
         return near, np.asarray(beyond - self.shares @ beyond)

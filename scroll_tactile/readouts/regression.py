@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.system import contrasts
+from scroll_tactile.readouts.triangle import contrasts
 
 __all__ = ["RegressionHead", "Spectrum", "fit_head"]
 

@@ -1,4 +1,4 @@
-"""How a readout is made: solved from the statistics of one moment, or read from the arrays of an earlier one.
+"""How a readout is made: solved from the statistics of one moment.
 
 Shrinkage is in closed form: how far the scatter within materials is drawn to a multiple of the identity.
 
@@ -13,27 +13,25 @@ It needs S alone, so there is nothing to hold out and nothing to choose.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Means, Numbers, Readout
-from scroll_tactile.readouts.system import System
+from scroll_tactile.readouts.readout import BLOCK, Means, Readout, Solution, about
+from scroll_tactile.readouts.triangle import InverseTriangle
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.moments import Sums, one_thread, within_scatter
+from scroll_tactile.statistics.moments import SecondMoment, Sums, one_thread, within_scatter
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["LARGEST", "LEAST", "Task", "readout_from_arrays", "readout_to_arrays", "shrinkage"]
+__all__ = ["LARGEST", "LEAST", "Task", "shrinkage"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FIRST_KNOWN = 256  # materials
 IN_DOUBLE = 1024  # materials: of more, those beyond the reference are held in single precision, within 1e-6 of scores
-AT_ONCE = 1024  # materials that are solved for at once
 # Bounds of ρ. Below LEAST the solution would not be accurate to 1e-9; above LARGEST nothing would be left of S. A
 # memory of a million touches stays above LEAST.
 LEAST, LARGEST = 1e-4, 0.99
@@ -43,13 +41,13 @@ LEAST, LARGEST = 1e-4, 0.99
 class Task:
     """The input of a readout's solution: the statistics at one moment, copied, so that solving needs no lock.
 
-    packed: A, as in SecondMoment. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
+    second: a copy, of which the thread that solves forms the products that wait. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
     shape (C, d). reference: the places of the materials that novelty and calibration use. touches: n. times: the
     factor by which the shrinkage of the formula is multiplied.
     """
 
     scale: Scale
-    packed: IntArray
+    second: SecondMoment
     names: list[str]
     counts: IntArray
     sums: Sums
@@ -65,13 +63,34 @@ class Task:
         # If no sampled touch has rows at this scale, the first materials with rows are the reference.
         known = [places[name] for name in reference if name in places] or range(min(len(names), FIRST_KNOWN))
         own = np.array(known, dtype=np.intp)
-        packed, (counts, sums) = statistics.second(scale).packed(), statistics.totals(scale)
-        return cls(scale, packed, names, counts, sums, own, statistics.touches, times)
+        counts, sums = statistics.totals(scale, names)
+        return cls(scale, statistics.second(scale).copy(), names, counts, sums, own, statistics.touches, times)
+
+    def without(self, material: str, rows: npt.NDArray[np.int32]) -> Task:
+        """The same task without a touch of these rows, codes (k, d): as if it had never been observed.
+
+        Another touch has rows at the scale. If no reference material is left, the first are the reference.
+        """
+        place = self.names.index(material)
+        second, counts, sums = self.second.copy(), self.counts.copy(), self.sums.copy()
+        second.remove(rows)
+        counts[place] -= len(rows)
+        sums[place] -= rows.sum(axis=0, dtype=np.int64).astype(sums.dtype)
+        stay, reference = np.flatnonzero(counts), self.reference[counts[self.reference] > 0]
+        return replace(
+            self,
+            second=second,
+            names=[self.names[i] for i in stay],
+            counts=counts[stay],
+            sums=sums[stay],
+            reference=np.searchsorted(stay, reference) if len(reference) else np.arange(min(len(stay), FIRST_KNOWN)),
+            touches=self.touches - 1,
+        )
 
     @property
     def scatter(self) -> FloatArray:
         """S_w, shape (d, d): the lower triangle, formed anew each time."""
-        return within_scatter(self.packed, self.counts, self.sums)
+        return within_scatter(self.second.packed(), self.counts, self.sums)
 
     @property
     def origin(self) -> FloatArray:
@@ -80,53 +99,31 @@ class Task:
             (self.sums.sum(axis=0, dtype=np.int64).astype(np.longdouble) / self.counts.sum()).astype(np.float64)
         )
 
-    def solve(self, like: Readout | None = None) -> Readout:
-        """The readout. like: an earlier one of the same reference, to which scores stay comparable.
+    def solve(self) -> Readout:
+        """The readout. Materials beyond the reference are solved for when they are first asked for.
 
         Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
         """
         origin, matrix = self.origin, self.scatter
         trace, dimension = float(np.trace(matrix)), len(matrix)
-        share = 0.0
-        if trace > 0:
-            share = shrinkage(matrix, self.touches, self.times) if like is None else like.share
+        share = shrinkage(matrix, self.touches, self.times) if trace > 0 else 0.0
         others = np.setdiff1d(np.arange(len(self.names)), self.reference)
-        order = np.concatenate([self.reference, others])
-        # Single rows have no scatter: the readout then is the nearest mean.
+        places = [self.reference, *(others[first : first + BLOCK] for first in range(0, len(others), BLOCK))]
         penalty = trace / dimension * share / (1 - share)
-        if not penalty > 0:  # an earlier one had no share of a scatter either: its penalty stays, as where it follows
-            squares = sum(float(np.square(means).sum()) for _, means in self._means(order))
-            own = max(squares / (len(order) * dimension), 1.0)
-            penalty = own if like is None or trace == 0 else like.penalty
+        if not penalty > 0:  # single rows have no scatter: the readout then is the nearest mean
+            squares = sum(float(np.square(about(self.counts[own], self.sums[own], origin)).sum()) for own in places)
+            penalty = max(squares / (len(self.names) * dimension), 1.0)
         matrix[np.diag_indices(dimension)] += penalty
-        counts = self.counts.astype(np.float64)
-        precision: FloatArray = counts.sum() / np.diagonal(matrix) if like is None else like.precision
-        single = len(self.names) > IN_DOUBLE
+        rows = int(self.counts.sum())
         with one_thread():
-            system = System(matrix)
-            del matrix  # 8 MB
-            near = self._solved(system, self.reference, np.float64)
-            rest = self._solved(system, others, np.float32 if single else np.float64)
-        numbers = Numbers(origin, counts[order], share, penalty, precision)
-        return Readout(self.scale, [self.names[place] for place in order], system, near, rest, numbers)
-
-    def _means(self, places: npt.NDArray[np.intp]) -> Iterator[tuple[slice, FloatArray]]:
-        """The means of materials at some places about the origin, (k, d) in grid units, block after block."""
-        # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
-        origin = self.origin
-        near = np.rint(origin)
-        for first in range(0, len(places), AT_ONCE):
-            own = places[first : first + AT_ONCE]
-            about = self.sums[own] - np.outer(self.counts[own], near.astype(np.int64))
-            yield slice(first, first + len(own)), about / self.counts[own, None] - (origin - near)
-
-    def _solved(self, system: System, places: npt.NDArray[np.intp], kind: type[np.floating]) -> Means:
-        """The materials at some places."""
-        shape = len(places), self.sums.shape[1]
-        found = Means(np.empty(shape, kind), np.empty(shape, kind), np.empty(len(places)))
-        for rows, means in self._means(places):
-            found.put(rows, means, system.solve(means))
-        return found
+            triangle = InverseTriangle(matrix)
+        solution = Solution(origin, triangle, rows, share, penalty, rows / np.diagonal(matrix))
+        single = len(self.names) > IN_DOUBLE
+        near, *rest = (
+            Means(self.counts[own], self.sums[own], solution, single=single and number > 0)
+            for number, own in enumerate(places)
+        )
+        return Readout(self.scale, [self.names[i] for own in places for i in own], near, rest, solution)
 
 
 def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
@@ -141,30 +138,3 @@ def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:
         return LARGEST
     ratio = ((1 - 2 / dimension) * squares + trace**2) / ((touches + 1 - 2 / dimension) * spread)
     return float(min(max(times * ratio, LEAST), LARGEST))
-
-
-PARTS = "near", "others"
-
-
-def readout_to_arrays(readout: Readout) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of a readout.
-
-    near-means, near-solved, near-sizes, and others- likewise: as `Means` has them. origin, precision: (d,). counts:
-    (C,). shape: share and penalty.
-    """
-    return {
-        **{f"{part}-{name}": array for part in PARTS for name, array in vars(getattr(readout, part)).items()},
-        "origin": readout.origin,
-        "precision": readout.precision,
-        "counts": readout.counts,
-        "shape": np.array([readout.share, readout.penalty]),
-    }
-
-
-def readout_from_arrays(scale: Scale, names: Sequence[str], arrays: Mapping[str, npt.NDArray[Any]]) -> Readout:
-    """The readout of which `readout_to_arrays` gave the arrays, which are taken over; it can follow nothing."""
-    near, others = (Means(*(arrays[f"{part}-{name}"] for name in ("means", "solved", "sizes"))) for part in PARTS)
-    origin = arrays["origin"]
-    share, penalty = arrays["shape"].tolist()
-    numbers = Numbers(origin, arrays["counts"], share, penalty, arrays["precision"])
-    return Readout(scale, names, System.unkept(len(origin)), near, others, numbers)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -123,12 +125,32 @@ class SecondMoment:
         return SecondMoment.of(self.packed() + sign * other.packed(), rows, self.dimension)
 
 
+T = TypeVar("T", bound=npt.NDArray[np.integer])
+
+
+class _Late(Generic[T]):
+    """Codes or a triangle, read when they are first needed: once for all copies, of whatever thread.
+
+    What reads them has one place in one file, and two threads would move it.
+    """
+
+    def __init__(self, read: Callable[[], T]) -> None:
+        self._read, self._lock = read, threading.Lock()
+        self._found: T | None = None
+
+    def __call__(self) -> T:
+        with self._lock:
+            if self._found is None:
+                self._found = self._read()
+            return self._found
+
+
 class _Rows:
     """All rows of a second moment, at most as many as features, with room for more; read when they are first needed."""
 
     def __init__(self, dimension: int, codes: Codes | Callable[[], Codes] | None = None) -> None:
         self._dimension = dimension
-        self._late = codes if callable(codes) else None
+        self._late = _Late(codes) if callable(codes) else None
         self._codes = np.empty((0, dimension), dtype=np.int32) if codes is None or callable(codes) else codes
         self._count = len(self._codes)
         self._packed: IntArray | None = None
@@ -187,7 +209,7 @@ class _Triangle:
     """The lower triangle of a second moment, and a block of at most 512 rows that waits to be added to it."""
 
     def __init__(self, dimension: int, packed: IntArray | Callable[[], IntArray]) -> None:
-        self._dimension, self._packed = dimension, packed
+        self._dimension, self._packed = dimension, _Late(packed) if callable(packed) else packed
         self._waiting = np.empty((0, dimension), dtype=np.int32)
         self._count = 0  # of rows that wait
 

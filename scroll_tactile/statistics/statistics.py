@@ -167,17 +167,18 @@ class Statistics:
         return [name for name, place in sorted(self._places.items()) if rows[place]]
 
     def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
-        """Rows of each material, shape (C,)."""
-        return self._rows[scale][[self._places[name] for name in names]]
+        """Rows of each material, shape (C,); zero of one that was never observed."""
+        rows, places = self._rows[scale], self._places
+        return np.array([rows[places[name]] if name in places else 0 for name in names], dtype=np.int64)
 
     def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
         """Sums of codes of each material, shape (C, d)."""
-        return self._sums[scale][[self._places[name] for name in names]].astype(np.int64)
+        return self.totals(scale, names)[1].astype(np.int64)
 
-    def totals(self, scale: Scale) -> tuple[IntArray, Sums]:
-        """Rows, shape (C,), and sums of codes, shape (C, d), of each of `names(scale)`."""
-        names = self.names(scale)
-        return self.counts(scale, names), self._sums[scale][[self._places[name] for name in names]]
+    def totals(self, scale: Scale, names: Sequence[str]) -> tuple[IntArray, Sums]:
+        """Rows, shape (C,), and sums of codes, shape (C, d), of each material; int32 while all of the scale are."""
+        places = [self._places[name] for name in names]
+        return self._rows[scale][places], self._sums[scale][places]
 
     def second(self, scale: Scale) -> SecondMoment:
         """The second moment of a scale, over all materials."""

@@ -158,7 +158,7 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     reported = [head(in_units(centre, 1.0)) for centre in centres[20:]]
     assert np.mean([item == shown[f"m{i + 20}"]["bright"] for i, item in enumerate(reported)]) >= 0.8
     # Leaving one out by the formula is leaving it out of the system.
-    counts, sums = statistics.totals(1)
+    counts, sums = statistics.totals(1, statistics.names(1))
     means = sums[:20] / counts[:20, None] - head.origin
     lower = Task.of(statistics, 1, statistics.names(1)).scatter
     scatter = np.tril(lower) + np.tril(lower, -1).T

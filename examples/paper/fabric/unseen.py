@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.readouts.attributes import GAMMAS, solve
-from scroll_tactile.readouts.system import System
 from scroll_tactile.readouts.task import Task
+from scroll_tactile.readouts.triangle import InverseTriangle
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
@@ -73,7 +73,7 @@ def fit_heads(
         # From the tamest on: of equals the first stays.
         for penalty in sorted(PENALTIES, reverse=True):
             ridge = penalty * variance * np.eye(len(task.origin))
-            solved = System(task.scatter + ridge).solve(means)
+            solved = InverseTriangle(task.scatter + ridge).solve(means)
             for gamma in sorted(GAMMAS, reverse=True):
                 system = solve(solved @ means.T, gamma).inverse
                 for key, truth in known.items():

@@ -127,7 +127,7 @@ def head_from(statistics: Statistics, penalty: float = 1.0) -> FloatArray:
     moment = np.zeros((dimension, dimension))
     moment[np.tril_indices(dimension)] = statistics.second(scale).packed()
     moment += np.tril(moment, -1).T
-    _, sums = statistics.totals(scale)
+    _, sums = statistics.totals(scale, statistics.names(scale))
     system = _with_penalty(moment, penalty * float(np.trace(moment)) / dimension)
     return np.asarray(cho_solve(cho_factor(system), sums.T.astype(np.float64)))
 

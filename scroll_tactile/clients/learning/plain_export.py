@@ -148,7 +148,7 @@ def _arrays(statistics: Statistics) -> dict[str, npt.NDArray[Any]]:
     for scale in statistics.scales:
         places = [names.index(name) for name in statistics.names(scale)]
         counts, sums = np.zeros(len(names), np.int64), np.zeros((len(names), dimension), np.int64)
-        counts[places], sums[places] = statistics.totals(scale)
+        counts[places], sums[places] = statistics.totals(scale, statistics.names(scale))
         second = np.zeros((dimension, dimension), np.int64)
         second[lower] = statistics.second(scale).packed()
         whole = second + np.tril(second, -1).T

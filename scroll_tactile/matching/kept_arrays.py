@@ -116,9 +116,7 @@ class KeptArrays:
         parts = _Parts.of(levels, max(each.shape[1] for each in levels))
         return cls([(touch.material, touch.key) for touch in kept], levels, parts)
 
-    def followed(
-        self, added: Iterable[KeptTouch], removed: Collection[tuple[str, bytes]] = ()
-    ) -> KeptArrays | None:
+    def followed(self, added: Iterable[KeptTouch], removed: Collection[tuple[str, bytes]] = ()) -> KeptArrays | None:
         """Those of these touches with others added, and without those removed; None where none is left.
 
         All is made anew where the longest touch has another length than before.

@@ -178,7 +178,15 @@ class TouchMatcher:
         both = query.seen & (best != MISSING)
         gain = float(logs.max()) / max(query.values, 1)
         return Beside(
-            query, noise, table, rows, others, logs, both, gain + query.entropy, _mean(table.expected[best[both]]) - gain
+            query,
+            noise,
+            table,
+            rows,
+            others,
+            logs,
+            both,
+            gain + query.entropy,
+            _mean(table.expected[best[both]]) - gain,
         )
 
     def result(self, beside: Beside) -> Match:

@@ -130,6 +130,14 @@ class Conformal:
         for reach in list(self._near):
             self._near[reach] = self._nearer(reach, *self._near[reach], first)
 
+    def followed(self, added, removed):  # type: ignore
+        """TEMPORARY."""
+        if any(t.levels.shape[1] > self._longest for t in added):
+            raise NotImplementedError
+        other = self.copy()
+        other.follow(list(added), set(removed))
+        return other
+
     def _index(self) -> None:
         self._materials = sorted({material for material, _ in self._touches})
         place = {material: i for i, material in enumerate(self._materials)}

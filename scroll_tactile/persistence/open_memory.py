@@ -6,7 +6,7 @@ import ctypes
 import logging
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -27,8 +27,8 @@ logger = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer")
 
-Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any], Collection[str]]
-"""Arrays, attributes, and the names of arrays that readers map."""
+Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
+"""Arrays and attributes that are stored beside a checkpoint."""
 
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
 REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
@@ -275,9 +275,9 @@ class OpenMemory:
         """Store what is derived from the memory; a failure is logged only, as the next user derives it again."""
         try:
             if (made := derived()) is not None:
-                arrays, attributes, mapped = made
+                arrays, attributes = made
                 last = self._memory.sequence
-                store.keep_derived(name, arrays, last_sequence=last, attributes=attributes, mapped=mapped)
+                store.keep_derived(name, arrays, last_sequence=last, attributes=attributes)
         except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
             logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)
 

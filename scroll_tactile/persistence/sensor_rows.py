@@ -133,7 +133,7 @@ def health_to_store(ledger: OpenMemory) -> Derived | None:
     if store is None or watched is None or watched.lost != ledger.lost:
         return None
     _take_back(store, ledger.memory, watched)
-    return *watch_to_arrays(watched), ()
+    return watch_to_arrays(watched)
 
 
 def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor: Sensor) -> dict[Stream, str]:

@@ -84,8 +84,8 @@ def answer(
         typical = _typicality(model, candidates, [touch for touch, _ in own])
     probability, novelty = judgements[0].probability, judgements[0].novelty
     if len(judgements) > 1:
-        probability = model.dependence.probability([judgement.probability for judgement in judgements])
-        novelty = model.dependence.standard([judgement.novelty for judgement in judgements])
+        probability = model.fitted.dependence.probability([judgement.probability for judgement in judgements])
+        novelty = model.fitted.dependence.standard([judgement.novelty for judgement in judgements])
     thresholds = [judgement.row.calibration.threshold(false_alarms) for judgement in judgements]
     threshold = math.fsum(thresholds) / len(thresholds)
     order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order

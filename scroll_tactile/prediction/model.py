@@ -296,7 +296,8 @@ class Model:
     def scales_for(self, candidates: Sequence[str], steps: int) -> list[Scale]:
         """The scales that are read to judge these candidates for a touch of so many steps."""
         decided = self._decided(candidates, len(self.plan.stages(steps)))
-        return sorted({scale for stage, _ in decided for scale in self.stages[stage]} | set(self.views))
+        views = self.views if steps >= self.fitted.least else ()
+        return sorted({scale for stage, _ in decided for scale in self.stages[stage]}.union(views))
 
     def judge(
         self,

@@ -22,7 +22,6 @@ from scroll_tactile.health.diagnosis import Deviation, SensorChange
 from scroll_tactile.health.watch import AT_REST, MOST_ROWS, RECENT, SCORES, STAKES, Cell, Watch, WatchedRows, WatchRules
 from scroll_tactile.results import ChangeKind
 from scroll_tactile.validation.expected import array, counts, expect, name, whole
-from scroll_tactile.validation.stored_readouts import ArrayReader
 
 __all__ = ["NAME", "watch_to_arrays", "watched_from"]
 
@@ -67,12 +66,11 @@ def watched_from(kept: Checkpoint, channels: int, rules: WatchRules, lost: int) 
     return WatchedRows(rules, watch, last=last, known=kept.last_sequence, lost=lost)
 
 
-class _WatchReader(ArrayReader):
+class _WatchReader:
     """Reads the parts of a watch that had taken the rows up to `last`; raises Unexpected for invalid ones."""
 
     def __init__(self, arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any], last: int) -> None:
-        super().__init__(arrays)
-        self._about, self._last = about, last
+        self.arrays, self._about, self._last = arrays, about, last
         names: Any = about.get("names")
         expect(isinstance(names, list) and names == sorted(set(names)), "names", "in order", names)
         self._names = [own and name("names", own) for own in names]  # "" at rest
@@ -103,6 +101,14 @@ class _WatchReader(ArrayReader):
             watch.alarmed, watch.change = watch.grew[-1][0], self._change(channels)
         expect((watch.change is None) == (self._about.get("change") is None), "change", "at an alarm", "none or one")
         return watch
+
+    def floats(
+        self, field: str, shape: tuple[int | None, ...], least: float = -LARGEST, most: float = LARGEST
+    ) -> npt.NDArray[np.float64]:
+        """Finite numbers within bounds."""
+        found = array(self.arrays, field, ("float64",), shape)
+        expect(bool(((found >= least) & (found <= most)).all()), field, f"from {least} to {most}", "others")
+        return found
 
     def rows_of_journal(self, field: str, count: int | None) -> npt.NDArray[np.int64]:
         """Rows up to the last."""

@@ -96,12 +96,12 @@ class Checkpoints:
         found = read_derived(self._folder, name, newest.sha256)
         return None if found is None else Checkpoint(newest.number, newest.last_sequence, *found)
 
-    def keep_derived(self, name: str, draft: CheckpointDraft, mapped: Collection[str]) -> None:
+    def keep_derived(self, name: str, draft: CheckpointDraft) -> None:
         """Keep what follows from the newest checkpoint, which is up to the same row, under a name."""
         with self._committing, reported(self._folder, f"keeping {name!r}"):
             newest = self._journal.current().newest
             if newest is not None and newest.last_sequence == draft.last_sequence:
-                write_derived(self._folder, name, newest.sha256, draft.attributes, draft.arrays, mapped)
+                write_derived(self._folder, name, newest.sha256, draft.attributes, draft.arrays)
 
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)

@@ -226,22 +226,13 @@ class Store:
         self._check_open()
         return self._checkpoints.derived(name)
 
-    def keep_derived(
-        self,
-        name: str,
-        arrays: Arrays,
-        *,
-        last_sequence: int,
-        attributes: Attributes = None,
-        mapped: Collection[str] = (),
-    ) -> None:
+    def keep_derived(self, name: str, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
         """Keep under a name what follows from the newest checkpoint; nothing where that is not up to the same row.
 
-        It takes the place of what was kept before, is not made durable, and is not part of copies. mapped: names of
-        arrays of numbers that `derived` maps into memory rather than reads. Raises StoreFullError, ReadOnlyError or
-        another StoreError.
+        It takes the place of what was kept before, is not made durable, and is not part of copies. Raises
+        StoreFullError, ReadOnlyError or another StoreError.
         """
-        self._checkpoints.keep_derived(name, self._draft(arrays, last_sequence, attributes), mapped)
+        self._checkpoints.keep_derived(name, self._draft(arrays, last_sequence, attributes))
 
     @property
     def newest(self) -> int | None:

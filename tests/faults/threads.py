@@ -43,12 +43,12 @@ from unittest.mock import patch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+import scroll_tactile.prediction.fusion
 from scroll_tactile_store import CompactedError
 
 import scroll_tactile.learner
 import scroll_tactile.memory.state
 import scroll_tactile.persistence.open_memory
-import scroll_tactile.prediction.fusion
 import scroll_tactile.prediction.predictor
 from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of

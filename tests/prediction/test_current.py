@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scroll_tactile.readouts.system import System
 from touches import PAD, SMALL
 
 from scroll_tactile import TactileLearner
@@ -24,7 +25,6 @@ from scroll_tactile.prediction import current
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.readout import Readout
-from scroll_tactile.readouts.system import System
 
 OBSERVED = tuple((name, seed) for seed in range(8) for name in "abc")
 FEWER = OBSERVED[:15]

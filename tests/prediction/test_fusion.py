@@ -4,10 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from scroll_tactile.matching.likelihood import CLEAN
-from scroll_tactile.matching.match import KeptTouch, Match
-from scroll_tactile.matching.matcher import matcher_of
 from scroll_tactile.prediction.fusion import (
     PRIOR_OUTLIERS,
     HeldOutMoment,
@@ -17,6 +13,10 @@ from scroll_tactile.prediction.fusion import (
     moments_of,
 )
 from scroll_tactile.prediction.moment_table import tempered
+
+from scroll_tactile.matching.likelihood import CLEAN
+from scroll_tactile.matching.match import KeptTouch, Match
+from scroll_tactile.matching.matcher import matcher_of
 from scroll_tactile.readouts.calibration import FEWEST, Calibration, HeldOutProbabilities
 
 NAMES = [f"m{i}" for i in range(5)]

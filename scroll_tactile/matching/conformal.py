@@ -17,11 +17,9 @@ are whole numbers, and sums of their squares are exact: any order gives the same
 
 from __future__ import annotations
 
-import copy
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from collections.abc import Set as AbstractSet
-from typing import Any, NamedTuple
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +30,8 @@ from scroll_tactile.matching.match import KeptTouch
 __all__ = ["Conformal", "Typicality"]
 
 FloatArray = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.intp]
+Steps = npt.NDArray[np.float32]
 
 BLOCKS, EARLIER = 25, 1.5  # of a touch, in time: their edges grow with this power, for touches differ early
 MOST_VALUES = 1024  # of a touch: sums of the squares of so many steps are below 2²⁴, and exact in single precision
@@ -56,99 +56,47 @@ class Typicality(NamedTuple):
 class Conformal:
     """Kept touches, and how typical another is of each of their materials.
 
-    The touches have one number of channels; lengths may differ. Any number of threads may read it at once. It follows
-    where nobody reads it: otherwise a copy does.
+    The touches have one number of channels; lengths may differ. Any number of threads may use it at once; nothing of
+    it changes but what it has counted before.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        longest: int,
-        touches: Sequence[KeptTouch] = (),
-        steps: npt.NDArray[np.float32] | None = None,
-    ) -> None:
-        """longest: columns of the longest touch that there may be. steps: the blocks of the touches, taken over."""
+    def __init__(self, channels: int, longest: int, touches: Sequence[tuple[str, bytes]], steps: Steps, lengths: Rows):
+        """longest: columns of the longest touch that there may be. steps, lengths: of the touches, row by row."""
         self._channels, self._longest = channels, longest
         self._edges = _edges(longest, channels)
-        self._touches = [(touch.material, touch.key) for touch in touches]
-        self._lengths = np.array([touch.levels.shape[1] for touch in touches], dtype=np.intp)
-        self._steps = np.empty((0, channels * (len(self._edges) - 1)), np.float32) if steps is None else steps
+        self._touches, self._steps, self._lengths = list(touches), steps, lengths
         self._near: dict[int, tuple[FloatArray, FloatArray]] = {}  # blocks → d_own and d_other of what is kept
-        self._squares: dict[int, npt.NDArray[np.float32] | None] = {}  # blocks → lengths, squared; None where some lack
-        self._index()
+        self._squares: dict[int, Steps | None] = {}  # blocks → lengths, squared; None where some lack
+        self._materials = sorted({material for material, _ in touches})
+        place = {material: i for i, material in enumerate(self._materials)}
+        self._places = np.array([place[material] for material, _ in touches], dtype=np.intp)
+        self._located: tuple[Sequence[str], Rows, Rows] | None = None
 
     @classmethod
     def of(cls, touches: Sequence[KeptTouch]) -> Conformal:
         """Those of some kept touches, one or more."""
-        conformal = cls(len(touches[0].levels), max(touch.levels.shape[1] for touch in touches))
-        conformal.follow(touches, set())
-        return conformal
+        channels, longest = len(touches[0].levels), max(touch.levels.shape[1] for touch in touches)
+        width = channels * (len(_edges(longest, channels)) - 1)
+        nothing = cls(channels, longest, (), np.empty((0, width), np.float32), np.empty(0, np.intp))
+        return nothing.followed(touches, ())
 
-    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """What is made of the kept touches in the order of `touches`, and of complete ones of them.
-
-        steps: (n, blocks · C). own, other: d of each from the others, by all blocks, (n,).
-        """
-        own, other = self._near_by(len(self._edges) - 1)
-        return {"steps": self._steps.astype(np.uint8), "own": own, "other": other}
-
-    @classmethod
-    def from_arrays(
-        cls, touches: Sequence[KeptTouch], arrays: Mapping[str, npt.NDArray[Any]], longest: int
-    ) -> Conformal:
-        """The kept touches of which `to_arrays` gave the arrays, which are taken over; of the same order."""
-        conformal = cls(len(touches[0].levels), longest, touches, arrays["steps"].astype(np.float32))
-        conformal._near[len(conformal._edges) - 1] = arrays["own"], arrays["other"]
-        return conformal
-
-    @staticmethod
-    def parts(count: int, channels: int, longest: int) -> dict[str, tuple[str, tuple[int, ...]]]:
-        """Name → dtype and shape of what `to_arrays` gives of so many touches."""
-        steps = channels * (len(_edges(longest, channels)) - 1)
-        return {"steps": ("uint8", (count, steps)), "own": ("float64", (count,)), "other": ("float64", (count,))}
-
-    @property
-    def touches(self) -> list[tuple[str, bytes]]:
-        """What is kept, by material and key, in its order."""
-        return self._touches
-
-    def follow(self, added: Sequence[KeptTouch], removed: AbstractSet[tuple[str, bytes]]) -> None:
-        """Take in touches no longer than the longest that were kept, and let others go, by material and key."""
-        if removed:
-            staying = [i for i, touch in enumerate(self._touches) if touch not in removed]
-            self._touches = [self._touches[i] for i in staying]
-            self._steps, self._lengths = self._steps[staying], self._lengths[staying]
-            self._near = {}
-        first = len(self._touches)
-        self._touches = [*self._touches, *((touch.material, touch.key) for touch in added)]
+    def followed(self, added: Sequence[KeptTouch], removed: Collection[tuple[str, bytes]]) -> Conformal:
+        """Those of these touches with others, no longer than the longest, and without those removed."""
+        gone = set(removed)
+        stays = np.array([touch not in gone for touch in self._touches], dtype=np.bool_)
         steps = [
             self._steps_of([touch.levels for touch in added[i : i + AT_ONCE]]) for i in range(0, len(added), AT_ONCE)
         ]
-        self._steps, self._squares = np.concatenate([self._steps, *steps], dtype=np.float32), {}
-        self._lengths = np.append(self._lengths, [touch.levels.shape[1] for touch in added]).astype(np.intp)
-        self._index()
-        for reach in list(self._near):
-            self._near[reach] = self._nearer(reach, *self._near[reach], first)
-
-    def followed(self, added, removed):  # type: ignore
-        """TEMPORARY."""
-        if any(t.levels.shape[1] > self._longest for t in added):
-            raise NotImplementedError
-        other = self.copy()
-        other.follow(list(added), set(removed))
-        return other
-
-    def _index(self) -> None:
-        self._materials = sorted({material for material, _ in self._touches})
-        place = {material: i for i, material in enumerate(self._materials)}
-        self._places = np.array([place[material] for material, _ in self._touches], dtype=np.intp)
-        self._located: tuple[Sequence[str], npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
-
-    def copy(self) -> Conformal:
-        """Another of the same touches: what comes to it does not come to this one."""
-        other = copy.copy(self)
-        # All else is replaced when it follows, and never changed.
-        other._near, other._squares = dict(self._near), dict(self._squares)
+        other = Conformal(
+            self._channels,
+            self._longest,
+            [touch for touch in self._touches if touch not in gone] + [(one.material, one.key) for one in added],
+            np.concatenate([self._steps[stays], *steps], dtype=np.float32),
+            np.append(self._lengths[stays], [touch.levels.shape[1] for touch in added]).astype(np.intp),
+        )
+        if not gone:  # else the nearest one may have gone: all is counted when it is asked for
+            for reach, near in self._near.items():
+                other._near[reach] = other._nearest(reach, *near)
         return other
 
     @property
@@ -156,7 +104,7 @@ class Conformal:
         """The materials of what is kept, in alphabetical order."""
         return self._materials
 
-    def places(self, candidates: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    def places(self, candidates: Sequence[str]) -> tuple[Rows, Rows]:
         """The materials among some, in alphabetical order, that are kept: their places in `p_rows`, and among those.
 
         Those of the last list are cached: it may be of all that a memory has.
@@ -169,16 +117,14 @@ class Conformal:
             self._located = located = candidates, rows, among
         return located[1:]
 
-    def p_values(self, levels: LevelArray) -> dict[str, Typicality]:
-        """p by material of a touch, levels (C, T); 1 of all where it is too short to be compared."""
-        values = (Typicality(*row) for row in self.p_rows(levels).tolist())
-        return dict(zip(self._materials, values, strict=True))
-
     def p_rows(self, levels: LevelArray) -> FloatArray:
-        """The same as rows of the materials in alphabetical order, (materials, 4)."""
+        """`Typicality` of a touch, levels (C, T), by material in alphabetical order, (materials, 4).
+
+        1 of all where it is too short to be compared.
+        """
         places, own_alpha, other_alpha, own = self.scores(levels)
 
-        def by_material(those: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+        def by_material(those: Rows) -> Rows:
             return np.bincount(those, minlength=len(own))
 
         at_least, count = by_material(places[own_alpha >= own[places]]) + 1, by_material(places) + 1
@@ -191,7 +137,7 @@ class Conformal:
         columns = (at_least / count, 1 / count, (others + at_least) / every, np.full(len(own), 1 / every))
         return np.stack(columns, axis=1)
 
-    def scores(self, levels: LevelArray) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray, FloatArray]:
+    def scores(self, levels: LevelArray) -> tuple[Rows, FloatArray, FloatArray, FloatArray]:
         """Of each kept touch that is as long its material's place, and α if x is of that material, and if of another.
 
         Each of shape (n,); and α(x, y) of all materials, (materials,). levels: of x, (C, T). Nothing that is kept is as
@@ -225,7 +171,7 @@ class Conformal:
         blocks: npt.NDArray[np.uint8] = np.where(counts > 0, steps, UNREAD).astype(np.uint8)
         return blocks.transpose(0, 2, 1).reshape(len(levels), -1)
 
-    def _distances(self, steps: npt.NDArray[np.uint8] | npt.NDArray[np.float32], reach: int) -> FloatArray:
+    def _distances(self, steps: npt.NDArray[np.uint8] | Steps, reach: int) -> FloatArray:
         """Squared distances of touches from all that are kept, by the blocks both have of the first: (touches, kept).
 
         Where some blocks lack they count as the others do; infinite where all lack.
@@ -245,36 +191,32 @@ class Conformal:
     def _near_by(self, reach: int) -> tuple[FloatArray, FloatArray]:
         """d_own and d_other of all that are kept, by so many blocks."""
         if reach not in self._near:
-            nothing = np.empty(0)
-            self._near[reach] = self._nearer(reach, nothing, nothing, 0)
+            self._near[reach] = self._nearest(reach, np.empty(0), np.empty(0))
         return self._near[reach]
 
-    def _nearer(self, reach: int, own: FloatArray, other: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
-        """d_own and d_other of all that are kept, where those before the row `first` have them of each other."""
-        owns, others = [own], [other]
-        own, other = own.copy(), other.copy()
-        for start in range(first, len(self._touches), AT_ONCE):
-            rows = np.arange(start, min(start + AT_ONCE, len(self._touches)))
+    def _nearest(self, reach: int, own: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """d_own and d_other of all that are kept, where the first ones have them of each other."""
+        first, count = len(own), len(self._touches)
+        own, other = (np.append(before, np.full(count - first, np.inf)) for before in (own, other))
+        for start in range(first, count, AT_ONCE):
+            rows = np.arange(start, min(start + AT_ONCE, count))
             far = self._distances(self._steps[rows], reach)
             far[np.arange(len(rows)), rows] = np.inf
             same = self._places[rows][:, None] == self._places
-            with_same, with_other = np.where(same, far, np.inf), np.where(same, np.inf, far)
-            owns.append(with_same.min(axis=1))
-            others.append(with_other.min(axis=1))
-            if first:
-                owns[0] = np.minimum(owns[0], with_same[:, :first].min(axis=0))
-                others[0] = np.minimum(others[0], with_other[:, :first].min(axis=0))
-        return np.concatenate(owns), np.concatenate(others)
+            for near, these in ((own, np.where(same, far, np.inf)), (other, np.where(same, np.inf, far))):
+                near[rows] = these.min(axis=1)
+                near[:first] = np.minimum(near[:first], these[:, :first].min(axis=0))
+        return own, other
 
 
-def _edges(longest: int, channels: int) -> npt.NDArray[np.intp]:
+def _edges(longest: int, channels: int) -> Rows:
     """The edges of the blocks of touches of so many columns at most."""
     blocks = max(1, min(BLOCKS, MOST_VALUES // channels))
     edges = np.rint(longest * (np.arange(blocks + 1) / blocks) ** EARLIER).astype(np.intp)
     return np.array(sorted(set(edges.tolist())), dtype=np.intp)
 
 
-def _least(far: FloatArray, places: npt.NDArray[np.intp], count: int) -> FloatArray:
+def _least(far: FloatArray, places: Rows, count: int) -> FloatArray:
     """The least distance of each of so many materials, (count,)."""
     least = np.full(count, np.inf)
     np.minimum.at(least, places, far)
@@ -295,7 +237,7 @@ def _nonconformity(own: FloatArray, other: FloatArray) -> FloatArray:
     return np.asarray((1 + OTHER_WEIGHT) * np.log1p(own) - OTHER_WEIGHT * np.log1p(others))
 
 
-def _common(few: Sequence[str], many: Sequence[str]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _common(few: Sequence[str], many: Sequence[str]) -> tuple[Rows, Rows]:
     """The places of what is in both of two ascending lists, in each of them."""
     found = []
     for place, name in enumerate(few):

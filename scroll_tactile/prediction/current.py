@@ -75,13 +75,14 @@ class CurrentModel:
                 self._retractions = job.retractions
         elif model is None:
             model = self._restored(ledger)
-        if model is None or behind is None or _outgrown(model, memory):
-            return self._fitted(memory)
-        if behind:
-            self._exact = False
-            if (model := model.followed(memory, behind)) is None:
-                return self._fitted(memory)
-        self._model, self._behind = model, set()
+        followed = None
+        if model is not None and behind is not None and not _outgrown(model, memory):
+            self._exact = self._exact and not behind
+            followed = model.followed(memory, behind) if behind else model
+        if followed is None:
+            return self._fitted(memory, model)
+        self._model = model = followed
+        self._behind = set()
         self.prepare(ledger)
         return model
 
@@ -123,7 +124,7 @@ class CurrentModel:
         memory = ledger.memory
         self._note_changes(ledger)
         if self._model is None or self._behind != set() or not self._exact:
-            return self._fitted(memory)
+            return self._fitted(memory, self._model)
         return self._model
 
     def _restored(self, ledger: Ledger) -> Model | None:
@@ -145,9 +146,9 @@ class CurrentModel:
             return None
         return weighing_text(self._model)
 
-    def _fitted(self, memory: Memory) -> Model:
+    def _fitted(self, memory: Memory, before: Model | None) -> Model:
         self._model, self._job = None, None
-        self._model = model = Draft.of(memory, self._kind).fit(rehearsed=self._rehearses)
+        self._model = model = Draft.of(memory, self._kind, before).fit(rehearsed=self._rehearses)
         self._behind, self._exact, self._retractions = set(), True, memory.retractions
         return model
 

@@ -31,6 +31,7 @@ from scroll_tactile.prediction.model import (
     Row,
     Trajectories,
     Weighing,
+    followed_to,
     held_out_of,
     match_scores,
     tempered,
@@ -71,8 +72,8 @@ LEAST_SPREAD, LEAST_INFORMATION, LEAST_WEIGHT = 1e-9, 1e-3, 1e-9
 class Draft:
     """The input of a fit, copied from a memory at one moment, so that fitting needs no lock.
 
-    kept: the kept touches; arrays, conformal: what an earlier model made of the very same, if it did. Raises
-    InputError, from `of`, for the ridge of more materials than it can weigh.
+    kept: the kept touches. before: an earlier model, which has arrays of most of them. Raises InputError, from `of`,
+    for the ridge of more materials than it can weigh.
     """
 
     kind: ReadoutName
@@ -90,7 +91,7 @@ class Draft:
 
     @classmethod
     def of(cls, memory: Memory, kind: ReadoutName, before: Model | None = None) -> Draft:
-        """The draft of a memory as it is now. before: a model that followed it to here."""
+        """The draft of a memory as it is now. before: an earlier model of it."""
         statistics, sample = memory.statistics, list(memory.sample)
         names = list(statistics.materials)
         if kind == "ridge" and len(names) > MOST_OF_RIDGE:
@@ -140,14 +141,15 @@ class Draft:
         )
 
     def _matched(self) -> tuple[TouchMatcher | None, Conformal | None]:
-        """What touches are matched by, where any are kept."""
+        """What touches are matched by, where any are kept; what an earlier model made of them is not made again."""
         if not self.kept:
             return None, None
-        if self.before is not None and self.before.matcher is not None and self.before.conformal is not None:
-            arrays = self.before.matcher.kept
-            if set(arrays.touches) == {(touch.material, touch.key) for touch in self.kept}:
-                return TouchMatcher.of(arrays), self.before.conformal
-        return TouchMatcher.of(KeptArrays.of(self.kept)), Conformal.of(self.kept)
+        before = self.before
+        if before is None or before.matcher is None or before.conformal is None:
+            return TouchMatcher.of(KeptArrays.of(self.kept)), Conformal.of(self.kept)
+        followed = followed_to(before.matcher.kept, before.conformal, self.kept)
+        assert followed is not None  # some are kept
+        return TouchMatcher.of(followed[0]), followed[1]
 
 
 def _weighed(draft: Draft, model: Model) -> Weighing | None:

@@ -18,7 +18,8 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.match import Match
+from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.readouts.calibration import Calibration
@@ -40,6 +41,7 @@ __all__ = [
     "Trajectories",
     "Weighing",
     "enough_memory",
+    "followed_to",
     "held_out_of",
     "match_scores",
     "softmax",
@@ -273,12 +275,9 @@ class Model:
             readouts[scale] = own
         matcher, conformal = self.matcher, self.conformal
         if matcher is not None and conformal is not None and memory.kept is not None:
-            kept, held = {(material, key) for material, key, _ in memory.kept}, set(matcher.kept.touches)
-            if kept != held:
-                added = [touch for touch in memory.kept.touches() if (touch.material, touch.key) not in held]
-                if (arrays := matcher.kept.followed(added, held - kept)) is None:
-                    return None
-                matcher, conformal = matcher.followed(arrays), conformal.followed(added, held - kept)
+            if (kept := followed_to(matcher.kept, conformal, memory.kept.touches())) is None:
+                return None
+            matcher, conformal = matcher.followed(kept[0]), kept[1]
         statistics = memory.statistics
         return replace(
             self,
@@ -296,7 +295,8 @@ class Model:
     def scales_for(self, candidates: Sequence[str], steps: int) -> list[Scale]:
         """The scales that are read to judge these candidates for a touch of so many steps."""
         decided = self._decided(candidates, len(self.plan.stages(steps)))
-        return sorted({scale for stage, _ in decided for scale in self.stages[stage]} | set(self.views))
+        views = self.views if steps >= self.fitted.least else ()
+        return sorted({scale for stage, _ in decided for scale in self.stages[stage]}.union(views))
 
     def judge(
         self,
@@ -389,6 +389,21 @@ class Model:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
         novel = [scales[place] for place in measuring(scales)]
         return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
+
+
+def followed_to(
+    arrays: KeptArrays, conformal: Conformal, kept: Sequence[KeptTouch]
+) -> tuple[KeptArrays, Conformal] | None:
+    """What is made of kept touches, for those that are kept now; None where there are none."""
+    there, now = set(arrays.touches), {(touch.material, touch.key) for touch in kept}
+    if there == now:
+        return arrays, conformal
+    added, removed = [touch for touch in kept if (touch.material, touch.key) not in there], there - now
+    if (followed := arrays.followed(added, removed)) is None:
+        return None
+    if followed.longest != arrays.longest:
+        return followed, Conformal.of(kept)
+    return followed, conformal.followed(added, removed)
 
 
 def held_out_of(

@@ -1,186 +1,115 @@
 """The weighing of a model as text in a checkpoint, so that the next opening only solves the readouts.
 
-It is some thousand numbers. A file may come from elsewhere: fields, lengths and bounds are checked against the memory,
-so that no prediction fails because of it. Whether the numbers are the fitted ones cannot be checked. What another
-release or readout wrote is not used, and the weighing is fitted anew.
+It is some thousand numbers, that have to fit the memory's scales and materials; whether they are the fitted ones cannot
+be told. What is damaged, or was written by another release or readout, is not used: the weighing is fitted anew.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Annotated
+import json
+from dataclasses import fields, is_dataclass, replace
+from functools import cache
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from scroll_tactile import __version__
 from scroll_tactile.matching.likelihood import LEVELS, Likelihood
 from scroll_tactile.matching.match import NaturalDeviation
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.model import Model, Paces, Row, Weighing
-from scroll_tactile.readouts.calibration import Calibration
-from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.prediction.model import Model, Row, Weighing
 from scroll_tactile.signals.windows import Scale, measuring
-from scroll_tactile.validation.expected import expect
 
 __all__ = ["read_weighing", "weighing_text"]
 
 MADE_BY = f"{__version__}, 1"  # the release, in which judging may differ, and the version of these fields
-Share = Annotated[float, Field(ge=0, le=1)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Above = Annotated[float, Field(gt=0)]
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-MeanAndSpread = tuple[Number, Above]
-
-
-class _Stored(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, ser_json_inf_nan="constants")
-
-
-class StoredRow(_Stored):
-    """A `Row`, its calibration among its fields."""
-
-    steps: Annotated[int, Field(ge=1)]
-    scales: list[int]
-    weights: list[Weight]
-    scale_novelty: list[MeanAndSpread]
-    median_distances: list[Annotated[float, Field(ge=0)]]
-    novelties: list[Number]
-    novelties_if_new: list[Number]
-    readout_outliers: Share
-    outliers: Share
-    distance_limit: Annotated[float, Field(ge=0)]
-    excess: MeanAndSpread
-
-    @classmethod
-    def of(cls, row: Row) -> StoredRow:
-        """What is stored of a row."""
-        arrays = {name: values.tolist() for name, values in vars(row.calibration).items()}
-        own = {name: value for name, value in vars(row).items() if name not in ("calibration", "scales", "excess")}
-        arrays["scale_novelty"] = [tuple(pair) for pair in arrays["scale_novelty"]]
-        return cls(scales=list(map(int, row.scales)), excess=row.excess, **own, **arrays)
-
-    def row(self, scales: tuple[Scale, ...]) -> Row:
-        """The row, if it is of these scales. Raises Unexpected."""
-        expect(self.scales == list(map(int, scales)), "scales", f"{scales}", self.scales)
-        lengths = len(self.weights), len(self.median_distances), len(self.scale_novelty)
-        expected = len(scales), len(scales), len(measuring(scales))
-        expect(lengths == expected, "weights", f"{expected} of them", lengths)
-        for name in ("novelties", "novelties_if_new"):
-            expect(getattr(self, name) == sorted(getattr(self, name)), name, "ascending", "others")
-        expect(len(self.novelties) == len(self.novelties_if_new), "novelties", "as many", "others")
-        calibration = Calibration(
-            np.array(self.weights),
-            np.array(self.scale_novelty).reshape(-1, 2),
-            np.array(self.median_distances),
-            np.array(self.novelties),
-            np.array(self.novelties_if_new),
-        )
-        rates = self.readout_outliers, self.outliers, self.distance_limit
-        return Row(self.steps, scales, calibration, *rates, excess=self.excess)
-
-
-class StoredDeviation(_Stored):
-    """A `NaturalDeviation`."""
-
-    spread: Annotated[list[Annotated[float, Field(ge=1, le=LEVELS)]], Field(min_length=LEVELS, max_length=LEVELS)]
-    weights: Annotated[list[Above], Field(min_length=LEVELS, max_length=LEVELS)]
-    coherence: Annotated[Number, Field(gt=0)]
-    energy: Annotated[Number, Field(gt=0)]
-    most: Above
-
-
-class StoredPaces(_Stored):
-    """A `Paces`."""
-
-    own: list[MeanAndSpread]
-    others: tuple[list[MeanAndSpread], list[MeanAndSpread]]
-
-
-class StoredWeighing(_Stored):
-    """A `Weighing`, and how the kept touches deviate, where any are kept."""
-
-    made_by: str
-    kind: str
-    rows: Annotated[list[StoredRow], Field(min_length=1)]
-    complete: StoredRow
-    paced: StoredRow
-    tau: Annotated[float, Field(gt=0, le=1)]
-    dependence: tuple[Share, Share]
-    least: Annotated[int, Field(ge=1)]
-    touches: Annotated[int, Field(ge=1)]
-    deviation: StoredDeviation | None
-    paces: StoredPaces | None
+NOT_STORED = "sample", "held_out", "trajectories"  # of a weighing: made again from the memory where they are asked for
 
 
 def weighing_text(model: Model) -> str | None:
     """The weighing of a model as JSON; None where it has none."""
-    weighing, matcher, paces = model.weighing, model.matcher, None
-    if weighing is None:
+    if model.weighing is None:
         return None
-    deviation = None
-    if matcher is not None:
-        own = matcher.deviation
-        deviation = StoredDeviation(
-            spread=own.likelihood.spread.tolist(),
-            weights=own.likelihood.weights.tolist(),
-            coherence=own.coherence,
-            energy=own.energy,
-            most=own.most,
-        )
-    if weighing.paces is not None:
-        own, *others = (
-            [tuple(pair) for pair in part.tolist()] for part in (weighing.paces.own, *weighing.paces.others)
-        )
-        paces = StoredPaces(own=own, others=tuple(others))
-    return StoredWeighing(
-        made_by=MADE_BY,
-        kind=model.kind,
-        rows=[StoredRow.of(row) for row in weighing.rows],
-        complete=StoredRow.of(weighing.complete),
-        paced=StoredRow.of(weighing.paced),
-        tau=weighing.tau,
-        dependence=(weighing.dependence.log_probability, weighing.dependence.novelty),
-        least=weighing.least,
-        touches=weighing.touches,
-        deviation=deviation,
-        paces=paces,
-    ).model_dump_json()
+    found = {"made_by": MADE_BY, "kind": model.kind, "weighing": _plain(model.weighing), "kept": None}
+    if model.matcher is not None:
+        own = model.matcher.deviation
+        tables = [own.likelihood.spread.tolist(), own.likelihood.weights.tolist()]
+        found["kept"] = [*tables, own.coherence, own.energy, own.most]
+    return json.dumps(found)
 
 
 def read_weighing(text: str, model: Model, memory: Memory) -> Model:
     """A model that was only solved, with the weighing of a text. Raises ValueError for any that does not fit it."""
-    found = StoredWeighing.model_validate_json(text)
-    for field, expected in (("made_by", MADE_BY), ("kind", model.kind)):
-        expect(getattr(found, field) == expected, field, expected, getattr(found, field))
-    reached = model.stages[: len(found.rows)]
-    expect(all(scale in model.readouts for stage in reached for scale in stage), "rows", "reached stages", len(reached))
-    expect(len(reached) == len(found.rows), "rows", f"{len(model.stages)} or fewer", len(found.rows))
-    complete = (*reached[-1], *model.views)
-    paces, matcher = None, model.matcher
-    if found.paces is not None:
-        arrays = np.array(found.paces.own), np.array(found.paces.others)
-        shape = len(measuring(model.views)) + 1, 2
-        expect(
-            bool(model.views) and [each.shape for each in arrays] == [shape, (2, *shape)], "paces", f"{shape}", "others"
-        )
-        paces = Paces(*arrays)
-    if matcher is not None:
-        expect(found.deviation is not None, "deviation", "one", None)
-        assert found.deviation is not None
-        likelihood = Likelihood(np.array(found.deviation.spread), np.array(found.deviation.weights))
-        own = NaturalDeviation(likelihood, found.deviation.coherence, found.deviation.energy, found.deviation.most)
-        matcher = TouchMatcher(matcher.kept, own)
-    weighing = Weighing(
-        rows=tuple(row.row(tuple(stage)) for row, stage in zip(found.rows, reached, strict=True)),
-        complete=found.complete.row(complete),
-        paced=found.paced.row(tuple(model.views) or complete),
-        tau=found.tau,
-        dependence=Dependence(*found.dependence),
-        least=found.least,
-        touches=found.touches,
-        sample=list(memory.sample),
-        paces=paces,
-    )
+    try:
+        found = json.loads(text)
+        if (found["made_by"], found["kind"]) != (MADE_BY, model.kind):
+            raise ValueError(f"expected one of {MADE_BY} for {model.kind}; came {found['made_by']} for {found['kind']}")
+        weighing: Weighing = _made(Weighing, found["weighing"] | {"sample": [], "held_out": None, "trajectories": None})
+        weighing.sample = list(memory.sample)
+        reached = model.stages[: len(weighing.rows)]
+        whole = [*reached[-1], *model.views]
+        scales = [*reached, whole, model.views or whole]
+        for row, own in zip([*weighing.rows, weighing.complete, weighing.paced], scales, strict=True):
+            _require_fitting(row, own, model)
+        matcher = model.matcher
+        if matcher is not None:
+            spread, weights, *natural = found["kept"]
+            tables = Likelihood(_numbers(spread, (LEVELS,)), _numbers(weights, (LEVELS,)))
+            coherence, energy, most = _numbers(natural, (3,)).tolist()
+            matcher = TouchMatcher(matcher.kept, NaturalDeviation(tables, coherence, energy, most))
+    except (KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+        raise ValueError(f"it is no weighing ({type(error).__name__}: {error})") from error
     return replace(model, weighing=weighing, matcher=matcher)
+
+
+def _require_fitting(row: Row, scales: list[Scale], model: Model) -> None:
+    calibration, count = row.calibration, len(scales)
+    if list(row.scales) != scales or not set(scales) <= model.readouts.keys():
+        raise ValueError(f"expected a row of the scales {scales}; came {row.scales}")
+    _numbers(calibration.weights, (count,))
+    _numbers(calibration.median_distances, (count,))
+    _numbers(calibration.scale_novelty, (len(measuring(scales)), 2))
+
+
+def _numbers(values: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    found = np.array(values, dtype=np.float64)
+    if found.shape != shape or np.isnan(found).any():
+        raise ValueError(f"expected {shape} numbers; came {found.shape}")
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """A weighing, or a part of one, in JSON's types."""
+    if is_dataclass(value) and not isinstance(value, Scale):
+        return {one.name: _plain(getattr(value, one.name)) for one in fields(value) if one.name not in NOT_STORED}
+    if isinstance(value, tuple):
+        return list(map(_plain, value))
+    if isinstance(value, Scale):
+        return int(value)
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _made(kind: Any, plain: Any) -> Any:
+    """What `_plain` gave, of a type, again. Raises TypeError, KeyError or ValueError for anything else."""
+    if get_origin(kind) is UnionType:  # one type or None
+        return None if plain is None else _made(get_args(kind)[0], plain)
+    if kind is Scale:
+        return Scale.numbered(plain)
+    if is_dataclass(kind):
+        hints = _hints(kind)  # type: ignore[arg-type]
+        return kind(**{one.name: _made(hints[one.name], plain[one.name]) for one in fields(kind)})  # type: ignore[operator]
+    if get_origin(kind) is tuple:
+        own = get_args(kind)
+        return tuple(_made(own[0], each) for each in plain)
+    if get_origin(kind) is np.ndarray:
+        return np.array(plain, dtype=np.float64)
+    if kind in (int, float) and (isinstance(plain, bool) or not isinstance(plain, (int, float))):
+        raise TypeError(f"expected a number; came {plain!r:.50}")
+    return kind(plain) if kind in (int, float) else plain

@@ -113,7 +113,7 @@ class Means:
             into[: len(self)] = held
             into[rows] = new
         other = Means(*own, self._solution, single=self.single)
-        stay = other.counts > 0
+        stay = slice(None) if counts.all() else other.counts > 0
         if self._solved is not None:
             parts = [np.empty((size, *held.shape[1:]), held.dtype) for held in self._solved]
             for into, held, new in zip(parts, self._solved, other._solve_at(live), strict=True):

@@ -41,9 +41,9 @@ LEAST, LARGEST = 1e-4, 0.99
 class Task:
     """The input of a readout's solution: the statistics at one moment, copied, so that solving needs no lock.
 
-    second: a copy, of which the thread that solves forms the products that wait. names: the materials with rows, counts: their rows, shape (C,), sums: of their codes,
-    shape (C, d). reference: the places of the materials that novelty and calibration use. touches: n. times: the
-    factor by which the shrinkage of the formula is multiplied.
+    second: a copy, of which the thread that solves forms the products that wait. names: the materials with rows,
+    counts: their rows, shape (C,), sums: of their codes, shape (C, d). reference: the places of the materials that
+    novelty and calibration use. touches: n. times: the factor by which the shrinkage of the formula is multiplied.
     """
 
     scale: Scale

@@ -28,8 +28,7 @@ from scroll_tactile.embeddings.convolution import (
     count_by_numpy,
 )
 from scroll_tactile.matching import comparing
-from scroll_tactile.matching.likelihood import MISSING, Table
-from scroll_tactile.matching.matcher import _Pairs
+from scroll_tactile.matching.likelihood import MISSING
 
 SOURCES = Path(native.__file__).parent
 compiled = pytest.mark.skipif(not native.available, reason=f"the compiled kernels are not at work: {native.reason}")
@@ -190,11 +189,11 @@ def test_touches_are_compared_as_by_numpy(data):
     rows = rng.choice([0, 1, 100, 254, MISSING], (others, width)).astype(np.uint8)
     guesses = rng.integers(-1024, 2041, (data.draw(st.integers(1, 5)), width)).astype(np.int16)
     known, own = rng.random(width) < 0.8, rng.integers(0, 256, width).astype(np.uint8)
-    table = Table(rng.integers(-(2**15), 2**15, 256 * 256).astype(np.int16), 0.0, 1.0, known, known, 1.0)
+    logs = rng.integers(-(2**15), 2**15, 256 * 256).astype(np.int16)
     with pytest.MonkeyPatch.context() as monkeypatch:
         by_c, by_numpy = both(
             monkeypatch,
-            lambda: (comparing.mean_distances(rows, guesses, known), _Pairs(own, rows, np.ones(others)).logs(table)),
+            lambda: (comparing.mean_distances(rows, guesses, known), comparing.log_sums(own, rows, logs)),
         )
     assert [array.tobytes() for array in by_c] == [array.tobytes() for array in by_numpy]
 

@@ -120,10 +120,12 @@ class Truth:
             ]
             self._conformal[row] = Conformal.of(kept)
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
-        found = [self._conformal[row].p_values(kept_touches.levels(once[key].readings)) for key in sorted(once)]
+        conformal = self._conformal[row]
+        rows = [conformal.p_rows(kept_touches.levels(once[key].readings)) for key in sorted(once)]
+        found = [dict(zip(conformal.materials, shares[:, 0].tolist(), strict=True)) for shares in rows]
         if len(found) == 1:
-            return tuple(found[0][name].share for name in names)
-        return tuple(min(1.0, 2 * math.fsum(of[name].share for of in found) / len(found)) for name in names)
+            return tuple(found[0][name] for name in names)
+        return tuple(min(1.0, 2 * math.fsum(of[name] for of in found) / len(found)) for name in names)
 
 
 @dataclass

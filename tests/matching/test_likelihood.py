@@ -3,10 +3,21 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, MOST_TABLES, UNIT, Likelihood, Noise, levels_of
+from scroll_tactile.matching.likelihood import (
+    AMPLITUDES,
+    CLEAN,
+    LEVELS,
+    MISSING,
+    MOST_TABLES,
+    UNIT,
+    Likelihood,
+    Noise,
+    levels_of,
+    noise_at,
+)
 from scroll_tactile.sensors import Sensor
 
-NOISES = [CLEAN, Noise(400), Noise(784), Noise(920), Noise(12, True), Noise(34, True)]
+NOISES = [CLEAN, *(Noise(step) for step in (200, 393, 461)), Noise(137, True), Noise(387, True)]
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +47,14 @@ def test_chances_are_those_of_draws(likelihood, noise, draws=200_000):
 
 
 def test_what_is_missing_says_nothing(likelihood):
-    logs = likelihood.table(Noise(784)).logs.reshape(256, 256)
+    logs = likelihood.table(Noise(393)).logs.reshape(256, 256)
     assert not logs[MISSING].any()
     assert not logs[:, MISSING].any()
 
 
 def test_noise_hides_how_touches_differ(likelihood):
     information = [
-        likelihood.table(noise).information for noise in (CLEAN, Noise(8, True), Noise(20, True), Noise(36, True))
+        likelihood.table(noise).information for noise in (CLEAN, Noise(91, True), Noise(228, True), Noise(410, True))
     ]
     assert information[0] == pytest.approx(1, abs=0.3)
     assert information == sorted(information, reverse=True)
@@ -61,10 +72,20 @@ def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):
     assert made == [*map(Noise, range(MOST_TABLES + 2)), Noise(0)]
 
 
-def test_neighbours_of_a_noise_stay_between_the_least_and_the_whole_range():
-    assert CLEAN.near(1) == [CLEAN]
-    assert Noise(1).near(1) == [Noise(0), Noise(1), Noise(2), Noise(3)]
-    assert all(0.009 < near.amplitude < 1.01 for near in Noise(923).near(8))
+def test_log_likelihoods_by_amplitude_are_those_of_the_tables():
+    """Where the spread is one for all levels, a value's is that of its deviation, and of how far in the end is."""
+    likelihood = Likelihood(np.full(LEVELS, 3.0), np.ones(LEVELS))
+    for column in (0, AMPLITUDES - 1, 393, AMPLITUDES + 100):
+        logs = likelihood.table(noise_at(column)).logs.reshape(256, 256) / UNIT
+        found = likelihood.by_amplitude[:, column]
+        away = np.arange(100)
+        assert np.allclose(found[away], logs[120 - away // 2, 120 + (away + 1) // 2], atol=1e-3)
+        for end, kept in ((0, away), (LEVELS - 1, LEVELS - 1 - away)):
+            assert np.allclose(found[256 + away], logs[end, kept], atol=1e-3)
+    assert noise_at(393) == Noise(393)
+    assert noise_at(AMPLITUDES + 100) == Noise(100, True)
+    assert Noise(AMPLITUDES - 1).amplitude == pytest.approx(1, abs=0.01)
+    assert not likelihood.by_amplitude[[255, 511]].any()
 
 
 def test_levels_of_readings():

@@ -93,12 +93,12 @@ class Likelihood:
     """The tables of one set of touches, for any number of threads.
 
     spread: standard deviation of a reading among touches of one material, in levels, for each level; shape (255,).
-    weights: how often each level is read, shape (255,).
+    weights: the share of readings at each level, shape (255,).
     """
 
     def __init__(self, spread: FloatArray, weights: FloatArray) -> None:
         self.spread = np.maximum(spread, NARROWEST)
-        self.weights = weights / weights.sum()
+        self.weights = weights
         self._tables: OrderedDict[Noise, Table] = OrderedDict()
         self._lock = threading.Lock()  # of the order of the tables; never held while one is made
 

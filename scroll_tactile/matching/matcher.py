@@ -331,7 +331,8 @@ def _likelihood(kept: KeptArrays) -> Likelihood:
     spread = (_between(deviations, least, most) + PRIOR_VALUES * typical) / (
         _between(counts, least, most) + PRIOR_VALUES
     )
-    return Likelihood(spread, counts + 1 / LEVELS)
+    weights = counts + 1 / LEVELS
+    return Likelihood(spread, weights / weights.sum())
 
 
 def _between(values: FloatArray, least: npt.NDArray[np.int_], most: npt.NDArray[np.int_]) -> FloatArray:

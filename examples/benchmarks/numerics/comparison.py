@@ -1,8 +1,7 @@
 """`python -m examples.benchmarks numerics`: what the learner runs on hard memories, what its grid costs, and its peers.
 
 Every record is one method on one case: the errors of its answers and weights, answers that it flips, seconds of the
-processor for each row, and what it says of itself. Methods are "learner", its readout solved from the integers;
-"learner, followed"; "grid", true answers for the codes against true answers for the features; and the solvers of any
+processor for each row, and what it says of itself. Methods are "learner", its readout solved from the integers; "grid", true answers for the codes against true answers for the features; and the solvers of any
 doubles, which are given the same codes, and regressions of their own that no learner meets.
 """
 
@@ -86,10 +85,10 @@ def run_numerics(
 def claims(records: list[Record]) -> Record:
     """The worst errors of what the learner runs, within the bound and below the grid, and whether they are below 1e-9.
 
-    Of the scores of both readouts and of novelty, solved and followed; of scores of touches left out; of ρ. What the
+    Of the scores of both readouts and of novelty; of scores of touches left out; of ρ. What the
     grid costs is no arithmetic: its errors stand beside.
     """
-    ours = [record for record in records if record["method"].startswith("learner") and record["family"] != "schedules"]
+    ours = [record for record in records if record["method"] == "learner" and record["family"] != "schedules"]
     fields = ("answers_error", "ridge_error", "novelty_error", "left_out_error", "share_error")
     worst = {
         name: max((record[name], record["case"]) for record in ours if record.get(name) is not None) for name in fields

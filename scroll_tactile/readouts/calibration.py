@@ -94,6 +94,15 @@ class Calibration:
         """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
         return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
 
+    def with_all_touches(self, touches: float) -> Calibration:
+        """How touches to come are read; touches: k, the median number of those materials that have two or more.
+
+        Weights are fitted to scores of touches held out, by means of the k − 1 others. New ones are scored by means of
+        k, and more surely: their weights are (k / (k − 1))^¾ times as large, a power that was best on average, from two
+        touches of a material to ten, on sixteen sets.
+        """
+        return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
+
     def relative(self, distances: FloatArray) -> FloatArray:
         """Diagonal distances in units of the median of known touches, both of shape (…, S)."""
         with np.errstate(over="ignore"):  # where known touches are all the same
@@ -255,6 +264,7 @@ class Neighbours:
         return np.sqrt(np.maximum(squares, self._least, dtype=np.float64))
 
 
+SURER = 0.75
 NEAREST = 5  # sampled touches around the nearest one; with 1, 3 or 10 it told new touches as well
 OWN = 2.0  # held-out touches expected above a material's own threshold
 TINY = 1e-300

@@ -360,3 +360,10 @@ def test_a_touch_is_known_where_hardly_any_new_one_is_as_near():
     few = thresholds([np.arange(6.0), np.arange(6.0)], [np.full(6, 900.0)] * 2)
     assert [few.known(novelty, "a", 0.05) for novelty in (0, 9, 10.5)] == [None, None, False]
     assert NoveltyThresholds().known(4.9, "a", 0.05) is None
+
+
+@pytest.mark.parametrize("touches", [1.0, 2.0, 5.0, 1000.0])
+def test_new_touches_are_scored_more_surely_than_held_out_ones_were(touches):
+    found = Calibration(np.array([0.2, 0.0]), np.zeros((1, 2)), np.ones(2)).with_all_touches(touches)
+    times = 1.0 if touches == 1 else (touches / (touches - 1)) ** 0.75
+    np.testing.assert_allclose(found.weights, [0.2 * times, 0.0])

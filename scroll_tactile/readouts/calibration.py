@@ -23,14 +23,16 @@ nearest others and |·| a distance by diagonal scatter,
 
     u(x) = log |x − s| − log mean_{r in N(s)} |s − r|.
 
-Novelty is the mean of both measures, each standardised at each scale: weights of them that were fitted gained a tenth
-more on eleven sets, and lost it on others.
+Novelty is the mean of the relative Mahalanobis distances (Ren et al. 2021), at the scales that measure it, and of u at
+the windows, each standardised by held-out touches: weights that were fitted to these gained hardly more.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +54,7 @@ __all__ = [
     "calibrate_stage",
     "fit_weights",
     "held_out_probabilities",
+    "novelty_measures",
     "scale_weights",
 ]
 
@@ -70,69 +73,6 @@ MOST_STEPS = 100
 PRIOR_TOUCHES = 0.5  # the prior counts as so many touches
 COMMON_TOUCHES = 2.0  # the common weight counts as so many, as the prior of each scale's
 LEAST_COMMON = 1e-3  # of the prior
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """How the scores and distances of one stage are to be read.
-
-    weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
-    scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
-    median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
-    touch counts alike.
-    novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
-    these touches had their own materials never been observed, sorted, shape (touches,). Both empty where too few were.
-    """
-
-    weights: FloatArray
-    scale_novelty: FloatArray
-    median_distances: FloatArray
-    novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
-    novelties_if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-    def weights_at(self, distances: FloatArray) -> FloatArray:
-        """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
-        return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
-
-    def with_all_touches(self, touches: float) -> Calibration:
-        """How touches to come are read; touches: k, the median number of those materials that have two or more.
-
-        Weights are fitted to scores of touches held out, by means of the k − 1 others. New ones are scored by means of
-        k, and more surely: their weights are (k / (k − 1))^¾ times as large, a power that was best on average, from two
-        touches of a material to ten, on sixteen sets.
-        """
-        return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
-
-    def relative(self, distances: FloatArray) -> FloatArray:
-        """Diagonal distances in units of the median of known touches, both of shape (…, S)."""
-        with np.errstate(over="ignore"):  # where known touches are all the same
-            return np.asarray(distances / np.maximum(self.median_distances, TINY))
-
-    def novelty(self, distances: FloatArray) -> FloatArray:
-        """Standardised novelty, shape (…,), of distances at the scales that measure it, shape (…, S')."""
-        mean, spread = self.scale_novelty.T
-        standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
-        return standard
-
-    def measures(self, false_alarms: float) -> bool:
-        """Whether enough known touches were held out to estimate the threshold of this false-alarm rate."""
-        return self._rank(false_alarms) <= len(self.novelties)
-
-    def detects(self, false_alarms: float) -> bool:
-        """Whether most touches would lie above the threshold of this rate, had their materials never been observed."""
-        return float(np.median(self.novelties_if_new)) > self.threshold(false_alarms)
-
-    def threshold(self, false_alarms: float) -> float:
-        """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
-        if len(self.novelties) < FEWEST:
-            return UNMEASURED
-        if not self.measures(false_alarms):
-            return float(2 * self.novelties[-1])
-        return float(self.novelties[self._rank(false_alarms) - 1])
-
-    def _rank(self, false_alarms: float) -> int:
-        """Of the conformal quantile: of n + 1 exchangeable touches no more than this share lies above it."""
-        return int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
 
 
 @dataclass(frozen=True)
@@ -160,7 +100,7 @@ class NoveltyThresholds:
         own = self.novelties[self.targets == (self.names.index(material) if material in self.names else -1)]
         if len(own) * false_alarms >= OWN:
             return _conformal(own, np.ones(len(own)), false_alarms)
-        found = _conformal(self.novelties, self._alike(), false_alarms)
+        found = _conformal(self.novelties, self._alike, false_alarms)
         return found if np.isfinite(found) else 2 * float(self.novelties.max())
 
     def below(self, false_alarms: float) -> float:
@@ -170,7 +110,7 @@ class NoveltyThresholds:
         """
         if len(np.unique(self.targets)) < 2:
             return -np.inf
-        return -_conformal(-self.if_new, self._alike(), false_alarms)
+        return -_conformal(-self.if_new, self._alike, false_alarms)
 
     def known(self, novelty: float, material: str, false_alarms: float) -> bool | None:
         """Whether a touch of this novelty that is answered `material` is of a known one; None where neither is sure."""
@@ -178,10 +118,77 @@ class NoveltyThresholds:
             return False
         return True if novelty < self.below(false_alarms) else None
 
+    @cached_property
     def _alike(self) -> FloatArray:
         """Weights of the touches, each material's of one sum and all together of N."""
         counts = np.bincount(self.targets)
         return np.asarray(len(self.targets) / (np.count_nonzero(counts) * counts[self.targets]))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """How the scores and distances of one stage are to be read.
+
+    weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
+    scale_novelty: mean and spread of the measures of novelty over known materials, shape (S', 2): the distance at each
+    scale that measures it, then u at each scale that has `Neighbours`.
+    median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
+    touch counts alike.
+    novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
+    these touches had their own materials never been observed, sorted, shape (touches,). Both empty where too few were.
+    thresholds: of the same touches, by material.
+    """
+
+    weights: FloatArray
+    scale_novelty: FloatArray
+    median_distances: FloatArray
+    novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
+    novelties_if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
+    thresholds: NoveltyThresholds = field(default_factory=NoveltyThresholds)
+
+    def weights_at(self, distances: FloatArray) -> FloatArray:
+        """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
+        return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
+
+    def with_all_touches(self, touches: float) -> Calibration:
+        """How touches to come are read; touches: k, the median number of those materials that have two or more.
+
+        Weights are fitted to scores of touches held out, by means of the k − 1 others. New ones are scored by means of
+        k, and more surely: their weights are (k / (k − 1))^¾ times as large, a power that was best on average, from two
+        touches of a material to ten, on sixteen sets.
+        """
+        return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
+
+    def relative(self, distances: FloatArray) -> FloatArray:
+        """Diagonal distances in units of the median of known touches, both of shape (…, S)."""
+        with np.errstate(over="ignore"):  # where known touches are all the same
+            return np.asarray(distances / np.maximum(self.median_distances, TINY))
+
+    def novelty(self, distances: FloatArray) -> FloatArray:
+        """Standardised novelty, shape (…,), of its measures, shape (…, S')."""
+        mean, spread = self.scale_novelty.T
+        standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
+        return standard
+
+    def measures(self, false_alarms: float) -> bool:
+        """Whether enough known touches were held out to estimate the threshold of this false-alarm rate."""
+        return self._rank(false_alarms) <= len(self.novelties)
+
+    def detects(self, false_alarms: float) -> bool:
+        """Whether most touches would lie above the threshold of this rate, had their materials never been observed."""
+        return float(np.median(self.novelties_if_new)) > self.threshold(false_alarms)
+
+    def threshold(self, false_alarms: float) -> float:
+        """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
+        if len(self.novelties) < FEWEST:
+            return UNMEASURED
+        if not self.measures(false_alarms):
+            return float(2 * self.novelties[-1])
+        return float(self.novelties[self._rank(false_alarms) - 1])
+
+    def _rank(self, false_alarms: float) -> int:
+        """Of the conformal quantile: of n + 1 exchangeable touches no more than this share lies above it."""
+        return int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
 
 
 def _conformal(values: FloatArray, weights: FloatArray, share: float) -> float:
@@ -223,13 +230,17 @@ class Neighbours:
         self._least = max(1e-6 * float(self._sizes.mean()), TINY) if rows else TINY
         self._between = self._distances(self._rows)
         np.fill_diagonal(self._between, np.inf)
+        self._around = np.log(_mean_of_nearest(self._between))
 
     def novelty(self, features: FloatArray, names: Collection[str] | None = None) -> float:
         """u of features in grid units, (d,). names: materials of whose touches one is the nearest; all unless given."""
-        left_out = np.zeros(len(self.places), np.bool_)
+        distances = self._distances(self._scaled(features[None]))
         if names is not None:
-            left_out |= [name not in names for name in self.names]
-        return float(self._local(self._distances(self._scaled(features[None])), left_out[None])[0])
+            left_out = np.array([[name not in names for name in self.names]])
+            return float(self._local(distances, left_out)[0])
+        near = int(distances.argmin())
+        around = float(self._around[near])
+        return math.log(distances[0, near]) - around if math.isfinite(around) else 0.0
 
     def held_out(self, places: Sequence[int], queries: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """u of sampled touches, each left out, (N,), and the same without all touches of their materials, (N,).
@@ -246,12 +257,9 @@ class Neighbours:
         """u by distances (N, M) from rows, of which some are left out for each, (N, M); 0 where all are but one."""
         seen = np.where(left_out, np.inf, distances)
         near = seen.argmin(axis=1)
-        nearest = np.sort(np.where(left_out, np.inf, self._between[near]), axis=1)[:, :NEAREST]
-        there = np.isfinite(nearest)
-        around = np.where(there, nearest, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-        least = seen[np.arange(len(near)), near]
-        some = there.any(axis=1)
-        return np.log(np.where(some, least, 1.0)) - np.log(np.where(some, around, 1.0))
+        around = _mean_of_nearest(np.where(left_out, np.inf, self._between[near]))
+        least = np.where(np.isfinite(around), seen[np.arange(len(near)), near], 1.0)
+        return np.asarray(np.log(least) - np.log(np.where(np.isfinite(around), around, 1.0)))
 
     def _scaled(self, features: npt.NDArray[np.number]) -> npt.NDArray[np.float32]:
         return np.asarray((features - self._origin) * self._scale, dtype=np.float32)
@@ -264,6 +272,15 @@ class Neighbours:
         return np.sqrt(np.maximum(squares, self._least, dtype=np.float64))
 
 
+def _mean_of_nearest(distances: FloatArray) -> FloatArray:
+    """The mean of the NEAREST least distances of each row that are finite, (N,); infinite where none is."""
+    nearest = np.sort(distances, axis=1)[:, :NEAREST]
+    there = np.isfinite(nearest)
+    count = there.sum(axis=1)
+    mean = np.where(there, nearest, 0.0).sum(axis=1) / np.maximum(count, 1)
+    return np.asarray(np.where(count > 0, mean, np.inf))
+
+
 SURER = 0.75
 NEAREST = 5  # sampled touches around the nearest one; with 1, 3 or 10 it told new touches as well
 OWN = 2.0  # held-out touches expected above a material's own threshold
@@ -272,12 +289,18 @@ UNMEASURED = 5.0  # spreads: where too few could be held out to measure the dist
 
 
 def calibrate_stage(
-    found: StageScores, readouts: Sequence[Readout], kind: ReadoutName, *, viewed: bool = False
+    found: StageScores,
+    readouts: Sequence[Readout],
+    kind: ReadoutName,
+    *,
+    viewed: bool = False,
+    neighbours: Sequence[Neighbours] = (),
 ) -> Calibration:
     """Calibrate one stage.
 
     found: the scores of held-out touches by each scale that judges. readouts: of these scales, in their order.
-    viewed: whether a scale's weight falls with a touch's diagonal distance.
+    viewed: whether a scale's weight falls with a touch's diagonal distance. neighbours: of the windows among the
+    scales, at the same stage; where too few touches were held out, only distances measure novelty.
     """
     scales = len(readouts)
     novel = [readouts[place] for place in measuring([readout.scale for readout in readouts])]
@@ -285,22 +308,34 @@ def calibrate_stage(
     if not found.places:
         unheld = np.full(scales, _weight_without_held_out(found.names, readouts, kind))
         return Calibration(unheld, _assumed(novel), medians)
-    scores, distances = found.scores(), found.distances().min(axis=2)
+    scores = found.scores()
     if viewed:
         away = found.diagonal_distances()
         medians = np.median(away, axis=0)
         scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
     weights = scale_weights(scores, found.targets.tolist(), PRIOR_WEIGHT[kind] / scales)
-    if len(distances) < FEWEST:
+    if len(found.places) < FEWEST:
         return Calibration(weights, _assumed(novel), medians)
-    spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
-    shape = np.stack([distances.mean(axis=0), spread], axis=1)
-    unsorted = Calibration(weights, shape, medians).novelty(distances)
-    # The mean over scales that are not fully correlated has a spread below 1: rescale it to 1.
+    measures, if_new = novelty_measures(found, neighbours)
+    spread = np.maximum(measures.std(axis=0), 1e-9 * (1 + np.abs(measures).max(axis=0)))
+    shape = np.stack([measures.mean(axis=0), spread], axis=1)
+    unsorted = Calibration(weights, shape, medians).novelty(measures)
+    # The mean over measures that are not fully correlated has a spread below 1: rescale it to 1.
     shape[:, 1] *= max(float(unsorted.std()), 1e-9)
     scaled = Calibration(weights, shape, medians)
-    novelties, if_new = (np.sort(scaled.novelty(of)) for of in (distances, found.distances_if_new()))
-    return replace(scaled, novelties=novelties, novelties_if_new=if_new)
+    known, new = scaled.novelty(measures), scaled.novelty(if_new)
+    thresholds = NoveltyThresholds(found.names, found.targets, known, new)
+    return replace(scaled, novelties=np.sort(known), novelties_if_new=np.sort(new), thresholds=thresholds)
+
+
+def novelty_measures(found: StageScores, neighbours: Sequence[Neighbours]) -> tuple[FloatArray, FloatArray]:
+    """What the novelty of N held-out touches is measured by, and the same had their own materials never been observed.
+
+    Both (N, S'): the least distance at each scale that measures novelty, then u among neighbours.
+    """
+    local = [each.held_out(found.places) for each in neighbours]
+    known, new = found.distances().min(axis=2), found.distances_if_new()
+    return np.column_stack([known, *(u for u, _ in local)]), np.column_stack([new, *(u for _, u in local)])
 
 
 @dataclass(frozen=True)
@@ -329,9 +364,9 @@ class HeldOutProbabilities:
 
 
 def held_out_probabilities(
-    found: StageScores, scales: Sequence[Scale], calibration: Calibration
+    found: StageScores, scales: Sequence[Scale], calibration: Calibration, neighbours: Sequence[Neighbours] = ()
 ) -> HeldOutProbabilities:
-    """The probabilities by some scales of the touches held out of them, as they are calibrated."""
+    """The probabilities by some scales of the touches held out of them, as they are calibrated; by the same ones."""
     diagonal, scores = found.diagonal_distances(), found.scores()
     weights = calibration.weights_at(diagonal)
     logits, distance, novelty = np.zeros((len(found.places), len(found.names))), np.zeros(0), np.zeros(0)
@@ -341,7 +376,9 @@ def held_out_probabilities(
     logits -= np.log(np.exp(logits).sum(axis=1, keepdims=True))
     if found.places:
         distance = calibration.relative(diagonal)[:, measuring(scales)].min(axis=1)
-        novelty = calibration.novelty(found.distances().min(axis=2))
+        measures, _ = novelty_measures(found, neighbours)
+        # With too few held-out touches the calibration has no u.
+        novelty = calibration.novelty(measures[:, : len(calibration.scale_novelty)])
     return HeldOutProbabilities(found.names, found.places, found.keys, found.targets, logits, distance, novelty)
 
 

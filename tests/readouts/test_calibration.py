@@ -18,6 +18,7 @@ from scroll_tactile.readouts.calibration import (
     NoveltyThresholds,
     calibrate_stage,
     fit_weights,
+    held_out_probabilities,
     scale_weights,
 )
 from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
@@ -367,3 +368,29 @@ def test_new_touches_are_scored_more_surely_than_held_out_ones_were(touches):
     found = Calibration(np.array([0.2, 0.0]), np.zeros((1, 2)), np.ones(2)).with_all_touches(touches)
     times = 1.0 if touches == 1 else (touches / (touches - 1)) ** 0.75
     np.testing.assert_allclose(found.weights, [0.2 * times, 0.0])
+
+
+@pytest.mark.parametrize("touches", [6, 60])
+def test_a_stage_with_neighbours_measures_novelty_by_both(touches):
+    """But with distances alone where too few touches are held out to know how either spreads."""
+    statistics, sample = scene(materials=3, touches=touches)
+    readouts = [Task.of(statistics, scale, statistics.names(scale)).solve() for scale in SCALES]
+    found = StageScores(1, sample, [held_out_scores(readout, sample, STAGES, "lda") for readout in readouts])
+    near = [Neighbours(readout, sample, STAGES, 1) for readout in readouts]
+    stage = calibrate_stage(found, readouts, "lda", neighbours=near)
+    assert len(stage.scale_novelty) == (4 if touches == 60 else 2)
+    held = held_out_probabilities(found, SCALES, stage, near)
+    assert len(held.novelty) == touches
+    if touches == 60:
+        distances = [found.distances().min(axis=2), *(one.held_out(found.places)[0] for one in near)]
+        measures = np.column_stack(distances)
+        mean = ((measures - measures.mean(axis=0)) / measures.std(axis=0)).mean(axis=1)
+        np.testing.assert_allclose(held.novelty, mean / mean.std(), rtol=1e-6)
+        np.testing.assert_array_equal(stage.thresholds.novelties, held.novelty)
+        assert np.mean(stage.thresholds.if_new) > 3
+        assert stage.thresholds.names == found.names
+        # Any order of observation, the same bits.
+        shuffled = TouchSample()
+        shuffled.update(list(sample)[::-1])
+        again = [Neighbours(readout, shuffled, STAGES, 1).held_out(found.places) for readout in readouts]
+        np.testing.assert_array_equal(again, [one.held_out(found.places) for one in near])

@@ -149,7 +149,7 @@ class Likelihood:
         was kept is d levels within. Columns: uniform noise by amplitude, then normal noise; see `noise_at`. Rows 255
         and 511 are 0: one of the two was not read.
         """
-        lower = np.arange(LEVELS + 1)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
+        lower = np.arange(LEVELS + 1, dtype=np.float64)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
         reach = np.array([Noise(step).amplitude for step in range(AMPLITUDES)]) * (LEVELS - 1)
         spread = float(self.weights @ self.spread)
         below = np.hstack([_below_uniform(lower, reach, spread), _below_normal(lower, reach, spread)])

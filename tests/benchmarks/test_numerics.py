@@ -4,7 +4,6 @@ import importlib.util
 import json
 import runpy
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import mpmath
@@ -83,26 +82,13 @@ class TestTruth:
 
 @pytest.mark.parametrize("memory", [*make_memories(1, 0.1)], ids=lambda memory: memory.name)
 def test_what_the_learner_runs_is_right_on_hard_memories(memory):
-    """Solved, followed and retracted, to 1e-9 of the scores; touches left out to 1e-8; ρ to its last bits."""
-    fresh, followed, grid = measure_learned(memory)
-    for found in (fresh, followed):
-        assert max(found[name] for name in ("answers_error", "ridge_error", "novelty_error")) < AGREED / 30
-        assert found["flipped"] == 0
+    """To 1e-9 of the scores; touches left out to 1e-8; ρ to its last bits."""
+    fresh, grid = measure_learned(memory)
+    assert max(fresh[name] for name in ("answers_error", "ridge_error", "novelty_error")) < AGREED / 30
+    assert fresh["flipped"] == 0
     assert fresh["share_error"] < 1e-14
     assert fresh["left_out_error"] is None or fresh["left_out_error"] < 1e-8
     assert memory.below or (grid["answers_error"] < 1e-2 and grid["flipped"] == 0)
-
-
-@pytest.mark.parametrize("louder", [3.0, 30.0, 1e3, 1e5])
-def test_a_readout_follows_touches_much_louder_than_all_before(louder):
-    """At 10⁵ it was wrong by ten thousand times the scores before it was solved again."""
-    memory = next(memory for memory in make_memories(2, 0.1) if memory.name == "every feature twice")
-    features = memory.features.copy()
-    features[:-3] /= louder
-    followed = measure_learned(replace(memory, features=features))[1]
-    assert measure_learned(memory)[1]["solved_again"] == 0
-    assert max(followed[name] for name in ("answers_error", "ridge_error", "novelty_error")) < AGREED
-    assert followed["solved_again"] >= (louder >= 1e3)
 
 
 class TestMeasuring:
@@ -228,8 +214,8 @@ def test_real_features(real_data):
     from examples.benchmarks.numerics.recorded import real_memory
 
     memory = real_memory("roboskin", real_data, 0, 64, 60)
-    fresh, followed, grid = measure_learned(memory)
-    assert max(fresh["answers_error"], followed["answers_error"]) < 1e-12
+    fresh, grid = measure_learned(memory)
+    assert fresh["answers_error"] < 1e-12
     assert grid["answers_error"] < 1e-4
-    assert fresh["flipped"] == followed["flipped"] == grid["flipped"] == 0
+    assert fresh["flipped"] == grid["flipped"] == 0
     assert measure(as_case(memory, fresh["penalty"]), "exact", 0)["weights_error"] < 2.0**-52

@@ -23,8 +23,6 @@ from __future__ import annotations
 import argparse
 import copy
 import faulthandler
-import math
-import operator
 import random
 import sys
 import threading
@@ -43,12 +41,11 @@ from unittest.mock import patch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-import scroll_tactile.prediction.fusion
 from scroll_tactile_store import CompactedError
 
 import scroll_tactile.learner
 import scroll_tactile.memory.state
-import scroll_tactile.persistence.open_memory
+import scroll_tactile.prediction.fitting
 import scroll_tactile.prediction.predictor
 from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of
@@ -70,7 +67,6 @@ TICK, HANGS = 0.1, 1200  # seconds between two looks; looks that a call may last
 SHOWN = 20  # failures of a round
 FEW = 2  # changes and touches, in place of a thousand
 
-Same = Callable[[Prediction, Prediction], bool]
 
 
 def touch(material: str, seed: int, readings: int = LENGTH) -> Array:
@@ -119,10 +115,7 @@ def learned_by(model: Any) -> Learned:
     """What the readouts of a model are of."""
     found = {}
     for scale, readout in model.readouts.items():
-        sums = np.empty((len(readout.names), len(readout.origin)))
-        for place in range(len(readout.names)):
-            held, row = readout._at(place)
-            sums[place] = (held.means[row] + readout.origin) * readout.counts[place]
+        sums = np.concatenate([part.sums for part in (readout.near, *readout.others)])
         found[int(scale)] = learned_of(readout.names, readout.counts, sums)
     return found
 
@@ -131,7 +124,7 @@ LOCAL = threading.local()
 
 
 @contextmanager
-def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
+def watched(fail: Callable[[str], None]) -> Iterator[None]:
     """While it lasts each answer is asked for twice of the model that gives it, which must stay as it is."""
     own = scroll_tactile.prediction.predictor.answer
 
@@ -140,7 +133,7 @@ def watched(fail: Callable[[str], None], same: Same) -> Iterator[None]:
         again = own(model, *rest)
         if learned_by(model) != before:
             fail("a model that an answer is of was changed meanwhile: it is of other touches")
-        elif not same(again, said):
+        elif again != said:
             fail(f"a model said {said}, and asked again {again}")
         LOCAL.learned = before
         return said
@@ -466,7 +459,7 @@ def looked_up(round_: Round) -> tuple[list[str], Counter[str]]:
     return wrong, counted
 
 
-def at_the_end(round_: Round, same: Same) -> list[str]:
+def at_the_end(round_: Round) -> list[str]:
     """What is wrong when all threads have ended: the memory must be that of what was observed, in any order."""
     learner, wrong = round_.learner, []
     store = learner._ledger.store
@@ -480,7 +473,7 @@ def at_the_end(round_: Round, same: Same) -> list[str]:
     probes = [touch(material, 7, readings) for material in FIRST for readings in (LENGTH, SHORT)]
     learner.settle()
     said = [learner.predict(probe) for probe in probes]
-    if not all(map(same, said, [alone.predict(probe) for probe in probes])):
+    if said != [alone.predict(probe) for probe in probes]:
         wrong.append("at the end, settled, it says other than a memory that observed the same in one thread")
     round_.reader.refresh()
     if round_.reader.digest() != alone.digest():
@@ -494,7 +487,7 @@ def short_fits() -> Iterator[None]:
     of_one = Likelihood(np.full(LEVELS, 4.0), np.full(LEVELS, 1 / LEVELS))
     made = lru_cache(maxsize=256)(of_one._made)
     with ExitStack() as patched:
-        patched.enter_context(patch.object(scroll_tactile.prediction.fusion, "MOST_HELD_OUT", TAKEN_OUT))
+        patched.enter_context(patch.object(scroll_tactile.prediction.fitting, "MOST_HELD_OUT", TAKEN_OUT))
         patched.enter_context(patch.object(Likelihood, "_made", lambda _, noise: made(noise)))
         yield
 
@@ -508,22 +501,9 @@ class FewSampled(TouchSample):
 
 @contextmanager
 def few_sampled() -> Iterator[None]:
-    """While it lasts few touches are sampled, and few changes followed, as if there were thousands."""
-    with ExitStack() as patched:
-        patched.enter_context(patch.object(scroll_tactile.persistence.open_memory, "MOST_ADDED", FEW))
-        patched.enter_context(patch.object(scroll_tactile.memory.state, "TouchSample", FewSampled))
+    """While it lasts few touches are sampled, as if there were thousands."""
+    with patch.object(scroll_tactile.memory.state, "TouchSample", FewSampled):
         yield
-
-
-def to_rounding(one: Prediction, other: Prediction) -> bool:
-    """Whether two predictions say the same, but for the order in which they were solved for."""
-    ours, theirs = dict(one.ranking), dict(other.ranking)
-    return (
-        ours.keys() == theirs.keys()
-        and all(math.isclose(ours[name], theirs[name], rel_tol=1e-6, abs_tol=1e-9) for name in ours)
-        and math.isclose(one.novelty, other.novelty, rel_tol=1e-6, abs_tol=1e-9)
-        and dict(zip(ours, one.typicality, strict=True)) == dict(zip(theirs, other.typicality, strict=True))
-    )
 
 
 def main(options: argparse.Namespace) -> dict[str, Any]:
@@ -536,11 +516,9 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
         while not interrupted and (not rounds or (time.monotonic() < ended and not options.quick)):
             seed = options.seed * 10_000 + rounds
             (where := home / f"round-{rounds}").mkdir()
-            many = seed % 2 == 1
-            with few_sampled() if many else nullcontext():
-                same: Same = to_rounding if many else operator.eq
+            with few_sampled() if seed % 2 else nullcontext():
                 round_ = begun(where, seed)
-                with watched(round_.failures.append, same):
+                with watched(round_.failures.append):
                     try:
                         whole = under_threads(round_, seconds, options.threads)
                     except KeyboardInterrupt:
@@ -548,7 +526,7 @@ def main(options: argparse.Namespace) -> dict[str, Any]:
                 found = list(dict.fromkeys(round_.failures))
                 if whole:
                     wrong, counted = looked_up(round_)
-                    found += [*wrong, *at_the_end(round_, same)]
+                    found += [*wrong, *at_the_end(round_)]
                     answers += counted
                     round_.reader.close()
                     round_.learner.close()

@@ -36,8 +36,8 @@ Learned = dict[int, dict[str, tuple[int, bytes]]]
 
 
 def learned_of(names: Sequence[str], counts: Array, sums: Array) -> dict[str, tuple[int, bytes]]:
-    """What is learned at one scale: of rows that were solved for the sum is an integer, to rounding."""
-    whole = np.rint(sums).astype(np.int64)
+    """What is learned at one scale: rows and their sums are integers."""
+    whole = sums.astype(np.int64)
     return {name: (int(count), total.tobytes()) for name, count, total in zip(names, counts, whole, strict=True)}
 
 

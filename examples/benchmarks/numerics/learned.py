@@ -1,4 +1,4 @@
-"""What a learner runs, measured on a memory: codes, exact sums, the readout that is solved from them and followed."""
+"""What a learner runs, measured on a memory: codes, exact sums, the readout that is solved from them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from examples.benchmarks.numerics.memories import Memory
 from examples.benchmarks.numerics.truth import Answers, TrueReadout
 from scroll_tactile.readouts.leave_one_out import held_out_scores
-from scroll_tactile.readouts.readout import Change, Readout
+from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.task import LARGEST, LEAST, Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import BITS
@@ -25,8 +25,6 @@ __all__ = [
     "asked",
     "compared",
     "flips",
-    "follow",
-    "keep_worst",
     "measure_learned",
     "name_of",
     "solved",
@@ -37,7 +35,7 @@ Scores = npt.NDArray[np.floating[Any]]
 Record = dict[str, Any]
 
 SCALE = Scale("window", 1)
-AGREED = 1e-9  # the relative error that scores of a followed readout stay below
+AGREED = 1e-9  # the relative error that scores stay below
 LEFT_OUT = 20  # touches that are really left out
 EDGE = 2.0**BITS
 MOST_DENSE = 64  # features: up to here touches are really left out
@@ -88,10 +86,10 @@ def compared(found: Answers, true: Answers) -> Record:
 
 
 def measure_learned(memory: Memory) -> list[Record]:
-    """Records of a memory: solved from the integers, followed, and what the grid costs."""
+    """Records of a memory: solved from the integers, and what the grid costs."""
     evaluated = np.rint(memory.evaluated * EDGE).astype(np.int64)
     begun = time.process_time()
-    statistics = taught(memory, len(memory.places))
+    statistics = taught(memory)
     statistics.second(SCALE).packed()
     summed = time.process_time()
     readout = solved(statistics)
@@ -118,13 +116,13 @@ def measure_learned(memory: Memory) -> list[Record]:
         **compared(true, free.answers(memory.evaluated * EDGE)),
         "weights_error": _norm_error(truth.weights(), free.weights()),
     }
-    return [base | found for found in (fresh, _followed(memory, evaluated), grid)]
+    return [base | found for found in (fresh, grid)]
 
 
-def taught(memory: Memory, count: int) -> Statistics:
-    """The statistics of the first touches of a memory."""
+def taught(memory: Memory) -> Statistics:
+    """The statistics of a memory."""
     statistics = Statistics(memory.features.shape[2], [SCALE])
-    for place, rows in zip(memory.places[:count].tolist(), memory.codes, strict=False):
+    for place, rows in zip(memory.places.tolist(), memory.codes, strict=True):
         statistics.add(name_of(place), {SCALE: rows}, 1)
     return statistics
 
@@ -137,49 +135,6 @@ def truth_of(memory: Memory, rows: npt.NDArray[Any], readout: Readout, kept: Any
 
 def _norm_error(found: FloatArray, true: FloatArray) -> float:
     return float(np.linalg.norm(found - true) / (np.linalg.norm(true) or 1.0))
-
-
-def _followed(memory: Memory, evaluated: npt.NDArray[np.int64]) -> Record:
-    """The readout of the first touches, followed to all of them: its worst errors then, when one more has come, was
-    answered for and is retracted, and when the first touch is retracted.
-    """
-    touches = [(name_of(place), rows, 1) for place, rows in zip(memory.places.tolist(), memory.codes, strict=True)]
-    rows, dimension = memory.codes.shape[1:]
-    # As many touches as a readout follows, less three changes behind them.
-    early = len(touches) - min(len(touches) // 2, max(32, dimension // 4) // rows - 3)
-    statistics = taught(memory, early)
-    readout = solved(statistics)
-    extra = np.repeat(evaluated[:1], rows, axis=0).astype(np.int32)
-    changes: list[Change] = [*touches[early:], (name_of(0), extra, 1), (name_of(0), extra, -1)]
-    compared_after = {len(touches) - early: slice(None), len(changes): slice(None)}
-    if np.count_nonzero(memory.places == memory.places[0]) > 1:
-        changes.append((*touches[0][:2], -1))
-        compared_after[len(changes)] = slice(1, None)
-    worst: Record = {"solved_again": 0}
-    spent = 0.0
-    for done, change in enumerate(changes, 1):
-        begun = time.process_time()
-        before, readout = readout, follow(statistics, readout, change)
-        readout.scores(change[1][0].astype(np.float64), range(len(readout.names)), "lda")
-        spent += time.process_time() - begun
-        worst["solved_again"] += readout is not before
-        if done in compared_after:
-            true = truth_of(memory, memory.codes, readout, compared_after[done]).answers(evaluated)
-            keep_worst(worst, compared(asked(readout, evaluated), true))
-    return {"method": "learner, followed", **worst, "seconds_per_row": spent / len(changes), "solve_seconds": 0.0}
-
-
-def keep_worst(worst: Record, errors: Record) -> None:
-    """Bring errors into the worst so far."""
-    for name, error in errors.items():
-        worst[name] = max(error, worst.get(name, 0))
-
-
-def follow(statistics: Statistics, readout: Readout, change: Change) -> Readout:
-    """Bring a change into the statistics and the readout; one solved again where it cannot follow."""
-    name, rows, sign = change
-    (statistics.add if sign > 0 else statistics.remove)(name, {SCALE: rows}, 1)
-    return readout if readout.follow([change]) else solved(statistics)
 
 
 def _shares(places: npt.NDArray[np.intp]) -> npt.NDArray[np.float64]:

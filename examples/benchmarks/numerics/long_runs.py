@@ -9,19 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.numerics.learned import SCALE, asked, compared, follow, keep_worst, name_of, solved
+from examples.benchmarks.numerics.learned import SCALE, name_of
 from examples.benchmarks.numerics.peers import Record, decided, error_of, record
 from examples.benchmarks.numerics.peers import solved as weights_of
 from examples.benchmarks.numerics.regressions import updates
-from examples.benchmarks.numerics.truth import TrueReadout, exact_weights
+from examples.benchmarks.numerics.truth import exact_weights
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.methods import SOLVERS
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
-from scroll_tactile.readouts.readout import Change
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["run_drift", "run_schedules", "run_updates"]
+__all__ = ["run_schedules", "run_updates"]
 
 FloatArray = npt.NDArray[np.float64]
 Note = Callable[[str], None]
@@ -30,56 +29,8 @@ DISTINCT = 1000  # rows of a long stream, which it repeats
 JUDGED = 20
 
 
-def run_drift(seed: int, dimension: int, count: int, note: Note) -> Iterator[Record]:
-    """Observations of one row each, all followed by the learner's readout, and a prediction after each thousandth.
-
-    The last observation is retracted right after it, predicted without, and observed again. The first thousand are
-    learned at once. Errors are the worst of
-    all predictions so far, against the truth with the same P; they are given at each power of ten.
-    """
-    rng = np.random.default_rng([seed, dimension, 3])
-    rows, targets, _ = updates(rng, dimension, DISTINCT)
-    codes, places = np.rint(rows * 2.0**20).astype(np.int32), targets.argmax(axis=1)
-    touches: list[Change] = [(name_of(y), code[None], 1) for y, code in zip(places.tolist(), codes, strict=True)]
-    exact = codes.astype(object)
-    second, sums = exact.T @ exact, targets.astype(int).T.astype(object) @ exact
-    statistics = Statistics(dimension, [SCALE])
-    for name, row, _ in touches:
-        statistics.add(name, {SCALE: row}, 1)
-    readout = solved(statistics)
-    worst: Record = {"solved_again": 0}
-    spent, evaluated = 0.0, codes[:JUDGED].astype(np.int64)
-
-    def compare(rounds: int, without: int) -> None:
-        last, own = exact[-without:] if without else exact[:0], targets[-without:] if without else targets[:0]
-        a, c = rounds * second - last.T @ last, rounds * sums - own.astype(int).T.astype(object) @ last
-        counts = (rounds * targets.sum(axis=0) - own.sum(axis=0)).astype(int).tolist()
-        true = TrueReadout.of_sums(a, c, counts, readout.penalty, readout.gamma).answers(evaluated)
-        keep_worst(worst, compared(asked(readout, evaluated), true))
-
-    for rounds in range(1, count // DISTINCT + 1):
-        fed = rounds * DISTINCT
-        note(f"{fed} observations, {dimension} features: the learner")
-        begun = time.process_time()
-        for touch in touches if rounds > 1 else ():
-            followed = follow(statistics, readout, touch)
-            worst["solved_again"] += followed is not readout
-            readout = followed
-        spent += time.process_time() - begun
-        compare(rounds, 0)
-        name, row, _ = touches[-1]
-        for sign, without in ((-1, 1), (1, 0)):
-            readout = follow(statistics, readout, (name, row, sign))
-            compare(rounds, without)
-        if fed in (10**power for power in range(4, 10)):
-            found = record(
-                _updates_name(fed, dimension), "updates", "learner, followed", fed, dimension, readout.penalty
-            )
-            yield found | worst | {"seconds_per_row": spent / (fed - DISTINCT), "solve_seconds": 0.0}
-
-
 def run_updates(seed: int, dimension: int, most: int, methods: Sequence[str], note: Note) -> Iterator[Record]:
-    """The same observations as updates of the solvers of doubles, and their errors after every power of ten."""
+    """Observations of one row each as updates of the solvers of doubles, and their errors after every power of ten."""
     rng = np.random.default_rng([seed, dimension, 3])
     rows, targets, penalty = updates(rng, dimension, DISTINCT)
     truths: dict[int, npt.NDArray[np.longdouble]] = {}

@@ -111,8 +111,9 @@ def _made(kind: Any, plain: Any) -> Any:
         hints = _hints(kind)  # type: ignore[arg-type]
         return kind(**{one.name: _made(hints[one.name], plain[one.name]) for one in fields(kind)})  # type: ignore[operator]
     if get_origin(kind) is tuple:
-        own = get_args(kind)
-        return tuple(_made(own[0], each) for each in plain)
+        first, *more = get_args(kind)
+        kinds = [first] * len(plain) if more == [...] else [first, *more]
+        return tuple(_made(own, each) for own, each in zip(kinds, plain, strict=True))
     if get_origin(kind) is np.ndarray:
         return np.array(plain, dtype=get_args(get_args(kind)[1])[0])
     if kind in (int, float) and (isinstance(plain, bool) or not isinstance(plain, (int, float))):

@@ -95,7 +95,7 @@ class Conformal:
             np.append(self._lengths[stays], [touch.levels.shape[1] for touch in added]).astype(np.intp),
         )
         if not gone:  # else the nearest one may have gone: all is counted when it is asked for
-            for reach, near in self._near.items():
+            for reach, near in list(self._near.items()):  # any thread may add to it
                 other._near[reach] = other._nearest(reach, *near)
         return other
 

@@ -93,12 +93,12 @@ class Likelihood:
     """The tables of one set of touches, for any number of threads.
 
     spread: standard deviation of a reading among touches of one material, in levels, for each level; shape (255,).
-    weights: how often each level is read, shape (255,).
+    weights: the share of readings at each level, shape (255,).
     """
 
     def __init__(self, spread: FloatArray, weights: FloatArray) -> None:
         self.spread = np.maximum(spread, NARROWEST)
-        self.weights = weights / weights.sum()
+        self.weights = weights
         self._tables: OrderedDict[Noise, Table] = OrderedDict()
         self._lock = threading.Lock()  # of the order of the tables; never held while one is made
 
@@ -149,7 +149,7 @@ class Likelihood:
         was kept is d levels within. Columns: uniform noise by amplitude, then normal noise; see `noise_at`. Rows 255
         and 511 are 0: one of the two was not read.
         """
-        lower = np.arange(LEVELS + 1)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
+        lower = np.arange(LEVELS + 1, dtype=np.float64)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
         reach = np.array([Noise(step).amplitude for step in range(AMPLITUDES)]) * (LEVELS - 1)
         spread = float(self.weights @ self.spread)
         below = np.hstack([_below_uniform(lower, reach, spread), _below_normal(lower, reach, spread)])

@@ -51,6 +51,7 @@ Rows = npt.NDArray[np.intp]
 SHORTLIST = 64  # kept touches that are compared value by value; with 32 six in 100 more are wrong through noise
 NEAR = 3 * SHORTLIST  # of which the means of wide blocks are near
 ROUGH = (CLEAN, *(Noise(step) for step in (210, 317, 393, 441)))  # under each of which one kept touch is nearest
+FINER = 5  # kept touches nearest under that noise, by which it is sought again: five in 200 more are right so
 WARMTHS = (0.03, 0.1, 0.3)  # of blends: how steeply the weight of a kept touch falls with its log-likelihood
 EXPECTED = 0.1  # the same, of what is expected where channels are stuck
 BLENDED = 3  # materials, the likeliest, that have blends
@@ -163,13 +164,11 @@ class TouchMatcher:
 
     def beside(self, query: Query, noise: Noise | None) -> Beside:
         """The touch beside the nearest kept ones under a noise; None: under the likeliest."""
+        first = self._likeliest_noise(query, self._roughly_near(query)) if noise is None else noise
+        nearest = self._nearest(query, first)
         if noise is None:
-            noise = self._likeliest_noise(query)
-        table, rows = self.deviation.likelihood.table(noise), query.rows
-        for count, blocks in zip((NEAR, SHORTLIST)[-len(query.blocks) :], query.blocks, strict=True):
-            if count < len(rows):
-                far = blocks.distances([(table.offset, table.slope)], rows)[:, 0]
-                rows = np.sort(rows[np.argpartition(far, count - 1)[:count]])
+            noise = self._likeliest_noise(query, nearest[:FINER]) if first != CLEAN else CLEAN
+        table, rows = self.deviation.likelihood.table(noise), np.sort(nearest)
         others = self._others(rows, query)
         logs = self._logs(query.levels, others, table)
         if not len(rows):
@@ -252,22 +251,33 @@ class TouchMatcher:
         both = np.count_nonzero((others != MISSING) & seen, axis=1)
         return np.asarray(np.count_nonzero(seen) / np.maximum(both, 1))
 
-    def _likeliest_noise(self, query: Query) -> Noise:
-        """The noise under which one of the nearest kept touches is likeliest: by a histogram of how far it lies."""
+    def _nearest(self, query: Query, noise: Noise) -> Rows:
+        """The rows of the kept touches nearest to the touch as it was before a noise, the nearest first."""
+        table, rows = self.deviation.likelihood.table(noise), query.rows
+        for count, blocks in zip((NEAR, SHORTLIST)[-len(query.blocks) :], query.blocks, strict=True):
+            far = blocks.distances([(table.offset, table.slope)], rows)[:, 0]
+            rows = rows[np.argsort(far, kind="stable")[:count]]
+        return rows
+
+    def _roughly_near(self, query: Query) -> Rows:
+        """The rows of the kept touches nearest under each of ROUGH."""
         tables = [self.deviation.likelihood.table(noise) for noise in ROUGH]
         far = query.blocks[0].distances([(table.offset, table.slope) for table in tables], query.rows)
-        if not len(far) or not query.values:
+        return query.rows[sorted(set(far.argmin(axis=0).tolist()))] if len(far) else query.rows
+
+    def _likeliest_noise(self, query: Query, rows: Rows) -> Noise:
+        """The noise under which one of some kept touches is likeliest, by a histogram of how far its values lie."""
+        own, likelihood = query.levels[query.seen], self.deviation.likelihood
+        if not len(rows) or not len(own):
             return CLEAN
-        rows = query.rows[sorted(set(far.argmin(axis=0).tolist()))]
-        own = query.levels[query.seen]
         others = self._others(rows, query)[:, query.seen]
         places = np.where(others == MISSING, LEVELS, np.abs(own.astype(np.int16) - others))
-        places += 256 * ((own == 0) | (own == LEVELS - 1)) + 512 * np.arange(len(rows))[:, None]
-        counts = np.bincount(places.ravel(), minlength=512 * len(rows)).reshape(len(rows), 512)
+        places += (256 * ((own == 0) | (own == LEVELS - 1))).astype(np.int16)
+        counts = np.stack([np.bincount(row, minlength=512) for row in places])
         weights = np.broadcast_to(self._weights(own, others), len(rows))
-        logs = (counts * weights[:, None]).astype(np.float32) @ self.deviation.likelihood.by_amplitude
+        logs = (counts * weights[:, None]).astype(np.float32) @ likelihood.by_amplitude
         best = int(logs.max(axis=0).argmax())
-        clean = (log_sums(own, others, tables[0].logs) / UNIT * weights).max()
+        clean = (log_sums(own, others, likelihood.table(CLEAN).logs) / UNIT * weights).max()
         return noise_at(best) if logs[:, best].max() > clean else CLEAN
 
     def _scores(self, beside: Beside) -> tuple[FloatArray, npt.NDArray[np.floating]]:
@@ -321,7 +331,8 @@ def _likelihood(kept: KeptArrays) -> Likelihood:
     spread = (_between(deviations, least, most) + PRIOR_VALUES * typical) / (
         _between(counts, least, most) + PRIOR_VALUES
     )
-    return Likelihood(spread, counts + 1 / LEVELS)
+    weights = counts + 1 / LEVELS
+    return Likelihood(spread, weights / weights.sum())
 
 
 def _between(values: FloatArray, least: npt.NDArray[np.int_], most: npt.NDArray[np.int_]) -> FloatArray:

@@ -16,7 +16,7 @@ def axis_memory(memory: Memory, axis: str) -> Memory:
     Empty where no touch has a label on the axis. It has no exemplars, descriptions or f*.
     """
     view = memory.empty_like()
-    view.exemplars, view.sequence = None, memory.sequence
+    view.exemplars, view.sequence, view.retractions = None, memory.sequence, memory.retractions
     view.statistics = memory.targets.axes.get(axis, view.statistics)
     for _, key, touch in memory.sample:
         if (label := touch.annotation.label(axis)) is not None:

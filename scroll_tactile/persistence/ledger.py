@@ -384,7 +384,7 @@ class Ledger(OpenMemory):
                 arrays, attributes = kept.to_arrays(last_sequence, exemplar_candidates(kept, store))
                 with self._mutation():
                     store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
-                    self._saved = memory.sequence
+                    self._saved, self._saved_weighings = memory.sequence, {}  # it has none
                     memory.note_compaction(last_sequence)
                 give_back_scratch()
             return Compacted(memory.compacted, before, sum(store.size().values()))

@@ -70,7 +70,8 @@ class OpenMemory:
         self.followers: list[Callable[[Sequence[Changed] | None], None]] = []
         self._load = load
         self._memory = load()
-        self._saved, self._saved_weighings = self._memory.saved, dict(self._memory.weighings)
+        self._note_saved()
+        self._saved = self._memory.saved
         self._closed = False
         self._whole = True
         self._undo: Callable[[], None] | None = None
@@ -226,15 +227,18 @@ class OpenMemory:
         except StoreError as error:
             # The journal has it all; only the next opening has more to replay.
             logger.warning("%s: no checkpoint could be written: %s", self.store.path, error)
-        self._saved = self._memory.sequence
+        self._note_saved()
         del arrays
         give_back_scratch()
 
     def _write_checkpoint(self) -> None:
         if self.store is not None:
             arrays, attributes = self._memory.to_arrays()
-            self._saved = self._memory.sequence  # even if it fails: the journal has all, and `close` must end
+            self._note_saved()  # even if it fails: the journal has all, and `close` must end
             self.store.commit(arrays, last_sequence=self._saved, attributes=attributes)
+
+    def _note_saved(self) -> None:
+        self._saved, self._saved_weighings = self._memory.sequence, dict(self._memory.weighings)
 
     def derived(self, name: str) -> Checkpoint | None:
         """The arrays stored under a name beside the checkpoint that the memory was loaded from, if any."""

@@ -38,11 +38,12 @@ FASTER = 2  # times the touches of the last fit: where there are more, or fewer 
 class _Job:
     """A fit in a thread.
 
-    retractions: of the memory when it began. changed: the materials that changed since; None where that is not known.
+    retractions, version: of the memory when it began. changed: the materials that changed since; None where that is not known.
     """
 
     future: Future[Model]
     retractions: int
+    version: int
     changed: set[str] | None = field(default_factory=set)
 
 
@@ -71,7 +72,7 @@ class CurrentModel:
         if (job := self._job) is not None and job.future.done():
             self._job = None
             if job.changed is not None and job.future.exception() is None:
-                model, behind, self._exact = job.future.result(), job.changed, not job.changed
+                model, behind, self._exact = job.future.result(), job.changed, job.version == self._version
                 self._retractions = job.retractions
         elif model is None:
             model = self._restored(ledger)
@@ -111,7 +112,7 @@ class CurrentModel:
             draft = Draft.of(memory, self._kind, model)
             self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
             fitted = self._worker.submit(draft.fit, rehearsed=self._rehearses)
-            self._job = _Job(fitted, memory.retractions)
+            self._job = _Job(fitted, memory.retractions, self._version)
 
     def rehearsed(self, ledger: Ledger) -> Model:
         """The present model with the trajectories of held-out touches; fits have them from now on."""

@@ -65,6 +65,8 @@ STEPS = 100  # of EM
 PACES = 2.0, 0.5  # times a touch's own, at which it is judged as others made faster or slower
 EVEN = 4.0  # times the energy of noise that those stay below: there the share of noise is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
+POWER_TOUCHES = 2.0  # how many touches the prior of a power, 1, counts as
+TINY = 1e-300
 LEAST_SPREAD, LEAST_INFORMATION, LEAST_WEIGHT = 1e-9, 1e-3, 1e-9
 
 
@@ -323,13 +325,13 @@ def _measured_paces(
     """As `paces_of`. chosen: row among the kept touches → place in the sample."""
     weighing, row = model.fitted, model.fitted.paced
     queries: dict[Scale, dict[int, dict[int, FloatArray]]] = {view: {} for view in model.views}
-    excess = np.zeros((len(PACES), len(weighing.sample)))
+    matches: dict[tuple[int, int], Match] = {}
     for kept, place in chosen.items():
         levels = matcher.kept.levels(kept)
         for number, pace in enumerate(PACES):
             columns = max(2, round(levels.shape[1] / pace))
             other = at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))
-            excess[number, place] = matcher.beside(matcher.query(other, whole=True, held_out=kept), CLEAN).excess
+            matches[number, place] = matcher.match(other, whole=True, held_out=kept, noise=CLEAN)
             image = extractor.image(stream_of(other, extractor.sensor))
             for view, mean in extractor.means(image, model.views).items():
                 queries[view].setdefault(place, {})[number] = mean
@@ -338,10 +340,12 @@ def _measured_paces(
         held_out_scores(model.readouts[view], weighing.sample, viewed, model.kind, queries[view])
         for view in model.views
     ]
-    others = []
+    others, logs, targets = [], list[FloatArray](), list[int]()
     for number in range(len(PACES)):
         found = StageScores(number, weighing.sample, held_out)
-        values = np.column_stack([found.distances().min(axis=2), excess[number, found.places]])
+        held = held_out_probabilities(found, model.views, row.calibration)
+        own = [matches[number, place] for place in found.places]
+        values = np.column_stack([found.distances().min(axis=2), [match.excess_loss for match in own]])
         mean, spread = values.mean(axis=0), np.maximum(values.std(axis=0), LEAST_SPREAD)
         spread *= max(float(((values - mean) / spread).mean(axis=1).std()), LEAST_SPREAD)
         novelties = np.sort(((values - mean) / spread).mean(axis=1))
@@ -349,4 +353,10 @@ def _measured_paces(
         rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
         high = float(novelties[rank]) / max(row.calibration.threshold(1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
-    return Paces(np.vstack([row.calibration.scale_novelty, row.excess]), np.stack(others))
+        for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
+            scores = match_scores(matcher, held.names, match)
+            logs.append(np.log(weighing.fused("paced", chances, match, scores, distance) + TINY))
+        targets += held.targets.tolist()
+    natural = np.vstack([row.calibration.scale_novelty, row.excess])
+    power = fit_weights(np.stack(logs)[:, None], targets, np.ones(1), POWER_TOUCHES)
+    return Paces(natural, np.stack(others), float(power[0]))

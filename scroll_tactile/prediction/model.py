@@ -130,11 +130,13 @@ class Trajectories:
 class Paces:
     """How known touches look at other paces: mean and spread of each view's distance, and of the excess loss, last.
 
-    own: at their own pace, (S' + 1, 2). others: at twice and at half of it, (2, S' + 1, 2).
+    own: at their own pace, (S' + 1, 2). others: at twice and at half of it, (2, S' + 1, 2). power: of the
+    probabilities of touches at another pace, with least log loss.
     """
 
     own: FloatArray
     others: FloatArray
+    power: float
 
     def novelty(self, values: FloatArray, pace: float) -> float:
         """The standardised novelty of distances and excess loss, (S' + 1,), of a touch so many times as fast."""
@@ -196,10 +198,10 @@ class Weighing:
 
         chances: by the readouts; scores: log-likelihoods by the kept touches; both (C,).
         """
-        weight, clear = self.distance_weight(hypothesis, distance), 1 - match.noise_share
-        sure = clear * weight
+        power = self.paces.power if hypothesis == "paced" and self.paces is not None else 1.0
+        sure = (1 - match.noise_share) * self.distance_weight(hypothesis, distance)
         beta = (BESIDE * sure + (1 - sure)) / (1 + (1 / self.tau - 1) * match.information)
-        return softmax(sure * np.log(np.maximum(chances, 1e-300)) + beta * scores)
+        return softmax(power * (sure * np.log(np.maximum(chances, 1e-300)) + beta * scores))
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
             tables = Likelihood(_numbers(spread, (LEVELS,)), _numbers(weights, (LEVELS,)))
             coherence, energy, most = _numbers(natural, (3,)).tolist()
             matcher = TouchMatcher(matcher.kept, NaturalDeviation(tables, coherence, energy, most))
-    except (KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+    except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"it is no weighing ({type(error).__name__}: {error})") from error
     return replace(model, weighing=weighing, matcher=matcher)
 

@@ -15,19 +15,32 @@ over held-out touches. So a view that a change of speed, zero or length has dist
 
 The novelty of known materials' touches is measured likewise, and an alarm's threshold is their conformal quantile (Vovk
 et al. 2005). All of these are functions of the statistics and the sample, and so of the set of observed touches.
+
+A second measure of novelty needs no materials, and finds what lies off the sampled touches in features in which no
+material differs (`Neighbours`): the distance to the nearest of them beside the distances around that one, as local
+outlier factors have it (Breunig, Kriegel, Ng and Sander 2000). With s the nearest sampled touch of x, N(s) its five
+nearest others and |·| a distance by diagonal scatter,
+
+    u(x) = log |x − s| − log mean_{r in N(s)} |s − r|.
+
+Novelty is the mean of the relative Mahalanobis distances (Ren et al. 2021), at the scales that measure it, and of u at
+the windows, each standardised by held-out touches: weights that were fitted to these gained hardly more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.leave_one_out import StageScores
+from scroll_tactile.readouts.leave_one_out import Sampled, StageScores, rows_at
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.signals.windows import Scale, measuring
+from scroll_tactile.statistics.moments import one_thread
 
 __all__ = [
     "AHEAD",
@@ -36,9 +49,12 @@ __all__ = [
     "UNMEASURED",
     "Calibration",
     "HeldOutProbabilities",
+    "Neighbours",
+    "NoveltyThresholds",
     "calibrate_stage",
     "fit_weights",
     "held_out_probabilities",
+    "novelty_measures",
     "scale_weights",
 ]
 
@@ -60,15 +76,67 @@ LEAST_COMMON = 1e-3  # of the prior
 
 
 @dataclass(frozen=True)
+class NoveltyThresholds:
+    """Up to which novelty a touch counts as one of its material, and below which as one that is known.
+
+    A material has a threshold of its own where OWN of its held-out touches are expected above it, 40 at 5 %. The others
+    share one, of all held-out touches, in which each material counts alike: else a material of hundreds of touches sets
+    it, and those of a dozen, which are known less well, are called new. Both are conformal quantiles, and hold for
+    touches that are exchangeable with the sampled ones: not for another run, speed or sensor.
+
+    names: the materials, ascending. targets: the place of each held-out touch's material among them, (N,). novelties:
+    standardised novelty of these touches, (N,). if_new: the same had their own materials never been observed, (N,).
+    """
+
+    names: Sequence[str] = ()
+    targets: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
+    if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def above(self, material: str, false_alarms: float) -> float:
+        """The novelty above which a touch that is answered `material` is new: a share `false_alarms` of known ones."""
+        if len(self.novelties) < FEWEST:
+            return UNMEASURED
+        own = self.novelties[self.targets == (self.names.index(material) if material in self.names else -1)]
+        if len(own) * false_alarms >= OWN:
+            return _conformal(own, np.ones(len(own)), false_alarms)
+        found = _conformal(self.novelties, self._alike, false_alarms)
+        return found if np.isfinite(found) else 2 * float(self.novelties.max())
+
+    def below(self, false_alarms: float) -> float:
+        """The novelty below which a touch is known: no larger a share of new ones lies there.
+
+        New ones are the held-out touches without their materials. -inf where these are too few, or of one material.
+        """
+        if len(np.unique(self.targets)) < 2:
+            return -np.inf
+        return -_conformal(-self.if_new, self._alike, false_alarms)
+
+    def known(self, novelty: float, material: str, false_alarms: float) -> bool | None:
+        """Whether a touch of this novelty that is answered `material` is of a known one; None where neither is sure."""
+        if novelty > self.above(material, false_alarms):
+            return False
+        return True if novelty < self.below(false_alarms) else None
+
+    @cached_property
+    def _alike(self) -> FloatArray:
+        """Weights of the touches, each material's of one sum and all together of N."""
+        counts = np.bincount(self.targets)
+        return np.asarray(len(self.targets) / (np.count_nonzero(counts) * counts[self.targets]))
+
+
+@dataclass(frozen=True)
 class Calibration:
     """How the scores and distances of one stage are to be read.
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
-    scale_novelty: mean and spread of the novelty of known materials at each scale that measures it, shape (S', 2).
+    scale_novelty: mean and spread of the measures of novelty over known materials, shape (S', 2): the distance at each
+    scale that measures it, then u at each scale that has `Neighbours`.
     median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
     touch counts alike.
     novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
     these touches had their own materials never been observed, sorted, shape (touches,). Both empty where too few were.
+    thresholds: of the same touches, by material.
     """
 
     weights: FloatArray
@@ -76,10 +144,20 @@ class Calibration:
     median_distances: FloatArray
     novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
     novelties_if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
+    thresholds: NoveltyThresholds = field(default_factory=NoveltyThresholds)
 
     def weights_at(self, distances: FloatArray) -> FloatArray:
         """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
         return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
+
+    def with_all_touches(self, touches: float) -> Calibration:
+        """How touches to come are read; touches: k, the median number of those materials that have two or more.
+
+        Weights are fitted to scores of touches held out, by means of the k − 1 others. New ones are scored by means of
+        k, and more surely: their weights are (k / (k − 1))^¾ times as large, a power that was best on average, from two
+        touches of a material to ten, on sixteen sets.
+        """
+        return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
 
     def relative(self, distances: FloatArray) -> FloatArray:
         """Diagonal distances in units of the median of known touches, both of shape (…, S)."""
@@ -87,7 +165,7 @@ class Calibration:
             return np.asarray(distances / np.maximum(self.median_distances, TINY))
 
     def novelty(self, distances: FloatArray) -> FloatArray:
-        """Standardised novelty, shape (…,), of distances at the scales that measure it, shape (…, S')."""
+        """Standardised novelty, shape (…,), of its measures, shape (…, S')."""
         mean, spread = self.scale_novelty.T
         standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
         return standard
@@ -113,17 +191,116 @@ class Calibration:
         return int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
 
 
+def _conformal(values: FloatArray, weights: FloatArray, share: float) -> float:
+    """The least value above which no more than this share of the weight lies, with a new one's of 1; inf if none is.
+
+    Of weights that are equal it is the conformal quantile: of n + 1 exchangeable values the new one lies above it with
+    no larger probability. Weighted ones: Tibshirani, Foygel Barber, Candès and Ramdas 2019, arXiv 1904.06019.
+    """
+    order = np.argsort(-values, kind="stable")
+    above = np.concatenate([[0.0], np.cumsum(weights[order])[:-1]])
+    allowed = share * (weights.sum() + 1) - 1
+    within = int(np.count_nonzero(above <= allowed + 1e-9 * weights.sum()))
+    return float(values[order[within - 1]]) if within else np.inf
+
+
+class Neighbours:
+    """The rows of one scale that sampled touches have at one stage, among which a touch lies near one or near none.
+
+    readout: of the scale. sample: of which the calibration is made. stages: the scales that judge at each. stage: whose
+    rows. Rows are scaled to a spread of 1 within materials and held in single precision: 1 MB of 256 touches.
+
+    places: of the touches among the sample that have such a row, ascending. names: their materials.
+    """
+
+    def __init__(self, readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]], stage: int) -> None:
+        self._origin, self._scale = readout.origin, np.sqrt(readout.precision)
+        self.places: list[int] = []
+        self.names: list[str] = []
+        rows = []
+        for place, (material, _, touch) in enumerate(sample):
+            for row in rows_at(touch, stages, readout.scale):
+                if touch.pairs[row, 0] == stage:
+                    self.places.append(place)
+                    self.names.append(material)
+                    rows.append(touch.rows[row])
+        self._rows = self._scaled(np.array(rows).reshape(len(rows), len(self._origin)))
+        self._sizes = np.square(self._rows).sum(axis=1)
+        # Nearer than it is rounded no distance is told from 0.
+        self._least = max(1e-6 * float(self._sizes.mean()), TINY) if rows else TINY
+        self._between = self._distances(self._rows)
+        np.fill_diagonal(self._between, np.inf)
+        self._around = np.log(_mean_of_nearest(self._between))
+
+    def novelty(self, features: FloatArray, names: Collection[str] | None = None) -> float:
+        """u of features in grid units, (d,). names: materials of whose touches one is the nearest; all unless given."""
+        distances = self._distances(self._scaled(features[None]))
+        if names is not None:
+            left_out = np.array([[name not in names for name in self.names]])
+            return float(self._local(distances, left_out)[0])
+        near = int(distances.argmin())
+        around = float(self._around[near])
+        return math.log(distances[0, near]) - around if math.isfinite(around) else 0.0
+
+    def held_out(self, places: Sequence[int], queries: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """u of sampled touches, each left out, (N,), and the same without all touches of their materials, (N,).
+
+        places: of these touches in the sample. queries: features in grid units that stand for theirs, (N, d).
+        """
+        at = np.searchsorted(self.places, places)
+        distances = self._between[at] if queries is None else self._distances(self._scaled(queries))
+        kinds = np.unique(self.names, return_inverse=True)[1]
+        itself = at[:, None] == np.arange(len(self.places))
+        return self._local(distances, itself), self._local(distances, kinds[at][:, None] == kinds)
+
+    def _local(self, distances: FloatArray, left_out: npt.NDArray[np.bool_]) -> FloatArray:
+        """u by distances (N, M) from rows, of which some are left out for each, (N, M); 0 where all are but one."""
+        seen = np.where(left_out, np.inf, distances)
+        near = seen.argmin(axis=1)
+        around = _mean_of_nearest(np.where(left_out, np.inf, self._between[near]))
+        least = np.where(np.isfinite(around), seen[np.arange(len(near)), near], 1.0)
+        return np.asarray(np.log(least) - np.log(np.where(np.isfinite(around), around, 1.0)))
+
+    def _scaled(self, features: npt.NDArray[np.number]) -> npt.NDArray[np.float32]:
+        return np.asarray((features - self._origin) * self._scale, dtype=np.float32)
+
+    def _distances(self, rows: npt.NDArray[np.float32]) -> FloatArray:
+        """Distances of scaled rows (N, d) from all rows, (N, M)."""
+        with one_thread():
+            products = rows @ self._rows.T
+        squares = np.square(rows).sum(axis=1)[:, None] + self._sizes - 2 * products
+        return np.sqrt(np.maximum(squares, self._least, dtype=np.float64))
+
+
+def _mean_of_nearest(distances: FloatArray) -> FloatArray:
+    """The mean of the NEAREST least distances of each row that are finite, (N,); infinite where none is."""
+    nearest = np.sort(distances, axis=1)[:, :NEAREST]
+    there = np.isfinite(nearest)
+    count = there.sum(axis=1)
+    mean = np.where(there, nearest, 0.0).sum(axis=1) / np.maximum(count, 1)
+    return np.asarray(np.where(count > 0, mean, np.inf))
+
+
+SURER = 0.75
+NEAREST = 5  # sampled touches around the nearest one; with 1, 3 or 10 it told new touches as well
+OWN = 2.0  # held-out touches expected above a material's own threshold
 TINY = 1e-300
 UNMEASURED = 5.0  # spreads: where too few could be held out to measure the distances of known touches
 
 
 def calibrate_stage(
-    found: StageScores, readouts: Sequence[Readout], kind: ReadoutName, *, viewed: bool = False
+    found: StageScores,
+    readouts: Sequence[Readout],
+    kind: ReadoutName,
+    *,
+    viewed: bool = False,
+    neighbours: Sequence[Neighbours] = (),
 ) -> Calibration:
     """Calibrate one stage.
 
     found: the scores of held-out touches by each scale that judges. readouts: of these scales, in their order.
-    viewed: whether a scale's weight falls with a touch's diagonal distance.
+    viewed: whether a scale's weight falls with a touch's diagonal distance. neighbours: of the windows among the
+    scales, at the same stage; where too few touches were held out, only distances measure novelty.
     """
     scales = len(readouts)
     novel = [readouts[place] for place in measuring([readout.scale for readout in readouts])]
@@ -131,22 +308,34 @@ def calibrate_stage(
     if not found.places:
         unheld = np.full(scales, _weight_without_held_out(found.names, readouts, kind))
         return Calibration(unheld, _assumed(novel), medians)
-    scores, distances = found.scores(), found.distances().min(axis=2)
+    scores = found.scores()
     if viewed:
         away = found.diagonal_distances()
         medians = np.median(away, axis=0)
         scores *= np.minimum(1.0, medians / np.maximum(away, TINY))[:, :, None]
     weights = scale_weights(scores, found.targets.tolist(), PRIOR_WEIGHT[kind] / scales)
-    if len(distances) < FEWEST:
+    if len(found.places) < FEWEST:
         return Calibration(weights, _assumed(novel), medians)
-    spread = np.maximum(distances.std(axis=0), 1e-9 * (1 + np.abs(distances).max(axis=0)))
-    shape = np.stack([distances.mean(axis=0), spread], axis=1)
-    unsorted = Calibration(weights, shape, medians).novelty(distances)
-    # The mean over scales that are not fully correlated has a spread below 1: rescale it to 1.
+    measures, if_new = novelty_measures(found, neighbours)
+    spread = np.maximum(measures.std(axis=0), 1e-9 * (1 + np.abs(measures).max(axis=0)))
+    shape = np.stack([measures.mean(axis=0), spread], axis=1)
+    unsorted = Calibration(weights, shape, medians).novelty(measures)
+    # The mean over measures that are not fully correlated has a spread below 1: rescale it to 1.
     shape[:, 1] *= max(float(unsorted.std()), 1e-9)
     scaled = Calibration(weights, shape, medians)
-    novelties, if_new = (np.sort(scaled.novelty(of)) for of in (distances, found.distances_if_new()))
-    return replace(scaled, novelties=novelties, novelties_if_new=if_new)
+    known, new = scaled.novelty(measures), scaled.novelty(if_new)
+    thresholds = NoveltyThresholds(found.names, found.targets, known, new)
+    return replace(scaled, novelties=np.sort(known), novelties_if_new=np.sort(new), thresholds=thresholds)
+
+
+def novelty_measures(found: StageScores, neighbours: Sequence[Neighbours]) -> tuple[FloatArray, FloatArray]:
+    """What the novelty of N held-out touches is measured by, and the same had their own materials never been observed.
+
+    Both (N, S'): the least distance at each scale that measures novelty, then u among neighbours.
+    """
+    local = [each.held_out(found.places) for each in neighbours]
+    known, new = found.distances().min(axis=2), found.distances_if_new()
+    return np.column_stack([known, *(u for u, _ in local)]), np.column_stack([new, *(u for _, u in local)])
 
 
 @dataclass(frozen=True)
@@ -175,9 +364,9 @@ class HeldOutProbabilities:
 
 
 def held_out_probabilities(
-    found: StageScores, scales: Sequence[Scale], calibration: Calibration
+    found: StageScores, scales: Sequence[Scale], calibration: Calibration, neighbours: Sequence[Neighbours] = ()
 ) -> HeldOutProbabilities:
-    """The probabilities by some scales of the touches held out of them, as they are calibrated."""
+    """The probabilities by some scales of the touches held out of them, as they are calibrated; by the same ones."""
     diagonal, scores = found.diagonal_distances(), found.scores()
     weights = calibration.weights_at(diagonal)
     logits, distance, novelty = np.zeros((len(found.places), len(found.names))), np.zeros(0), np.zeros(0)
@@ -187,7 +376,9 @@ def held_out_probabilities(
     logits -= np.log(np.exp(logits).sum(axis=1, keepdims=True))
     if found.places:
         distance = calibration.relative(diagonal)[:, measuring(scales)].min(axis=1)
-        novelty = calibration.novelty(found.distances().min(axis=2))
+        measures, _ = novelty_measures(found, neighbours)
+        # With too few held-out touches the calibration has no u.
+        novelty = calibration.novelty(measures[:, : len(calibration.scale_novelty)])
     return HeldOutProbabilities(found.names, found.places, found.keys, found.targets, logits, distance, novelty)
 
 

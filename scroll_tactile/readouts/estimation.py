@@ -188,6 +188,8 @@ def _lacking(targets: FloatArray, materials: Sequence[str]) -> str:
 def _estimate(
     heads: Heads | str, quantity: Quantity, features: Sequence[FloatArray], risk: float, *, known: bool
 ) -> Estimate:
+    if not isinstance(heads, str) and len(features) < len(heads.known.weights):
+        heads = "the sampled touches that carry a value are longer than this one; observe some as short, with a value"
     if isinstance(heads, str):
         return Estimate(value=None, low=None, high=None, unit=quantity.unit, risk=risk, known=known, missing=heads)
     head = heads.known if known else heads.new

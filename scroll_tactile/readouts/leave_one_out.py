@@ -196,7 +196,7 @@ class _Leaving:
         near = white @ self.basis
         rest = (white - near @ self.basis.T).reshape(vectors.shape)
         # The triangle of a QR, which equal rows do not make singular, as they make their Gram matrix.
-        beyond = np.linalg.qr(rest.transpose(0, 2, 1), mode="r").transpose(0, 2, 1)
+        beyond = np.asarray(np.linalg.qr(rest.transpose(0, 2, 1), mode="r")).transpose(0, 2, 1)
         found = np.zeros((*vectors.shape[:2], self.means.shape[1]))
         found[:, :, : near.shape[1]] = near.reshape(*vectors.shape[:2], -1)
         found[:, :, near.shape[1] : near.shape[1] + beyond.shape[2]] = beyond

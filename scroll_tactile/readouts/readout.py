@@ -27,7 +27,7 @@ from bisect import bisect_right
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -108,18 +108,18 @@ class Means:
         Rows past the end are appended; materials without rows any more are taken out.
         """
         size, live = max(len(self), *(row + 1 for row in rows)), [row for row, n in zip(rows, counts, strict=True) if n]
-        own = np.empty(size, np.int64), np.empty((size, sums.shape[1]), np.result_type(self.sums, sums))
-        for into, held, new in zip(own, (self.counts, self.sums), (counts, sums), strict=True):
-            into[: len(self)] = held
-            into[rows] = new
-        other = Means(*own, self._solution, single=self.single)
+
+        def put(held: npt.NDArray[Any], into: Sequence[int], new: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            found = np.empty((size, *held.shape[1:]), np.result_type(held, new))
+            found[: len(self)] = held
+            found[into] = new
+            return found
+
+        other = Means(put(self.counts, rows, counts), put(self.sums, rows, sums), self._solution, single=self.single)
         stay = slice(None) if counts.all() else other.counts > 0
         if self._solved is not None:
-            parts = [np.empty((size, *held.shape[1:]), held.dtype) for held in self._solved]
-            for into, held, new in zip(parts, self._solved, other._solve_at(live), strict=True):
-                into[: len(self)] = held
-                into[live] = new
-            other._solved = parts[0][stay], parts[1][stay]
+            solved, sizes = other._solve_at(live)
+            other._solved = put(self._solved[0], live, solved)[stay], put(self._solved[1], live, sizes)[stay]
         other.counts, other.sums = other.counts[stay], other.sums[stay]
         return other
 

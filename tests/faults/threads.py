@@ -483,7 +483,7 @@ def at_the_end(round_: Round) -> list[str]:
 @contextmanager
 def short_fits() -> Iterator[None]:
     """While it lasts a fit takes few touches out, and all have the tables of one set of touches: they take longest."""
-    of_one = Likelihood(np.full(LEVELS, 4.0), np.ones(LEVELS))
+    of_one = Likelihood(np.full(LEVELS, 4.0), np.full(LEVELS, 1 / LEVELS))
     made = lru_cache(maxsize=256)(of_one._made)
     with ExitStack() as patched:
         patched.enter_context(patch.object(scroll_tactile.prediction.fitting, "MOST_HELD_OUT", TAKEN_OUT))

@@ -22,7 +22,7 @@ NOISES = [CLEAN, *(Noise(step) for step in (200, 393, 461)), Noise(137, True), N
 
 @pytest.fixture(scope="module")
 def likelihood():
-    return Likelihood(1 + 0.05 * np.arange(LEVELS), np.ones(LEVELS))
+    return Likelihood(1 + 0.05 * np.arange(LEVELS), np.full(LEVELS, 1 / LEVELS))
 
 
 @pytest.mark.parametrize("noise", NOISES)
@@ -74,7 +74,7 @@ def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):
 
 def test_log_likelihoods_by_amplitude_are_those_of_the_tables():
     """Where the spread is one for all levels, a value's is that of its deviation, and of how far in the end is."""
-    likelihood = Likelihood(np.full(LEVELS, 3.0), np.ones(LEVELS))
+    likelihood = Likelihood(np.full(LEVELS, 3.0), np.full(LEVELS, 1 / LEVELS))
     for column in (0, AMPLITUDES - 1, 393, AMPLITUDES + 100):
         logs = likelihood.table(noise_at(column)).logs.reshape(256, 256) / UNIT
         found = likelihood.by_amplitude[:, column]

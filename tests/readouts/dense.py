@@ -12,10 +12,11 @@ class Dense:
     """A readout of rows by material, each a pair of a row of integers and how often it counts.
 
     penalty, share: P and ρ. reference: the materials that novelty and the ridge rest on. total: N, where it is not the
-    sum of the counts; excess: N over the counts of the reference, likewise.
+    sum of the counts; excess: N over the counts of the reference, likewise. solved: the readout that this one followed,
+    of which it has the scatter within materials, and N.
     """
 
-    def __init__(self, groups, penalty, share, reference=None, total=None, excess=None):
+    def __init__(self, groups, penalty, share, reference=None, total=None, excess=None, solved=None):
         self.groups, self.names, self.penalty, self.share = groups, sorted(groups), penalty, share
         self.reference = self.names if reference is None else list(reference)
         self.counts = {name: sum(Fraction(often) for _, often in rows) for name, rows in groups.items()}
@@ -33,6 +34,8 @@ class Dense:
                         scatter[i][j] += often * away[i] * away[j]
         self.scatter = [[scatter[max(i, j)][min(i, j)] for j in range(self.width)] for i in range(self.width)]
         known = sum(self.counts[name] for name in self.reference)
+        if solved is not None:
+            self.scatter, total = solved.scatter, solved.total
         self.total = sum(self.counts.values()) if total is None else total
         self.shares = {name: self.counts[name] / known for name in self.reference}
         self.center = [
@@ -73,7 +76,7 @@ class Dense:
             onto = self.of_whole * self.column(row, self.center)
             scores = []
             for name in names:
-                target = self.number(self.counts[name]) * self.column(self.means[name], self.center)
+                target = self.number(self.excess * self.counts[name]) * self.column(self.means[name], self.center)
                 scores.append(float(self.number(self.shares[name]) + (target.T * onto)[0]))
             return scores
 

@@ -14,8 +14,11 @@ from scroll_tactile.readouts.calibration import (
     FEWEST,
     PRIOR_WEIGHT,
     Calibration,
+    Neighbours,
+    NoveltyThresholds,
     calibrate_stage,
     fit_weights,
+    held_out_probabilities,
     scale_weights,
 )
 from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
@@ -232,3 +235,162 @@ def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_wil
     for calibration in (viewed, plain):
         assert len({float(calibration.novelty(distances)) for distances in (near, by_first, by_second)}) == 3
     assert np.std(viewed.novelties) == pytest.approx(1, abs=1e-6)
+
+
+def local_novelty(touch, others):
+    """Of the module's docstring: touches and their distances in the readout's scaled units."""
+    near = min(range(len(others)), key=lambda place: np.linalg.norm(touch - others[place]))
+    around = sorted(np.linalg.norm(others[near] - other) for place, other in enumerate(others) if place != near)
+    return np.log(np.linalg.norm(touch - others[near])) - np.log(np.mean(around[:5]))
+
+
+def neighbours(statistics, sample, stage=1, scale=1):
+    readout = Task.of(statistics, SCALES[scale], statistics.names(SCALES[scale])).solve()
+    scaled = {
+        place: (touch.rows[-1] - readout.origin) * np.sqrt(readout.precision)
+        for place, (*_, touch) in enumerate(sample)
+    }
+    return Neighbours(readout, sample, STAGES, stage), readout, scaled
+
+
+def test_a_touch_is_as_new_as_it_is_far_from_the_nearest_beside_what_lies_around_that_one():
+    statistics, sample = scene(touches=30)
+    found, readout, scaled = neighbours(statistics, sample)
+    assert found.places == list(range(30))
+    features = np.random.default_rng(1).normal(size=DIMENSION) * 60_000
+    touch = (features - readout.origin) * np.sqrt(readout.precision)
+    assert found.novelty(features) == pytest.approx(local_novelty(touch, [*scaled.values()]), abs=1e-4)
+    materials = [material for material, *_ in sample]
+    of_two = [scaled[place] for place in scaled if materials[place] in ("1", "4")]
+    assert found.novelty(features, {"1", "4"}) == pytest.approx(local_novelty(touch, of_two), abs=1e-4)
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_held_out_touch_is_as_new_as_without_it_or_without_its_material(asked):
+    statistics, sample = scene(touches=30)
+    found, readout, scaled = neighbours(statistics, sample)
+    materials, places = [material for material, *_ in sample], [3, 4, 11, 29]
+    moved = np.random.default_rng(2).normal(size=(4, DIMENSION)) * 60_000 if asked else None
+    known, if_new = found.held_out(places, moved)
+    for i, place in enumerate(places):
+        touch = scaled[place] if moved is None else (moved[i] - readout.origin) * np.sqrt(readout.precision)
+        others = [scaled[other] for other in scaled if other != place]
+        strangers = [scaled[other] for other in scaled if materials[other] != materials[place]]
+        assert known[i] == pytest.approx(local_novelty(touch, others), abs=1e-4)
+        assert if_new[i] == pytest.approx(local_novelty(touch, strangers), abs=1e-4)
+
+
+@pytest.mark.parametrize("materials", [1, 2])
+@pytest.mark.parametrize("touches", [1, 2, 3])
+def test_few_neighbours_give_numbers(materials, touches):
+    statistics, sample = scene(materials=materials, touches=touches)
+    found, *_ = neighbours(statistics, sample)
+    for values in (found.novelty(np.zeros(DIMENSION)), *found.held_out(found.places)):
+        assert np.isfinite(values).all()
+
+
+def test_touches_that_are_all_alike_are_as_new_as_each_other():
+    statistics, sample = Statistics(DIMENSION, SCALES), TouchSample()
+    codes = {SCALES[0]: np.full((1, DIMENSION), 9, np.int32)}
+    for i in range(9):
+        statistics.add("ab"[i % 2], codes)
+        sample.add("ab"[i % 2], bytes([i]) * 32, SampledTouch.of(REACHED[:1], codes))
+    readout = Task.of(statistics, SCALES[0], ["a", "b"]).solve()
+    found = Neighbours(readout, sample, STAGES, 0)
+    for values in found.held_out(found.places):
+        assert values.tolist() == [0.0] * 9
+    assert found.novelty(np.full(DIMENSION, 1e5)) > 5
+
+
+NAMES = ["a", "b", "c"]
+
+
+def thresholds(novelties, if_new=None):
+    """Of materials a, b, c by their held-out touches' novelties."""
+    targets = np.repeat(np.arange(len(novelties)), [len(own) for own in novelties])
+    values = np.concatenate(novelties).astype(float)
+    new = values + 100 if if_new is None else np.concatenate(if_new).astype(float)
+    return NoveltyThresholds(NAMES[: len(novelties)], targets, values, new)
+
+
+@pytest.mark.parametrize("touches", [8, 9, 19, 20, 99, 100, 256])
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
+def test_both_thresholds_keep_the_conformal_promise_and_are_the_closest_that_do(touches, share):
+    """Of n + 1 exchangeable touches the new one lies above rank r with probability (n + 1 − r) / (n + 1)."""
+    ranks = np.arange(1.0, touches + 1)
+    found = NoveltyThresholds(NAMES, np.arange(touches) % 2, ranks, ranks)
+    alarms = [Fraction(touches + 1 - rank, touches + 1) for rank in range(1, touches + 1)]
+    kept = [rank for rank, alarm in enumerate(alarms, start=1) if alarm <= Fraction(str(share))]
+    if touches % 2 == 0:  # both materials have as many touches
+        assert found.above("c", share) == (kept[0] if kept else 2 * touches)
+        assert found.below(share) == (touches + 1 - kept[0] if kept else -np.inf)
+    own = NoveltyThresholds(NAMES, np.zeros(touches, np.intp), ranks, ranks)
+    assert own.above("a", share) == (kept[0] if kept else 2 * touches)
+
+
+def test_a_material_of_many_touches_has_its_own_threshold_and_the_others_share_one_in_which_all_count_alike():
+    rng = np.random.default_rng(0)
+    often, seldom = rng.normal(size=200), rng.normal(size=(2, 12)) + 3
+    found = thresholds([often, *seldom])
+    assert found.above("a", 0.05) == np.sort(often)[190]
+    # 5 % of the weight of 225: a seldom touch weighs 6.2 of them, and a new one 1.
+    assert found.above("b", 0.05) == found.above("c", 0.05) == np.sort(seldom.ravel())[-2]
+    # With 39 of its own fewer than two would be expected above.
+    few = thresholds([often[:39], *seldom])
+    assert few.above("a", 0.05) == few.above("b", 0.05)
+
+
+def test_seldom_felt_materials_are_called_new_no_more_often_than_asked():
+    """200 touches of one material and 12 of two others, whose novelty is larger by two spreads."""
+    rng = np.random.default_rng(0)
+    alarms = []
+    for _ in range(200):
+        found = thresholds([rng.normal(size=200), *(rng.normal(size=(2, 12)) + 2)])
+        alarms.append([rng.normal() + shift > found.above(name, 0.05) for name, shift in (("a", 0), ("b", 2))])
+    assert (np.mean(alarms, axis=0) <= 0.12).all()
+
+
+def test_a_touch_is_known_where_hardly_any_new_one_is_as_near():
+    known, new = [np.arange(100.0), np.arange(100.0)], [np.arange(60.0, 160), np.arange(60.0, 160)]
+    found = thresholds(known, new)
+    assert found.below(0.05) == 64  # of 201 ten at most may lie below, one of them the touch that is asked about
+    told = {novelty: found.known(novelty, "a", 0.05) for novelty in (0, 63, 64, 95, 96)}
+    assert told == {0: True, 63: True, 64: None, 95: None, 96: False}
+    # One material alone: no new one was seen. Too few touches: neither can be said, but of one that is far off.
+    assert thresholds([np.arange(100.0)], [np.full(100, 900.0)]).known(1.0, "a", 0.05) is None
+    few = thresholds([np.arange(6.0), np.arange(6.0)], [np.full(6, 900.0)] * 2)
+    assert [few.known(novelty, "a", 0.05) for novelty in (0, 9, 10.5)] == [None, None, False]
+    assert NoveltyThresholds().known(4.9, "a", 0.05) is None
+
+
+@pytest.mark.parametrize("touches", [1.0, 2.0, 5.0, 1000.0])
+def test_new_touches_are_scored_more_surely_than_held_out_ones_were(touches):
+    found = Calibration(np.array([0.2, 0.0]), np.zeros((1, 2)), np.ones(2)).with_all_touches(touches)
+    times = 1.0 if touches == 1 else (touches / (touches - 1)) ** 0.75
+    np.testing.assert_allclose(found.weights, [0.2 * times, 0.0])
+
+
+@pytest.mark.parametrize("touches", [6, 60])
+def test_a_stage_with_neighbours_measures_novelty_by_both(touches):
+    """But with distances alone where too few touches are held out to know how either spreads."""
+    statistics, sample = scene(materials=3, touches=touches)
+    readouts = [Task.of(statistics, scale, statistics.names(scale)).solve() for scale in SCALES]
+    found = StageScores(1, sample, [held_out_scores(readout, sample, STAGES, "lda") for readout in readouts])
+    near = [Neighbours(readout, sample, STAGES, 1) for readout in readouts]
+    stage = calibrate_stage(found, readouts, "lda", neighbours=near)
+    assert len(stage.scale_novelty) == (4 if touches == 60 else 2)
+    held = held_out_probabilities(found, SCALES, stage, near)
+    assert len(held.novelty) == touches
+    if touches == 60:
+        distances = [found.distances().min(axis=2), *(one.held_out(found.places)[0] for one in near)]
+        measures = np.column_stack(distances)
+        mean = ((measures - measures.mean(axis=0)) / measures.std(axis=0)).mean(axis=1)
+        np.testing.assert_allclose(held.novelty, mean / mean.std(), rtol=1e-6)
+        np.testing.assert_array_equal(stage.thresholds.novelties, held.novelty)
+        assert np.mean(stage.thresholds.if_new) > 3
+        assert stage.thresholds.names == found.names
+        # Any order of observation, the same bits.
+        shuffled = TouchSample()
+        shuffled.update(list(sample)[::-1])
+        again = [Neighbours(readout, shuffled, STAGES, 1).held_out(found.places) for readout in readouts]
+        np.testing.assert_array_equal(again, [one.held_out(found.places) for one in near])

@@ -130,3 +130,11 @@ def test_heads_last_as_long_as_their_touches(estimator):
     assert Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 100, estimator) is estimator
     fewer = Estimator.of(PLAN, LEARNED[1:], {"force": FORCE}, 100, estimator)
     assert fewer.heads(0)["force"].known.weights.tobytes() != estimator.heads(0)["force"].known.weights.tobytes()
+
+
+def test_of_a_touch_shorter_than_those_that_carry_a_value_it_is_said_that_these_are_longer():
+    """The least length is that of all touches, of which few may carry a value: it was an untyped error."""
+    estimator = estimator_of(least=15)
+    estimate = asked(estimator, felt("felt", 3)[0].first(0.3))["force"]
+    assert (estimate.value, estimate.interval) == (None, None) and "longer than this one" in estimate.missing
+    assert asked(estimator, felt("felt", 3)[0])["force"].missing == ""

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from readouts.dense import Dense, groups_of, require_near
 
 from scroll_tactile.readouts.task import Task
+from scroll_tactile.readouts.triangle import InverseTriangle
 from scroll_tactile.statistics.statistics import Statistics
 
 EDGE, SCALE, WIDTH = 2**20, 7, 5
@@ -33,10 +34,13 @@ def readout_of(statistics, reference=None):
     return Task.of(statistics, SCALE, reference or statistics.names(SCALE)).solve()
 
 
-def require_textbook(readout, touches, probes, tolerance=1e-9):
+def require_textbook(readout, touches, probes, tolerance=1e-9, solved=None):
+    """solved: the touches that it was solved from, where it followed."""
     names = sorted({material for material, _ in touches})
     reference = readout.reference
-    dense = Dense(groups_of(touches), readout.penalty, readout.share, reference)
+    if solved is not None:
+        solved = Dense(groups_of(solved), readout.penalty, readout.share)
+    dense = Dense(groups_of(touches), readout.penalty, readout.share, reference, solved=solved)
     places = [readout.places[name] for name in names]
     known = [readout.places[name] for name in reference]
     for row in probes:
@@ -87,76 +91,116 @@ CHANGES = st.lists(
 
 
 @settings(max_examples=30, deadline=None)
-@given(CHANGES, st.sampled_from([0, 0.9 * EDGE]), st.sampled_from([None, ["a", "b"]]))
-def test_followed_it_is_the_textbooks_of_what_is_there(batches, offset, reference):
-    """With the same P and ρ; where it cannot follow it says so, and is solved again."""
-    touches = [touch("abc"[i % 3], i, offset) for i in range(15)]
-    statistics = statistics_of(touches)
+@given(CHANGES, st.sampled_from([0, 0.9 * EDGE]), st.sampled_from([None, ["a", "b"]]), st.booleans())
+def test_followed_it_has_the_means_of_what_is_there_and_the_scatter_that_it_was_solved_with(
+    batches, offset, reference, asked
+):
+    """asked: whether it was asked for scores before, so that what is solved for already is taken over."""
+    first = [touch("abc"[i % 3], i, offset) for i in range(15)]
+    touches, statistics = [*first], statistics_of(first)
     readout = readout_of(statistics, reference)
     for batch in batches:
-        changes = []
+        changed = set()
         for change in batch:
             if isinstance(change, int) and len(touches) > 1:
                 name, rows = touches.pop(change % len(touches))
                 statistics.remove(name, {SCALE: rows})
-                changes.append((name, rows, -1))
             elif not isinstance(change, int):
-                touches.append(touch(*change, offset))
-                statistics.add(touches[-1][0], {SCALE: touches[-1][1]})
-                changes.append((*touches[-1], 1))
-        gone = any(name not in statistics.names(SCALE) for name, *_ in changes)
-        followed = readout.follow(changes)
-        assert not (gone and followed)
-        if not followed:
-            there = statistics.names(SCALE)
-            readout = readout_of(statistics, [name for name in reference or there if name in there] or there[:1])
-    require_textbook(readout, touches, PROBES[:2])
+                name, rows = touch(*change, offset)
+                touches.append((name, rows))
+                statistics.add(name, {SCALE: rows})
+            changed.add(name)
+        there, before = statistics.names(SCALE), readout
+        if asked:
+            before.scores(PROBES[0].astype(float), range(len(before.names)), "lda")
+        readout = before.followed(statistics, changed)
+        if not set(before.reference) & set(there):
+            assert readout is None
+            return
+        assert readout.names == [*(name for name in before.names if name in there), *sorted({*there} - {*before.names})]
+        new = set() if len(before.reference) < len(before.names) else set(there)
+        assert {*readout.reference} == ({*before.reference} | new) & {*there}
+        assert readout.counts.tolist() == statistics.counts(SCALE, readout.names).tolist()
+    require_textbook(readout, touches, PROBES[:2], solved=first)
 
 
-def test_following_stays_exact_for_as_long_as_it_follows():
-    touches = [touch("abc"[i % 3], i, 0.9 * EDGE) for i in range(15)]
+def test_it_never_changes_and_what_did_not_change_is_shared(monkeypatch):
+    """A scene reads only the blocks that its materials lie in, and a touch has one of them made anew."""
+    monkeypatch.setattr("scroll_tactile.readouts.task.BLOCK", 2)
+    monkeypatch.setattr("scroll_tactile.readouts.readout.BLOCK", 2)
+    touches = [touch("abcdefg"[i % 7], i) for i in range(21)]
     statistics = statistics_of(touches)
-    readout, followed = readout_of(statistics), 0
-    for i in range(200):
-        touches.append(touch("abc"[i % 3], 100 + i, 0.9 * EDGE, rows=1))
-        statistics.add(touches[-1][0], {SCALE: touches[-1][1]})
-        if readout.follow([(*touches[-1], 1)]):
-            followed += 1
-            continue
-        break
-    assert followed == 32  # all the columns that there is room for
-    require_textbook(readout, touches[:-1], PROBES[:2])
-    fresh = readout_of(statistics)
-    require_textbook(fresh, touches, PROBES[:2])
+    readout, probe = readout_of(statistics, ["a", "b"]), PROBES[0].astype(float)
+    assert [len(block) for block in readout.others] == [2, 2, 1]
+    solved = []
+    solve = InverseTriangle.solve
+    monkeypatch.setattr(InverseTriangle, "solve", lambda self, rows: solved.append(len(rows)) or solve(self, rows))
+    before = readout.scores(probe, [6], "lda"), readout.scores(probe, [6], "lda")
+    assert solved == [1]
+    for name in "eh":
+        statistics.add(name, {SCALE: touch(name, 99)[1]})
+    after = readout.followed(statistics, ["a", "e", "h", "never"])
+    assert readout.scores(probe, [6], "lda").tobytes() == before[0].tobytes()
+    assert after.near is readout.near and after.triangle is readout.triangle
+    assert [one is other for one, other in zip(after.others, readout.others, strict=True)] == [True, False, False]
+    assert (readout.names, after.names) == ([*"abcdefg"], [*"abcdefgh"])
+    assert solved == [1, 1]  # of a block that was never asked for nothing is solved
+    for name in "ij":
+        statistics.add(name, {SCALE: touch(name, 99)[1]})
+    assert [len(block) for block in after.followed(statistics, "ij").others] == [2, 2, 2, 2]
+    for name, rows in [*touches, ("e", touch("e", 99)[1]), ("h", touch("h", 99)[1])]:
+        if name in "eh":
+            statistics.remove(name, {SCALE: rows})
+    assert [len(block) for block in after.followed(statistics, "eh").others] == [2, 1, 1]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        [("a", touch("a", 0, rows=40)[1], 1)],  # more columns than there is room for
-        [(*touch("a", 91, spread=9, rows=3), 1), (*touch("a", 90, spread=10**6, rows=3), 1)],  # much louder than others
-        [(*touch("d", 0), -1)],  # never observed
-        [(*touch("a", i, spread=300), -1) for i in (0, 3)],  # all that there was of it
-    ],
-)
-def test_where_it_cannot_follow_it_says_so(changes):
-    statistics = statistics_of([touch("abc"[i % 3], i, spread=300) for i in range(6)])
-    assert not readout_of(statistics).follow(changes)
-    assert readout_of(statistics).follow([])
+def test_a_material_that_is_new_joins_the_reference_where_that_is_all_materials():
+    """As after an opening, where the ridge had an IndexError."""
+    touches = [touch("bcd"[i % 3], i) for i in range(12)]
+    statistics = statistics_of(touches)
+    readout = readout_of(statistics)
+    for name in "az":
+        touches.append(touch(name, 0))
+        statistics.add(name, {SCALE: touches[-1][1]})
+    readout = readout.followed(statistics, "az")
+    assert readout.reference == readout.names == [*"bcdaz"]
+    require_textbook(readout, touches, PROBES[:2], solved=touches[:-2])
+    assert readout.scores(touches[-1][1][0].astype(float), range(5), "lda").argmax() == 4
 
 
-def test_a_material_that_is_new_is_known_at_once_and_belongs_to_the_reference_where_all_do():
+def test_of_more_than_a_thousand_materials_of_one_row_each_the_nearest_mean_is_found():
+    """They have no scatter: 1030 materials that were touched once each had no readout."""
+    rng = np.random.default_rng(0)
+    rows = np.rint(rng.normal(size=(1030, WIDTH)) * 40_000).astype(np.int32)
+    readout = readout_of(statistics_of([(f"{i:04d}", row[None]) for i, row in enumerate(rows)]), ["0000", "0001"])
+    for i in (0, 1, 2, 700, 1029):
+        assert readout.scores(rows[i] + 5.0, range(1030), "lda").argmax() == i
+        assert np.isfinite(readout.novelty(rows[i] + 5.0, range(1030)))
+
+
+@pytest.mark.parametrize("gone", [0, 3, 12], ids=["one of several", "of the reference", "the only one of its material"])
+def test_a_task_without_a_touch_is_that_of_a_memory_that_never_had_it(gone):
+    touches = [*(touch("abc"[i % 3], i) for i in range(12)), touch("d", 0)]
+    statistics = statistics_of(touches)
+    task = Task.of(statistics, SCALE, ["a", "d"])
+    less = task.without(*touches[gone])
+    statistics.remove(touches[gone][0], {SCALE: touches[gone][1]})
+    found, expected = less.solve(), Task.of(statistics, SCALE, ["a", "d"]).solve()
+    assert (found.names, found.reference) == (expected.names, expected.reference)
+    probe, every = PROBES[1].astype(float), range(len(found.names))
+    assert found.scores(probe, every, "lda").tobytes() == expected.scores(probe, every, "lda").tobytes()
+    assert found.novelty(probe, every) == expected.novelty(probe, every)
+    assert len(task.solve().names) == 4  # it is as it was
+
+
+def test_a_task_that_is_solved_later_is_of_the_moment_it_was_made():
     touches = [touch("abc"[i % 3], i) for i in range(12)]
     statistics = statistics_of(touches)
-    whole, part = readout_of(statistics), readout_of(statistics, ["a", "b"])
-    touches.append(touch("z", 0))
-    statistics.add(touches[-1][0], {SCALE: touches[-1][1]})
-    assert whole.follow([(*touches[-1], 1)])
-    assert part.follow([(*touches[-1], 1)])
-    assert [readout.names for readout in (whole, part)] == [[*"abcz"]] * 2
-    assert [readout.reference for readout in (whole, part)] == [[*"abcz"], [*"ab"]]
-    require_textbook(whole, touches, PROBES[:2])
-    require_textbook(part, touches, PROBES[:2])
+    tasks = [Task.of(statistics, SCALE, ["a", "b"])]
+    for name, rows in (touch("c", 99, rows=3), touch("d", 99, rows=3)):
+        statistics.add(name, {SCALE: rows})
+    statistics.remove(touches[0][0], {SCALE: touches[0][1]})
+    require_textbook(tasks[0].solve(), touches, PROBES[:2])
 
 
 @pytest.mark.parametrize("offset", [0, 0.9 * EDGE])
@@ -175,7 +219,7 @@ def test_of_many_materials_scores_in_single_precision_are_near_enough(monkeypatc
     double = readout_of(statistics, names[:20])
     monkeypatch.setattr("scroll_tactile.readouts.task.IN_DOUBLE", 299)
     single = readout_of(statistics, names[:20])
-    assert (single.near.solved.dtype, single.others.solved.dtype) == (np.float64, np.float32)
+    assert (single.near.solved.dtype, single.others[0].solved.dtype) == (np.float64, np.float32)
     for followed in range(12):
         probe = rows_of(followed * 25)[SCALE][0].astype(float)
         for places in (range(300), [7, 150, 299]):
@@ -185,6 +229,6 @@ def test_of_many_materials_scores_in_single_precision_are_near_enough(monkeypatc
             assert single.novelty(probe, places) == pytest.approx(distance, abs=1e-6 * np.abs(expected).max())
         own = followed * 25
         assert single.diagonal_distance(probe, own) == pytest.approx(double.diagonal_distance(probe, own), rel=1e-4)
-        change = [(["new", *names][own], rows_of(own)[SCALE], 1)]
-        assert double.follow(change)
-        assert single.follow(change)
+        name = ["new", *names][own]
+        statistics.add(name, rows_of(own))
+        double, single = (readout.followed(statistics, [name]) for readout in (double, single))

@@ -1,5 +1,7 @@
 """The second moment and the scatter within classes, against integers and fractions that cannot round."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numpy as np
@@ -244,3 +246,45 @@ def test_the_scatter_of_more_classes_than_one_block():
     compare([codes(int(size), 3, seed) for seed, size in enumerate(rng.integers(1, 5, size=1100))])
     # At the bound, where the limbs are largest.
     compare([codes(2, 2, seed, EDGE - 3, EDGE) for seed in range(2100)])
+
+
+@pytest.mark.parametrize("kept", ["rows", "triangle"])
+def test_what_is_read_late_is_read_once_for_all_copies_of_whatever_thread(kept):
+    """What reads it has one place in one file: two threads that read at once gave each other's bytes."""
+    batch, inside, most = codes(4, 4), [], []
+
+    def read():
+        inside.append(0)
+        most.append(len(inside))
+        time.sleep(0.01)
+        inside.pop()
+        return batch.copy() if kept == "rows" else np.array(truth(batch))
+
+    moment = SecondMoment.of_codes(read, 4, 4) if kept == "rows" else SecondMoment.of(read, 4, 4)
+    copies = [moment.copy() for _ in range(3)]
+    moment.add(codes(1, 4, 7))
+    moment.remove(batch[:1])
+    with ThreadPoolExecutor() as pool:
+        found = list(pool.map(lambda one: one.packed().tolist(), [*copies, moment]))
+    assert most == [1]
+    assert found == [*[truth(batch)] * 3, truth(np.concatenate([batch[1:], codes(1, 4, 7)]))]
+
+
+@pytest.mark.parametrize("rows", [3, 600])
+def test_a_copy_stays_what_it_was_while_another_thread_changes_the_one_it_was_made_of(rows):
+    batch, more = codes(rows, 4), codes(40, 4, 3)
+    moment, expected = added(batch), added(batch).packed().tobytes()
+
+    def change():
+        for row in more:
+            moment.add(row[None])
+            moment.packed()
+        for row in more:
+            moment.remove(row[None])
+
+    copies = [moment.copy() for _ in range(20)]
+    with ThreadPoolExecutor() as pool:
+        changing = pool.submit(change)
+        assert {copy.packed().tobytes() for copy in copies} == {expected}
+        changing.result()
+    assert moment.packed().tobytes() == expected

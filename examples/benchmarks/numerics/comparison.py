@@ -1,7 +1,8 @@
 """`python -m examples.benchmarks numerics`: what the learner runs on hard memories, what its grid costs, and its peers.
 
 Every record is one method on one case: the errors of its answers and weights, answers that it flips, seconds of the
-processor for each row, and what it says of itself. Methods are "learner", its readout solved from the integers; "grid", true answers for the codes against true answers for the features; and the solvers of any
+processor for each row, and what it says of itself. Methods are "learner", its readout solved from the integers;
+"grid", true answers for the codes against true answers for the features; and the solvers of any
 doubles, which are given the same codes, and regressions of their own that no learner meets.
 """
 
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from examples.benchmarks.numerics.learned import AGREED, measure_learned
-from examples.benchmarks.numerics.long_runs import run_drift, run_schedules, run_updates
+from examples.benchmarks.numerics.long_runs import run_schedules, run_updates
 from examples.benchmarks.numerics.memories import Memory, make_memories
 from examples.benchmarks.numerics.peers import as_case, measure
 from examples.benchmarks.numerics.recorded import NIST, nist_cases, real_memory
@@ -75,7 +76,6 @@ def run_numerics(
     for case in regressions:
         records += _peers(case, seed, note)
     observations = QUICK_OBSERVATIONS if quick else OBSERVATIONS
-    records += run_drift(seed, DIMENSION, observations, note)
     records += run_updates(seed, DIMENSION, observations, tuple(SOLVERS), note)
     records += run_schedules(seed, SCHEDULED, 20 if quick else 1000, 32, note)
     result = {"bench": "numerics", "quick": quick}

@@ -1,4 +1,4 @@
-"""What a learner runs, measured on a memory: codes, exact sums, and the readout that is solved from them."""
+"""What a learner runs, measured on a memory: codes, exact sums, the readout that is solved from them."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def measure_learned(memory: Memory) -> list[Record]:
     """Records of a memory: solved from the integers, and what the grid costs."""
     evaluated = np.rint(memory.evaluated * EDGE).astype(np.int64)
     begun = time.process_time()
-    statistics = taught(memory, len(memory.places))
+    statistics = taught(memory)
     statistics.second(SCALE).packed()
     summed = time.process_time()
     readout = solved(statistics)
@@ -119,10 +119,10 @@ def measure_learned(memory: Memory) -> list[Record]:
     return [base | found for found in (fresh, grid)]
 
 
-def taught(memory: Memory, count: int) -> Statistics:
-    """The statistics of the first touches of a memory."""
+def taught(memory: Memory) -> Statistics:
+    """The statistics of a memory."""
     statistics = Statistics(memory.features.shape[2], [SCALE])
-    for place, rows in zip(memory.places[:count].tolist(), memory.codes, strict=False):
+    for place, rows in zip(memory.places.tolist(), memory.codes, strict=True):
         statistics.add(name_of(place), {SCALE: rows}, 1)
     return statistics
 

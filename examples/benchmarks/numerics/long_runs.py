@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from examples.benchmarks.numerics.learned import SCALE, asked, compared, name_of, solved
+from examples.benchmarks.numerics.learned import SCALE, name_of
 from examples.benchmarks.numerics.peers import Record, decided, error_of, record
 from examples.benchmarks.numerics.peers import solved as weights_of
 from examples.benchmarks.numerics.regressions import updates
-from examples.benchmarks.numerics.truth import TrueReadout, exact_weights
+from examples.benchmarks.numerics.truth import exact_weights
 from examples.benchmarks.solvers.exact import Exact
 from examples.benchmarks.solvers.methods import SOLVERS
 from examples.benchmarks.solvers.solver_protocol import RidgeBase
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["run_drift", "run_schedules", "run_updates"]
+__all__ = ["run_schedules", "run_updates"]
 
 FloatArray = npt.NDArray[np.float64]
 Note = Callable[[str], None]
@@ -29,35 +29,8 @@ DISTINCT = 1000  # rows of a long stream, which it repeats
 JUDGED = 20
 
 
-def run_drift(seed: int, dimension: int, count: int, note: Note) -> Iterator[Record]:
-    """Observations of one row each, and what the readout of all of them answers at each power of ten."""
-    rng = np.random.default_rng([seed, dimension, 3])
-    rows, targets, _ = updates(rng, dimension, DISTINCT)
-    codes, places = np.rint(rows * 2.0**20).astype(np.int32), targets.argmax(axis=1).tolist()
-    exact = codes.astype(object)
-    second, sums = exact.T @ exact, targets.astype(int).T.astype(object) @ exact
-    counts, evaluated = targets.sum(axis=0).astype(int), codes[:JUDGED].astype(np.int64)
-    statistics, spent = Statistics(dimension, [SCALE]), 0.0
-    for rounds in range(1, count // DISTINCT + 1):
-        fed = rounds * DISTINCT
-        note(f"{fed} observations, {dimension} features: the learner")
-        begun = time.process_time()
-        for place, row in zip(places, codes, strict=True):
-            statistics.add(name_of(place), {SCALE: row[None]}, 1)
-        spent += time.process_time() - begun
-        if fed not in (10**power for power in range(4, 10)):
-            continue
-        begun = time.process_time()
-        readout = solved(statistics)
-        took, of = time.process_time() - begun, (readout.penalty, readout.gamma)
-        true = TrueReadout.of_sums(rounds * second, rounds * sums, (rounds * counts).tolist(), *of)
-        found = record(_updates_name(fed, dimension), "updates", "learner", fed, dimension, readout.penalty)
-        found |= compared(asked(readout, evaluated), true.answers(evaluated))
-        yield found | {"seconds_per_row": spent / fed, "solve_seconds": took}
-
-
 def run_updates(seed: int, dimension: int, most: int, methods: Sequence[str], note: Note) -> Iterator[Record]:
-    """The same observations as updates of the solvers of doubles, and their errors after every power of ten."""
+    """Observations of one row each as updates of the solvers of doubles, and their errors after every power of ten."""
     rng = np.random.default_rng([seed, dimension, 3])
     rows, targets, penalty = updates(rng, dimension, DISTINCT)
     truths: dict[int, npt.NDArray[np.longdouble]] = {}

@@ -113,17 +113,7 @@ class TrueReadout:
         counts = np.bincount(places).tolist()
         sums = fmpz_mat([[int(v) for v in table[places == y].sum(axis=0)] for y in range(len(counts))])
         digits = fmpz_mat(table.tolist())
-        self._of_sums(digits.transpose() * digits, sums, counts, penalty, gamma)
-
-    @classmethod
-    def of_sums(cls, second: Integers, sums: Integers, counts: list[int], penalty: float, gamma: float) -> TrueReadout:
-        """The readout of rows of integers with Σ x xᵀ (d, d), and Σ x of each material, (C, d)."""
-        found = cls.__new__(cls)
-        found._unit = 0
-        found._of_sums(fmpz_mat(second.tolist()), fmpz_mat(sums.tolist()), counts, penalty, gamma)
-        return found
-
-    def _of_sums(self, second: fmpz_mat, sums: fmpz_mat, counts: list[int], penalty: float, gamma: float) -> None:
+        second = digits.transpose() * digits
         self.counts, self._gamma = counts, gamma
         total = sum(counts)
         self._mean = [fmpq(sum(column, start=fmpz(0)), total) for column in sums.transpose().tolist()]

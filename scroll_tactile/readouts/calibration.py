@@ -269,7 +269,7 @@ class Neighbours:
         with one_thread():
             products = rows @ self._rows.T
         squares = np.square(rows).sum(axis=1)[:, None] + self._sizes - 2 * products
-        return np.sqrt(np.maximum(squares, self._least, dtype=np.float64))
+        return np.asarray(np.sqrt(np.maximum(squares, self._least, dtype=np.float64)))
 
 
 def _mean_of_nearest(distances: FloatArray) -> FloatArray:

@@ -93,10 +93,10 @@ class NoveltyThresholds:
     novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
     if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def above(self, false_alarms: float, material: str = "") -> float:
+    def above(self, material: str, false_alarms: float) -> float:
         """The novelty above which a touch that is answered `material` is new: a share `false_alarms` of known ones.
 
-        Without a material, that which all share.
+        Of "", and of a material with few touches, that which all share.
         """
         if len(self.novelties) < FEWEST:
             return UNMEASURED
@@ -117,7 +117,7 @@ class NoveltyThresholds:
 
     def detects(self, false_alarms: float) -> bool:
         """Whether most touches would lie above the shared threshold, had their materials never been observed."""
-        return np.isfinite(self.below(false_alarms)) and float(np.median(self.if_new)) > self.above(false_alarms)
+        return np.isfinite(self.below(false_alarms)) and float(np.median(self.if_new)) > self.above("", false_alarms)
 
     @cached_property
     def _alike(self) -> FloatArray:

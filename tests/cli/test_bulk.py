@@ -12,7 +12,6 @@ import pytest
 from commands import refused, run
 
 from scroll_tactile import Kernels, TactileLearner, sensors
-from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -51,25 +50,6 @@ def of_six(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def learned(of_six: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(of_six, tmp_path / "learned"))
-
-
-@pytest.mark.parametrize("command", ["learn", "fleet", "merge"])
-def test_what_learns_many_touches_leaves_a_model_that_a_reader_answers_by(
-    command: str, tmp_path: Path, data: Path, of_six: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder, sensor = tmp_path / "m", ("--sensor", "roboskin", "--label-by", "folder")
-    if command == "merge":
-        TactileLearner.open(folder, sensor=sensors.ROBOSKIN, embedding=Kernels(dimension=64)).close()
-        done = run("memory", "merge", folder, of_six)
-    else:
-        done = run(command, folder, data, *sensor, *(("--workers", 1) if command == "fleet" else ()))
-    assert done.exit_code == 0, done.output
-
-    def fit(draft: Draft, extractor: object) -> None:
-        raise AssertionError("a reader fitted a model")
-
-    monkeypatch.setattr(Draft, "fit", fit)
-    assert TactileLearner.open(folder, mode="read").predict(SCENE.touch("silk", 9)).material == "silk"
 
 
 class TestLearn:

@@ -68,7 +68,6 @@ SHOWN = 20  # failures of a round
 FEW = 2  # changes and touches, in place of a thousand
 
 
-
 def touch(material: str, seed: int, readings: int = LENGTH) -> Array:
     """A touch: its material's level and rhythm, in noise."""
     rng, place = np.random.default_rng([ord(material), seed]), MATERIALS.index(material)

@@ -23,6 +23,7 @@ from scroll_tactile.clients.report.facts import (
 from scroll_tactile.live.decision import DecisionRule, decision_rule
 from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
 from scroll_tactile.simulation.scene import Scene
 
@@ -79,7 +80,7 @@ def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):
         expected = dict(other.predict(touch.first(prediction.seconds)).ranking)
         assert dict(prediction.ranking)[name] == pytest.approx(expected[name], abs=0.3)
     # The model has not lost the touch.
-    assert (name, touch.key) in model.matcher.kept.held
+    assert (name, touch.key) in model.matcher.kept.touches
     assert len(model.matcher.kept) == 24
 
 
@@ -104,6 +105,7 @@ def test_a_few_touches_of_different_materials_are_chosen(learner):
 
 def test_how_soon_answers_come_is_counted(learner):
     model = learner.model()
+    rehearse(model)
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan)
     counted = soon(model, extractor, DecisionRule((1,), 0.05, sure=0.0, together=0.0, least_new=0.0), 0.05)
     assert counted.decided == (1.0,) * len(counted.seconds)
@@ -122,10 +124,8 @@ def test_separations_are_the_log_odds_between_means(learner):
     assert names == sorted(NAMES)
     assert np.array_equal(apart, apart.T)
     assert (np.diagonal(apart) == 0).all()
-    scales = model.scales("complete", len(model.calibrations) - 1)
-    weights = model.fusion.complete.calibration.weights
-    total = 0.0
-    for scale, weight in zip(scales, weights, strict=True):
+    complete, total = model.fitted.complete, 0.0
+    for scale, weight in zip(complete.scales, complete.calibration.weights, strict=True):
         readout, statistics = model.readouts[scale], learner.memory.statistics
         mean = statistics.sums(scale, names[:1])[0] / statistics.counts(scale, names[:1])[0]
         scores = readout.scores(mean, [readout.places[name] for name in names[:2]], "lda")

@@ -13,13 +13,10 @@ from commands import refused, run
 from robot_sets import FIELD, robot_set
 
 from scroll_tactile import Frames, Kernels, Quantity, Sensor, TactileLearner
-from scroll_tactile.clients.learning.learning import store_model
 from scroll_tactile.clients.report import memory_page, recording_page, save
 from scroll_tactile.clients.report.channels import health_cards, health_section
 from scroll_tactile.clients.report.page import cards, table
 from scroll_tactile.errors import CapacityError, InputError
-from scroll_tactile.prediction.fitting import Draft
-from scroll_tactile.prediction.judging import held_out_touches
 from scroll_tactile.prediction.predictor import Predictor
 from scroll_tactile.recordings import read_intervals
 from scroll_tactile.results import Health
@@ -210,22 +207,6 @@ def test_a_long_table_says_how_long_it_is():
     assert 'class="table long"' in long and "41 rows: the table scrolls." in long
 
 
-def test_a_page_of_a_stored_model_fits_nothing_and_says_the_same(tmp_path, monkeypatch):
-    with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, exemplars=0) as learner:
-        feel(learner, 12, 5)
-        store_model(learner, lambda what, done, of: None)
-    with TactileLearner.open(tmp_path / "m", mode="read") as learner:
-        fresh = held_out_touches(learner.model(), 0.05)
-        monkeypatch.delattr(Draft, "fit")
-        found = held_out_touches(learner._predictor.examined(), 0.05)
-        html = memory_page(learner)
-    assert [(one.material, one.key, one.answer) for one in found] == [(o.material, o.key, o.answer) for o in fresh]
-    for one, other in zip(found, fresh, strict=True):
-        assert one.probability == pytest.approx(other.probability, abs=1e-9)
-        assert (one.novelty, one.threshold) == pytest.approx((other.novelty, other.threshold), abs=1e-9)
-    assert "60 touches of 5 materials were left out" in words(html)
-
-
 def test_a_compacted_memory_and_one_that_keeps_no_readings(tmp_path):
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL, kept_touches=0, exemplars=0) as learner:
         feel(learner, 4, 3)
@@ -305,13 +286,13 @@ def test_more_materials_than_the_ridge_weighs_leave_a_page(learner, monkeypatch)
     def refuse(_):
         raise InputError("the readout weighs 1024 materials at most")
 
-    monkeypatch.setattr(Predictor, "examined", refuse)
+    monkeypatch.setattr(Predictor, "fitted", refuse)
     assert "Nothing could be fitted: the readout weighs 1024 materials at most" in words(memory_page(learner))
 
     def lack(_):
         raise CapacityError("no memory is left")
 
-    monkeypatch.setattr(Predictor, "examined", lack)
+    monkeypatch.setattr(Predictor, "fitted", lack)
     with pytest.raises(CapacityError):
         memory_page(learner)
 

@@ -264,7 +264,7 @@ def test_a_material_felt_only_for_a_moment_beside_others_felt_for_long(readout):
         for readings in (10, 15, 75, 150):
             prediction = learner.predict(touch(name, 40, sensors.ROBOSKIN, readings=readings))
             check(prediction, NAMES)
-            if readings >= 15:
+            if 15 <= readings <= 75:  # a longer one may be a whole one at another pace
                 assert prediction.material == name
     check(learner.predict(touch("wool", 40, sensors.ROBOSKIN), scene=["wool"]), ["wool"])
 

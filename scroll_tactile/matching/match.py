@@ -120,7 +120,12 @@ def independent(energy: float, coherence: float, natural: float) -> float:
 
 
 def noise_share(energy: float, coherence: float, natural: NaturalDeviation) -> float:
-    """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² where odds are even."""
+    """σ⁴ / (σ⁴ + e⁴): σ² the energy of independent noise in a deviation, e² where odds are even.
+
+    0 where too few touches are kept to say what is natural: then the readouts decide.
+    """
+    if not np.isfinite(natural.most):
+        return 0.0
     noise = independent(energy, coherence, natural.coherence)
     return noise**2 / (noise**2 + natural.energy**2) if noise else 0.0
 

@@ -53,7 +53,7 @@ from scroll_tactile.signals.windows import Scale, WindowPlan
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Draft", "paces_of", "rehearse"]
+__all__ = ["Draft", "noisy_excess_of", "paces_of", "rehearse"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,6 +64,7 @@ UNMATCHED = 1 / 16_000  # τ where nothing can be held out: a larger one misclas
 PRIOR_OUTLIERS = 0.5  # of one more touch than the held-out ones
 STEPS = 100  # of EM
 PACES = 2.0, 0.5  # times a touch's own, at which it is judged as others made faster or slower
+SOUGHT = 16  # kept touches, to twice as many, in which noise is sought: a search takes some 10 ms
 EVEN = 4.0  # times the energy of noise that those stay below: there the share of noise is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 POWER_TOUCHES = 2.0  # how many touches the prior of a power, 1, counts as
@@ -344,6 +345,24 @@ def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:
             with one_thread():
                 weighing.paces = _measured_paces(model, extractor, matcher, chosen)
     return weighing.paces
+
+
+def noisy_excess_of(model: Model) -> tuple[float, float]:
+    """Mean and spread of the excess loss of known touches in which noise was sought; measured when first asked for.
+
+    Under the likeliest noise a touch has far less excess than under none, noise by itself included.
+    """
+    weighing, matcher = model.fitted, model.matcher
+    if weighing.noisy_excess is None and matcher is not None:
+        rows = list(_chosen(weighing, model.held_out, matcher))
+        rows = rows[:: max(1, len(rows) // SOUGHT)]
+        if len(rows) < FEWEST:
+            return weighing.complete.excess
+        with one_thread():
+            queries = [matcher.query(matcher.kept.levels(row), held_out=row) for row in rows]
+            losses = np.array([matcher.beside(query, None).excess for query in queries])
+        weighing.noisy_excess = float(losses.mean()), max(float(losses.std()), LEAST_SPREAD)
+    return weighing.noisy_excess or weighing.complete.excess
 
 
 def _measured_paces(

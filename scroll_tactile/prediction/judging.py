@@ -31,7 +31,7 @@ from scroll_tactile.matching.conformal import Typicality
 from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
 from scroll_tactile.matching.match import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.fitting import paces_of
+from scroll_tactile.prediction.fitting import noisy_excess_of, paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, tempered
 from scroll_tactile.readouts.calibration import NoveltyThresholds, held_out_probabilities
 from scroll_tactile.readouts.estimation import Estimator
@@ -230,7 +230,8 @@ def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: M
     scores = match_scores(model.matcher, candidates, match)
     chances = model.fitted.fused(matched.hypothesis, alone.probability, match, scores, alone.distance)
     share = match.noise_share
-    novelty = (1 - share) * alone.novelty + share * alone.row.matched_novelty(match.excess_loss)
+    mean, spread = alone.row.excess if match.noise == CLEAN else noisy_excess_of(model)
+    novelty = (1 - share) * alone.novelty + share * (match.excess_loss - mean) / spread
     return replace(alone, probability=tempered(chances, alone.row.outliers), novelty=float(novelty))
 
 

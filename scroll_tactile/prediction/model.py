@@ -110,10 +110,6 @@ class Row:
         """Whether an excess loss is so many spreads above that of known touches."""
         return excess > self.excess[0] + spreads * self.excess[1]
 
-    def matched_novelty(self, excess: float) -> float:
-        """An excess loss in units of its spread over known touches, as novelty is."""
-        return (excess - self.excess[0]) / self.excess[1]
-
 
 @dataclass(frozen=True)
 class Trajectories:
@@ -154,8 +150,8 @@ class Weighing:
     rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
     another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
     of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
-    to. sample: those that were held out. held_out, neighbours, trajectories, paces: see `Model`,
-    `fitting.rehearse` and `fitting.paces_of`; made when they are first asked for.
+    to. sample: those that were held out. held_out, neighbours, trajectories, paces, noisy_excess: see `Model`,
+    `fitting.rehearse`, `fitting.paces_of` and `fitting.noisy_excess_of`; made when they are first asked for.
     """
 
     rows: tuple[Row, ...]
@@ -170,6 +166,7 @@ class Weighing:
     trajectories: Trajectories | None = None
     neighbours: dict[tuple[int, Scale], Neighbours] = field(default_factory=dict)
     paces: Paces | None = None
+    noisy_excess: tuple[float, float] | None = None
 
     def row(self, hypothesis: Hypothesis, stage: int) -> Row:
         """How a touch is judged at a stage."""

@@ -49,7 +49,7 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
         if (found["made_by"], found["kind"]) != (MADE_BY, model.kind):
             raise ValueError(f"expected one of {MADE_BY} for {model.kind}; came {found['made_by']} for {found['kind']}")
         weighing: Weighing = _made(Weighing, found["weighing"] | {"sample": []} | LATER)
-        weighing.sample = list(memory.sample)
+        weighing.sample, weighing.neighbours = list(memory.sample), {}
         reached = model.stages[: len(weighing.rows)]
         whole = [*reached[-1], *model.views]
         scales = [*reached, whole, model.views or whole]

@@ -77,6 +77,41 @@ def test_the_seed_decides_the_features_and_the_fingerprint_and_global_generators
     assert states() == before
 
 
+@pytest.mark.parametrize("harm", ["missing", "cut", "changed", "empty", "a folder", "no room", "no home", "none"])
+def test_thresholds_that_are_not_kept_or_damaged_are_made_again_to_the_same_features(tmp_path, monkeypatch, harm):
+    own, picture = Kernels(seed=77, dimension=64), image(3, 50)
+    monkeypatch.setenv("SCROLL_TACTILE_CACHE", str(tmp_path / "cache"))
+    forget_caches()
+    features = own.embed(picture).tobytes()
+    files = sorted((tmp_path / "cache" / "banks").iterdir())
+    whole = {file: file.read_bytes() for file in files}
+    assert whole
+    for file, data in whole.items():
+        file.unlink()
+        if harm == "a folder":
+            file.mkdir()
+        elif harm != "missing":
+            half = len(data) // 2
+            changed = data[:half] + bytes([data[half] ^ 1]) + data[half + 1 :]
+            file.write_bytes({"cut": data[:-4], "changed": changed, "empty": b""}.get(harm, data))
+    if harm == "no room":
+        (tmp_path / "file").write_bytes(b"")
+        monkeypatch.setenv("SCROLL_TACTILE_CACHE", str(tmp_path / "file"))
+    elif harm == "no home":
+        monkeypatch.delenv("SCROLL_TACTILE_CACHE")
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setattr("pathlib.Path.expanduser", lambda path: (_ for _ in ()).throw(RuntimeError("no home")))
+    made = []
+    monkeypatch.setattr(convolution, "_thresholds", lambda *of, own=convolution._thresholds: made.append(1) or own(*of))
+    forget_caches()
+    assert own.embed(picture).tobytes() == features
+    assert bool(made) == (harm != "none")
+    if harm not in ("a folder", "no room", "no home"):
+        assert {file: file.read_bytes() for file in files} == whole
+        assert sorted((tmp_path / "cache" / "banks").iterdir()) == files  # and no draft
+    forget_caches()
+
+
 @pytest.mark.parametrize("settings", [{"seed": -1}, {"dimension": 63}])
 def test_settings_that_make_no_embedding_are_refused(settings):
     with pytest.raises(ValueError, match="came"):

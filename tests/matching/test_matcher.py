@@ -68,6 +68,7 @@ def test_the_noise_is_found(matcher, amplitude, normal):
 
 
 def test_noise_is_trusted_to_kept_touches_and_clean_touches_are_not(matcher):
+    matcher = matcher.measured(10.0, 10.0, 100.0)
     assert all(matcher.match(noisy(touch(m, 100), 0.3, m)).noise_share > 0.95 for m in range(MATERIALS))
     assert np.mean([matcher.match(touch(m, 100 + i)).noise_share for m in range(MATERIALS) for i in range(4)]) < 0.3
 

@@ -139,7 +139,9 @@ def test_a_prediction_is_of_one_state_that_there_was(monkeypatch, readings):
 def test_a_held_model_stays_as_it_is_to_the_bit():
     learner = learned()
     model, extractor = learner._predictor.present(), learner._predictor.extractor
-    encoded = extractor.encode(extractor.stream(touch("b", 9, 20)), model.longest, lambda at: model.scales_for("abc", at))
+    encoded = extractor.encode(
+        extractor.stream(touch("b", 9, 20)), model.longest, lambda at: model.scales_for("abc", at)
+    )
     before = learner._predictor.answer_of(model, list("abc"), [encoded])
     changing(learner)()
     learner.settle()

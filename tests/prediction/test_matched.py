@@ -179,9 +179,9 @@ def test_a_model_that_followed_keeps_what_one_fitted_anew_does(tmp_path):
         followed = present(learner)
         assert followed.deviation is measured
         kept = {(material, key) for material, key, _ in learner.memory.kept}
-        assert followed.kept.held == kept
+        assert set(followed.kept.touches) == kept
         learner.settle()
-        assert (present(learner).kept.held, present(learner).kept.materials) == (kept, sorted({*NAMES, "new"}))
+        assert (set(present(learner).kept.touches), present(learner).kept.materials) == (kept, sorted({*NAMES, "new"}))
         learner.retract(receipt)
         assert "new" not in present(learner).kept.materials
         assert "new" not in {material for material, _ in learner.predict(ASKED[0][1]).ranking}

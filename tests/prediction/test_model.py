@@ -123,8 +123,8 @@ def test_a_material_that_was_observed_briefly_among_others_that_came_since(monke
 
 def test_competing_kernels_weigh_in_probabilities_and_not_in_novelty_or_distance():
     model, touch = model_of("lda"), stream(3, 99)
-    moment, last = model.fusion.complete, len(model.calibrations) - 1
-    scales = model.scales("complete", last)
+    moment = model.fitted.complete
+    scales = moment.scales
     assert COMPETING in scales
     assert moment.calibration.weights[scales.index(COMPETING)] > 0
     assert len(moment.calibration.scale_novelty) == len(scales) - 1

@@ -236,7 +236,9 @@ class TouchMatcher:
         columns = query.levels.shape[1]
         if not query.whole:
             return self.kept.beginnings(rows, columns)
-        return self.kept.at_shares(rows, np.arange(columns) * (query.step / max(query.columns - 1, 1)))
+        return self.kept.at_shares(
+            rows, np.arange(columns, dtype=np.float64) * (query.step / max(query.columns - 1, 1))
+        )
 
     def _logs(self, own: LevelArray, others: LevelArray, table: Table) -> FloatArray:
         """Log-likelihoods of levels (C, T') by each of others, (others, C, T'); scaled up where some lack values."""

@@ -20,6 +20,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.attributes import GAMMAS, Curve, RidgeSystem, fit_curve, solve
+from scroll_tactile.readouts.calibration import novelty_measures
 from scroll_tactile.readouts.leave_one_out import StageScores
 from scroll_tactile.results import Constituent
 from scroll_tactile.signals.windows import Scale
@@ -86,15 +87,14 @@ class HeadFitter:
 
     def __init__(self, model: Model, stage: int) -> None:
         weighing = model.fitted
-        scales, calibration = model.stages[stage], weighing.rows[stage].calibration
-        found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in scales])
-        weights, distances = _weights(model, stage), found.distances()
+        row = weighing.rows[stage]
+        found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in row.scales])
+        weights = _weights(model, stage)
         self.space = _space_of(model, stage, found.names)
         self.materials = [found.names[place] for place in found.targets]
         self.z = sum(weight * z for weight, z in zip(weights, np.moveaxis(found.z(), 1, 0), strict=True))
-        self.known_novelty = calibration.novelty(distances.min(axis=2, initial=np.inf))
-        distances[np.arange(len(distances)), :, found.targets] = np.inf
-        self.new_novelty = calibration.novelty(distances.min(axis=2, initial=np.inf))
+        measures = novelty_measures(found, model.neighbours(row))
+        self.known_novelty, self.new_novelty = map(row.calibration.novelty, measures)
         self._systems: dict[tuple[float, bytes], RidgeSystem] = {}
 
     def fit(self, targets: Mapping[str, Target]) -> StageHeads:

@@ -38,7 +38,8 @@ FASTER = 2  # times the touches of the last fit: where there are more, or fewer 
 class _Job:
     """A fit in a thread.
 
-    retractions, version: of the memory when it began. changed: the materials that changed since; None where that is not known.
+    retractions, version: of the memory when it began. changed: the materials that changed since; None where that is
+    not known.
     """
 
     future: Future[Model]

@@ -40,6 +40,7 @@ from scroll_tactile.readouts.calibration import (
     AHEAD,
     FEWEST,
     HeldOutProbabilities,
+    Neighbours,
     calibrate_stage,
     fit_weights,
     held_out_probabilities,
@@ -161,16 +162,25 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
         return None
     last, milestones = len(reached) - 1, model.plan.milestones()
     held_out = held_out_of(model.readouts, draft.sample, model.stages, model.views, model.kind)
+    viewed, found_near = [[*stage, *model.views] for stage in model.stages], dict[tuple[int, Scale], Neighbours]()
+
+    def neighbours(stage: int, scale: Scale) -> Neighbours:
+        """The sampled touches that a touch lies among at a stage and a scale; made once for both rows of a stage."""
+        if (stage, scale) not in found_near:
+            found_near[stage, scale] = Neighbours(model.readouts[scale], draft.sample, viewed, stage)
+        return found_near[stage, scale]
 
     def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
         """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
         found = StageScores(stage, draft.sample, [held_out[scale] for scale in scales])
         readouts = [model.readouts[scale] for scale in scales]
-        calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views))
-        held = held_out_probabilities(found, scales, calibration)
+        windows = [scale for scale in scales if scale.width]
+        near = [neighbours(stage, scale) for scale in windows] if len(found.places) >= FEWEST else []
+        calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views), neighbours=near)
+        held = held_out_probabilities(found, scales, calibration, near)
         own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
         rate = _outlier_rate(own, len(held.names)) if len(own) else 0.0
-        return Row(steps, tuple(scales), calibration, rate, rate), held
+        return Row(steps, stage, tuple(scales), calibration, rate, rate), held
 
     rows = [row(stage, scales, milestones[stage])[0] for stage, scales in enumerate(reached)]
     complete, held = row(last, [*reached[last], *model.views], draft.least)
@@ -186,6 +196,7 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
         touches=draft.touches,
         sample=draft.sample,
         held_out=held_out,
+        neighbours=found_near,
     )
 
 
@@ -283,7 +294,7 @@ def rehearse(model: Model) -> None:
     with one_thread():
         for stage, row in enumerate(early):
             found = StageScores(stage, weighing.sample, [held_out[scale] for scale in row.scales])
-            held = held_out_probabilities(found, row.scales, row.calibration)
+            held = held_out_probabilities(found, row.scales, row.calibration, model.neighbours(row))
             for i, place in enumerate(held.places if held.names == names else ()):
                 own = np.exp(held.logs[i])
                 if matcher is None or chosen is None:
@@ -351,7 +362,7 @@ def _measured_paces(
         novelties = np.sort(((values - mean) / spread).mean(axis=1))
         # As many of these lie above the threshold as of touches in their own time.
         rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
-        high = float(novelties[rank]) / max(row.calibration.threshold(1 - WITHIN), LEAST_SPREAD)
+        high = float(novelties[rank]) / max(row.calibration.thresholds.above(1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
         for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
             scores = match_scores(matcher, held.names, match)

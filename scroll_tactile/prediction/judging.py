@@ -33,7 +33,7 @@ from scroll_tactile.matching.match import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, tempered
-from scroll_tactile.readouts.calibration import held_out_probabilities
+from scroll_tactile.readouts.calibration import NoveltyThresholds, held_out_probabilities
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.leave_one_out import StageScores
 from scroll_tactile.results import Estimate, Prediction, Unusual
@@ -86,17 +86,12 @@ def answer(
     if len(judgements) > 1:
         probability = model.fitted.dependence.probability([judgement.probability for judgement in judgements])
         novelty = model.fitted.dependence.standard([judgement.novelty for judgement in judgements])
-    thresholds = [judgement.row.calibration.threshold(false_alarms) for judgement in judgements]
-    threshold = math.fsum(thresholds) / len(thresholds)
     order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
     names = list(map(candidates.__getitem__, order.tolist()))
     ranking = tuple(zip(names, probability[order].tolist(), strict=True))
     seconds = math.fsum(touch.seconds for touch, _ in own)
     tuned = all(logits is not None for _, logits in own)
-    calibrations = [judgement.row.calibration for judgement in judgements]
-    measured = all(each.measures(false_alarms) for each in calibrations) and len(model.names) > 1
-    detects = measured and any(each.detects(false_alarms) for each in calibrations)
-    known = False if novelty > threshold else True if detects else None
+    known = _known(novelty, names[0], [judgement.row.calibration.thresholds for judgement in judgements], false_alarms)
     p_own, least_own, p_all, least_all = typical[order].T.tolist()
     unusual = tuple(sorted({way for judgement in judgements for way in judgement.unusual}))
     return Prediction(
@@ -112,6 +107,15 @@ def answer(
         least_typicality=(*least_own, max(least_all)),
         unusual=unusual,
     )
+
+
+def _known(novelty: float, material: str, thresholds: Sequence[NoveltyThresholds], false_alarms: float) -> bool | None:
+    """Whether touches of one thing that are answered by a material are of a known one; None where that is not told."""
+    above = [each.above(false_alarms, material) for each in thresholds]
+    below = [each.below(false_alarms) for each in thresholds]
+    if novelty > math.fsum(above) / len(above):
+        return False
+    return True if novelty < math.fsum(below) / len(below) else None
 
 
 def judged(
@@ -213,7 +217,7 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     """The judgement by the readouts. For a novel touch its match names how it differs."""
     unusual = _of_length(model, encoded)
-    if model.matcher is not None and alone.novelty > alone.row.calibration.threshold(1 - WITHIN):
+    if model.matcher is not None and alone.novelty > alone.row.calibration.thresholds.above(1 - WITHIN):
         match = model.matcher.match(_levels_of(encoded.stream), noise=None)
         unusual = _unusual(model, encoded, match, _own_hypothesis(model, encoded))
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
@@ -311,7 +315,7 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     for stage in range(len(weighing.rows) - 1, -1, -1):
         row = weighing.row("complete", stage)
         found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in row.scales])
-        held = held_out_probabilities(found, row.scales, row.calibration)
+        held = held_out_probabilities(found, row.scales, row.calibration, model.neighbours(row))
         for i, place in enumerate(held.places):
             if place in answers:
                 continue
@@ -323,8 +327,9 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
                 result = _fused(model, held.names, alone, matched)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
-            threshold = row.calibration.threshold(false_alarms)
             names = tuple(held.names)
+            called = names[int(result.probability.argmax())]
+            threshold = row.calibration.thresholds.above(false_alarms, called)
             answers[place] = HeldOutTouch(material, key, names, result.probability, result.novelty, threshold)
     return list(answers.values())
 

@@ -22,7 +22,7 @@ from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.readouts.calibration import Calibration
+from scroll_tactile.readouts.calibration import Calibration, Neighbours
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
@@ -83,14 +83,15 @@ def enough_memory() -> Iterator[None]:
 class Row:
     """How touches are judged from a length on, by readouts and kept touches.
 
-    steps: that length; of a complete touch, that of most. scales: that judge. calibration: of their scores.
-    readout_outliers: ε of the readouts' own probabilities, the share of touches unlike all others of their material;
+    steps: that length; of a complete touch, that of most. stage: that it belongs to. scales: that judge.
+    calibration: of their scores. readout_outliers: ε of the readouts' own probabilities, the share of touches unlike all others of their material;
     outliers: ε where kept touches judge beside them. distance_limit: the relative distance that 19 of 20 complete
     touches stay below; infinite in the rows of prefixes. excess: mean and spread of the excess loss of known touches
     beside the kept ones.
     """
 
     steps: int
+    stage: int
     scales: tuple[Scale, ...]
     calibration: Calibration
     readout_outliers: float
@@ -153,8 +154,8 @@ class Weighing:
     rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
     another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
     of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
-    to. sample: those that were held out. held_out, trajectories, paces: see `Model.held_out`, `fitting.rehearse` and
-    `fitting.paces_of`; made when they are first asked for.
+    to. sample: those that were held out. held_out, neighbours, trajectories, paces: see `Model`,
+    `fitting.rehearse` and `fitting.paces_of`; made when they are first asked for.
     """
 
     rows: tuple[Row, ...]
@@ -167,6 +168,7 @@ class Weighing:
     sample: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
     held_out: dict[Scale, HeldOutScores] | None = None
     trajectories: Trajectories | None = None
+    neighbours: dict[tuple[int, Scale], Neighbours] = field(default_factory=dict)
     paces: Paces | None = None
 
     def row(self, hypothesis: Hypothesis, stage: int) -> Row:
@@ -224,7 +226,8 @@ class Judgement:
 class Model:
     """Everything that predictions need of one state of a memory; it never changes.
 
-    names: the materials, in alphabetical order; known: the same names, as a set. stages: for each, the windows that
+    names: the materials, in alphabetical order; known: the same names, as a set; sampled: those
+    with a sampled touch. stages: for each, the windows that
     judge there. views: the views that judge beside them. readouts: scale → its readout. weighing: None where nothing
     was learned. matcher, conformal: of the kept touches. longest: the longest learned touch, in steps.
     """
@@ -240,10 +243,13 @@ class Model:
     conformal: Conformal | None
     longest: int
     known: frozenset[str] = field(init=False)
+    sampled: frozenset[str] = field(init=False)
     _of_all: dict[Scale, npt.NDArray[np.intp]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "known", frozenset(self.names))
+        sample = [] if self.weighing is None else self.weighing.sample
+        object.__setattr__(self, "sampled", frozenset(material for material, *_ in sample))
 
     @property
     def fitted(self) -> Weighing:
@@ -332,7 +338,7 @@ class Model:
             mass = float(probability[later].sum())
         best = int(np.argmax(probability))
         row = self.fitted.row(hypothesis, max(stage for stage, members in decided if best in members))
-        return Judgement(probability, float(self.novelty(row, means, candidates)), row, distance)
+        return Judgement(probability, self.novelty(row, means, candidates), row, distance)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
         """(stage, places of the candidates weighed there), for each stage that is the last one of any candidate."""
@@ -383,9 +389,23 @@ class Model:
         begun = min(1.0, steps / row.steps) ** 2
         return begun * np.asarray(sum(weight * scores for weight, scores in zip(weights, found, strict=True))), distance
 
-    def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> FloatArray:
+    def neighbours(self, row: Row) -> list[Neighbours]:
+        """The sampled touches that a row's windows lie among; none where too few were held out to measure that."""
+        if not len(row.calibration.thresholds.novelties):
+            return []
+        found, stages = self.fitted.neighbours, [[*stage, *self.views] for stage in self.stages]
+        windows = [scale for scale in row.scales if scale.width]
+        for scale in windows:
+            if (row.stage, scale) not in found:
+                found[row.stage, scale] = Neighbours(self.readouts[scale], self.fitted.sample, stages, row.stage)
+        return [found[row.stage, scale] for scale in windows]
+
+    def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch judged by a row, among these materials."""
-        return row.calibration.novelty(self.distances(row.scales, means, names))
+        among = None if len(names) == len(self.names) and self.sampled <= self.known else set(names)
+        windows = (scale for scale in row.scales if scale.width)
+        local = [own.novelty(means[scale], among) for own, scale in zip(self.neighbours(row), windows, strict=False)]
+        return float(row.calibration.novelty(np.array([*self.distances(row.scales, means, names), *local])))
 
     def distances(self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]) -> FloatArray:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""

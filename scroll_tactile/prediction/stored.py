@@ -25,7 +25,9 @@ from scroll_tactile.signals.windows import Scale, measuring
 __all__ = ["read_weighing", "weighing_text"]
 
 MADE_BY = f"{__version__}, 1"  # the release, in which judging may differ, and the version of these fields
-NOT_STORED = "sample", "held_out", "trajectories"  # of a weighing: made again from the memory where they are asked for
+# Of a weighing: made again from the memory where they are asked for.
+NOT_STORED = "sample", "held_out", "neighbours", "trajectories"
+LATER: dict[str, Any] = {"held_out": None, "neighbours": {}, "trajectories": None}
 
 
 def weighing_text(model: Model) -> str | None:
@@ -46,7 +48,7 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
         found = json.loads(text)
         if (found["made_by"], found["kind"]) != (MADE_BY, model.kind):
             raise ValueError(f"expected one of {MADE_BY} for {model.kind}; came {found['made_by']} for {found['kind']}")
-        weighing: Weighing = _made(Weighing, found["weighing"] | {"sample": [], "held_out": None, "trajectories": None})
+        weighing: Weighing = _made(Weighing, found["weighing"] | {"sample": []} | LATER)
         weighing.sample = list(memory.sample)
         reached = model.stages[: len(weighing.rows)]
         whole = [*reached[-1], *model.views]
@@ -70,7 +72,10 @@ def _require_fitting(row: Row, scales: list[Scale], model: Model) -> None:
         raise ValueError(f"expected a row of the scales {scales}; came {row.scales}")
     _numbers(calibration.weights, (count,))
     _numbers(calibration.median_distances, (count,))
-    _numbers(calibration.scale_novelty, (len(measuring(scales)), 2))
+    measures = len(measuring(scales))
+    if len(calibration.thresholds.novelties):
+        measures += sum(1 for scale in scales if scale.width)
+    _numbers(calibration.scale_novelty, (measures, 2))
 
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -106,10 +111,11 @@ def _made(kind: Any, plain: Any) -> Any:
         hints = _hints(kind)  # type: ignore[arg-type]
         return kind(**{one.name: _made(hints[one.name], plain[one.name]) for one in fields(kind)})  # type: ignore[operator]
     if get_origin(kind) is tuple:
-        own = get_args(kind)
-        return tuple(_made(own[0], each) for each in plain)
+        first, *more = get_args(kind)
+        kinds = [first] * len(plain) if more == [...] else [first, *more]
+        return tuple(_made(own, each) for own, each in zip(kinds, plain, strict=True))
     if get_origin(kind) is np.ndarray:
-        return np.array(plain, dtype=np.float64)
+        return np.array(plain, dtype=get_args(get_args(kind)[1])[0])
     if kind in (int, float) and (isinstance(plain, bool) or not isinstance(plain, (int, float))):
         raise TypeError(f"expected a number; came {plain!r:.50}")
     return kind(plain) if kind in (int, float) else plain

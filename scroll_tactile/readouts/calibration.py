@@ -93,8 +93,11 @@ class NoveltyThresholds:
     novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
     if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def above(self, material: str, false_alarms: float) -> float:
-        """The novelty above which a touch that is answered `material` is new: a share `false_alarms` of known ones."""
+    def above(self, false_alarms: float, material: str = "") -> float:
+        """The novelty above which a touch that is answered `material` is new: a share `false_alarms` of known ones.
+
+        Without a material, that which all share.
+        """
         if len(self.novelties) < FEWEST:
             return UNMEASURED
         own = self.novelties[self.targets == (self.names.index(material) if material in self.names else -1)]
@@ -112,11 +115,9 @@ class NoveltyThresholds:
             return -np.inf
         return -_conformal(-self.if_new, self._alike, false_alarms)
 
-    def known(self, novelty: float, material: str, false_alarms: float) -> bool | None:
-        """Whether a touch of this novelty that is answered `material` is of a known one; None where neither is sure."""
-        if novelty > self.above(material, false_alarms):
-            return False
-        return True if novelty < self.below(false_alarms) else None
+    def detects(self, false_alarms: float) -> bool:
+        """Whether most touches would lie above the shared threshold, had their materials never been observed."""
+        return np.isfinite(self.below(false_alarms)) and float(np.median(self.if_new)) > self.above(false_alarms)
 
     @cached_property
     def _alike(self) -> FloatArray:
@@ -134,16 +135,12 @@ class Calibration:
     scale that measures it, then u at each scale that has `Neighbours`.
     median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
     touch counts alike.
-    novelties: sorted standardised novelty of known, held-out touches, shape (touches,). novelties_if_new: the same of
-    these touches had their own materials never been observed, sorted, shape (touches,). Both empty where too few were.
-    thresholds: of the same touches, by material.
+    thresholds: of the novelty of known touches, as far as any were held out.
     """
 
     weights: FloatArray
     scale_novelty: FloatArray
     median_distances: FloatArray
-    novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
-    novelties_if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
     thresholds: NoveltyThresholds = field(default_factory=NoveltyThresholds)
 
     def weights_at(self, distances: FloatArray) -> FloatArray:
@@ -169,26 +166,6 @@ class Calibration:
         mean, spread = self.scale_novelty.T
         standard: FloatArray = ((distances - mean) / spread).mean(axis=-1)
         return standard
-
-    def measures(self, false_alarms: float) -> bool:
-        """Whether enough known touches were held out to estimate the threshold of this false-alarm rate."""
-        return self._rank(false_alarms) <= len(self.novelties)
-
-    def detects(self, false_alarms: float) -> bool:
-        """Whether most touches would lie above the threshold of this rate, had their materials never been observed."""
-        return float(np.median(self.novelties_if_new)) > self.threshold(false_alarms)
-
-    def threshold(self, false_alarms: float) -> float:
-        """The novelty that a share `false_alarms` of known touches exceeds, by the held-out ones."""
-        if len(self.novelties) < FEWEST:
-            return UNMEASURED
-        if not self.measures(false_alarms):
-            return float(2 * self.novelties[-1])
-        return float(self.novelties[self._rank(false_alarms) - 1])
-
-    def _rank(self, false_alarms: float) -> int:
-        """Of the conformal quantile: of n + 1 exchangeable touches no more than this share lies above it."""
-        return int(np.ceil((1 - false_alarms) * (len(self.novelties) + 1)))
 
 
 def _conformal(values: FloatArray, weights: FloatArray, share: float) -> float:
@@ -269,7 +246,7 @@ class Neighbours:
         with one_thread():
             products = rows @ self._rows.T
         squares = np.square(rows).sum(axis=1)[:, None] + self._sizes - 2 * products
-        return np.sqrt(np.maximum(squares, self._least, dtype=np.float64))
+        return np.asarray(np.sqrt(np.maximum(squares, self._least, dtype=np.float64)))
 
 
 def _mean_of_nearest(distances: FloatArray) -> FloatArray:
@@ -325,7 +302,7 @@ def calibrate_stage(
     scaled = Calibration(weights, shape, medians)
     known, new = scaled.novelty(measures), scaled.novelty(if_new)
     thresholds = NoveltyThresholds(found.names, found.targets, known, new)
-    return replace(scaled, novelties=np.sort(known), novelties_if_new=np.sort(new), thresholds=thresholds)
+    return replace(scaled, thresholds=thresholds)
 
 
 def novelty_measures(found: StageScores, neighbours: Sequence[Neighbours]) -> tuple[FloatArray, FloatArray]:

@@ -169,6 +169,7 @@ class Readout:
         self, scale: Scale, names: Sequence[str], near: Means, others: Sequence[Means], solution: Solution
     ) -> None:
         self.scale, self.names, self.near, self.solution = scale, list(names), near, solution
+        self.origin, self.triangle, self.rows, self.share, self.penalty, self.precision = solution
         self.others = tuple(block for block in others if len(block))
         self.places = {name: place for place, name in enumerate(self.names)}
         self.counts = np.concatenate([part.counts for part in self._parts]).astype(np.float64)
@@ -181,31 +182,6 @@ class Readout:
         return (self.near, *self.others)
 
     @property
-    def origin(self) -> FloatArray:
-        """The origin that features and means are taken about, shape (d,)."""
-        return self.solution.origin
-
-    @property
-    def triangle(self) -> InverseTriangle:
-        """L⁻¹, by which K⁻¹ solves."""
-        return self.solution.triangle
-
-    @property
-    def share(self) -> float:
-        """ρ."""
-        return self.solution.share
-
-    @property
-    def penalty(self) -> float:
-        """P."""
-        return self.solution.penalty
-
-    @property
-    def precision(self) -> FloatArray:
-        """One over the variance of each feature within materials, shape (d,)."""
-        return self.solution.precision
-
-    @property
     def reference(self) -> list[str]:
         """The reference materials."""
         return self.names[: len(self.near)]
@@ -213,7 +189,7 @@ class Readout:
     @property
     def gamma(self) -> float:
         """γ, by which K⁻¹ becomes Σ⁻¹."""
-        return self.solution.rows / (1 - self.share)
+        return self.rows / (1 - self.share)
 
     @property
     def shares(self) -> FloatArray:

@@ -252,7 +252,7 @@ def test_the_start_is_f_itself_as_its_windows_judge():
         logits = start.bias + sum(frozen[width] @ start.heads[width] for width in start.heads)
         chances = np.exp(logits - logits.max())
         said = dict(learner.predict(SCENE.touch(NAMES[3], 40)).ranking)
-        odd = model.fusion.complete.model_outlier_rate  # f's answers leave a share for outliers
+        odd = model.fitted.complete.readout_outliers  # f's answers leave a share for outliers
         chances = (1 - odd) * chances / chances.sum() + odd / len(chances)
         assert said == pytest.approx(dict(zip(model.names, chances, strict=True)), abs=1e-4)
 

@@ -5,11 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scroll_tactile.prediction.moment_table import Trajectories
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
+from scroll_tactile.prediction.fitting import rehearse
+from scroll_tactile.prediction.model import Trajectories
 from scroll_tactile.readouts.dependence import Dependence
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
@@ -32,7 +33,9 @@ def learned(touches=TOUCHES, **settings):
 @cache
 def model_of(learner):
     """The model of a learner that observes nothing more."""
-    return learner.model()
+    model = learner.model()
+    rehearse(model)
+    return model
 
 
 def rule_of(learner, risk):

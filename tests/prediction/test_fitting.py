@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+from live_touches import touched
 
-from scroll_tactile import Kernels, Sensor, TactileLearner
+from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.clients.report.facts import _without
-from scroll_tactile.matching.likelihood import MISSING
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
-from scroll_tactile.prediction.fitting import Draft, at_pace
+from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.judging import held_out_touches, judged
-from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import one_thread
 
@@ -49,58 +48,24 @@ def faster(readings, times):
     return np.stack([np.interp(places, range(len(readings)), channel) for channel in readings.T], axis=1)
 
 
-def table(model):
-    """All numbers of the table of moments, as bytes."""
-    rows = (*model.fusion.moments, *model.fusion.paced)
-    said = model.fusion.trajectories
-    numbers = [
-        [value for name, value in vars(row).items() if name not in ("calibration", "mean_excess_loss", "loss_spread")]
-        for row in rows
-    ]
-    arrays = [said.chances, said.novelty, *(part for row in rows for part in vars(row.calibration).values())]
-    return numbers, [array.tobytes() for array in arrays]
-
-
-def test_what_is_fitted_to_is_what_the_model_says_of_a_touch_that_it_lacks(model, extractor):
-    """Of each beginning of a touch that readouts and kept touches never observed, as the table reads it."""
-    said, fusion, apart = model.fusion.trajectories, model.fusion, []
-    rows = fusion.matcher.kept.rows()
-    keys = sorted(rows)  # all of them are held out: they are fewer than that
-    assert len(said.targets) == len(keys) == len(TOUCHES)
+def test_what_is_rehearsed_is_what_the_model_says_of_a_touch_that_it_lacks(learner, model, extractor):
+    """Of each beginning of a touch that readouts and kept touches never observed."""
+    rehearse(model)
+    said, weighing, apart = model.fitted.trajectories, model.fitted, []
+    rows, keys = model.matcher.kept.rows(), [key for _, key, _ in weighing.sample]
+    assert len(said.targets) == len(rows) == len(TOUCHES)  # all are held out: they are few
     for touch in held_out_touches(model, 0.05)[::7]:
-        stream = stream_of(fusion.matcher.kept.levels(rows[touch.key]), SKIN)
-        with _without(model, touch) as other, one_thread():
-            for i, moment in enumerate(fusion.moments[:-1]):
-                beginning = stream.first(moment.steps / SKIN.rate)
-                encoded = extractor.encode(beginning, model.longest, lambda at: model.scales_for(NAMES, at))
-                alone = other.judge(sorted(NAMES), encoded.means, moment.steps, "prefix")
+        stream = stream_of(model.matcher.kept.levels(rows[touch.key]), SKIN)
+        other = _without(model, learner.memory, touch)
+        with one_thread():
+            for i, row in enumerate(weighing.early):
+                encoded = extractor.encode(
+                    stream.first(row.steps / SKIN.rate), model.longest, lambda at: model.scales_for(NAMES, at)
+                )
                 found = judged(other, extractor, sorted(NAMES), encoded)
-                if alone.probability.max() < 0.99:
-                    own = said.chances[keys.index(touch.key), i]
-                    apart.append(np.abs(found.probability - own).max())
+                apart.append(np.abs(found.probability - said.chances[keys.index(touch.key), i]).max())
     assert len(apart) > 4
     assert np.median(apart) < 0.05  # a prediction looks for noise in the beginning alone
-
-
-@pytest.mark.parametrize("order", [slice(None, None, -1), slice(1, None), "shuffled"])
-def test_settled_it_is_that_of_a_fresh_learner_to_the_bit(model, order):
-    if order == "shuffled":
-        places = np.random.default_rng(0).permutation(len(TOUCHES)).tolist()
-        again = learned([TOUCHES[i] for i in places])
-    elif order.step:
-        again = learned(TOUCHES[order])
-    else:
-        again = learned(TOUCHES[order])
-        again.predict(LATER[0][1])
-        again.observe(*TOUCHES[0])
-        again.predict(LATER[1][1])
-    again.settle()
-    assert table(again._predictor.current.settle(again._ledger)) == table(model)
-    fresh = learned()
-    fresh.settle()
-    for _, touch in LATER[:4]:
-        for asked in (touch, touch.first(0.2), faster(touch.readings, 2.0)):
-            assert again.predict(asked) == fresh.predict(asked)
 
 
 def test_nothing_is_fitted_when_it_is_asked_for(learner, monkeypatch):
@@ -111,9 +76,7 @@ def test_nothing_is_fitted_when_it_is_asked_for(learner, monkeypatch):
         learner.predict(touch.first(0.1), touch.first(0.3))
         learner.predict(faster(touch.readings, 1.7))
     with learner.live(contact="manual") as live:
-        live.begin()
-        live.push(LATER[0][1].readings)
-        assert live.end().prediction.material in NAMES
+        assert touched(live, LATER[0][1].readings).prediction.material in NAMES
 
 
 @pytest.mark.parametrize("times", [2.0, 0.5])
@@ -124,20 +87,73 @@ def test_a_touch_at_another_pace_is_known_and_right(learner, times):
 
 
 def test_beginnings_are_right_sooner_than_later_and_no_surer_than_that(model):
-    said = model.fusion.trajectories
+    rehearse(model)
+    said = model.fitted.trajectories
     right = (said.chances.argmax(axis=2) == said.targets[:, None]).mean(axis=0)
     assert right[-1] >= max(0.95, right[0])
     assert np.abs(said.chances.max(axis=2).mean(axis=0) - right).max() < 0.12
 
 
-def test_nothing_is_held_out_where_nothing_is_kept_or_too_few_are(extractor):
-    for few in (learned(kept_touches=0), learned(TOUCHES[:2]), learned(TOUCHES[:4]), learned(TOUCHES[:1])):
-        fusion = few.model().fusion
-        assert len(fusion.trajectories.targets) < FEWEST
-        assert fusion.complete.model_weight == 1.0
-        assert few.predict(TOUCHES[0][1]).material == TOUCHES[0][0]
-        for asked in (LATER[0][1], LATER[0][1].first(0.06), faster(LATER[0][1].readings, 2.0)):
-            assert np.isfinite(few.predict(asked).novelty)
+def waves(seed, readings):
+    return 50 + 30 * np.sin(np.arange(readings)[:, None] * (0.1 + 0.03 * (seed % 7)) + np.arange(6) + seed)
+
+
+FEW = {
+    "one touch": [("a", 1, 60)],
+    "one short touch": [("a", 1, 2)],
+    "one material": [("a", seed, 60) for seed in range(20)],
+    "two touches": [("a", 1, 60), ("b", 2, 60)],
+    "two short ones": [("a", 1, 2), ("b", 2, 2)],
+    "a short one and a long": [("a", 1, 2), ("b", 2, 60)],
+    "one of each": [(name, seed, 60) for seed, name in enumerate("abcdef")],
+    "one of another": [*(("a", seed, 60) for seed in range(20)), ("b", 3, 2)],
+    "all alike": [(name, 1, 60) for name in "abc"],
+    "any length": [(name, i, n) for i, n in enumerate((2, 3, 9, 60, 400, 4000, 2, 3, 4000)) for name in "abc"],
+}
+
+
+@pytest.mark.parametrize("kept_touches", [0, 1, None])
+@pytest.mark.parametrize("kind", FEW)
+def test_of_whatever_few_touches_everything_is_answered(kind, kept_touches):
+    """From touch to touch, of any length, live and settled."""
+    learner = TactileLearner(sensor=SKIN, embedding=Kernels(dimension=84), kept_touches=kept_touches)
+    learner.declare(Quantity(name="force", unit="N", low=0.0, high=9.0, resolution=0.1))
+    for i, (name, seed, readings) in enumerate(FEW[kind]):
+        values = {"force": float(i % 9)} if i % 2 else None
+        learner.observe(name, waves(seed, readings), values=values, labels={"slip": "ny"[i % 2]} if i == 1 else None)
+        if i + 1 == len(FEW[kind]):
+            learner.settle()
+        elif i not in (1, 5):
+            continue
+        for asked in (2, 9, 30, 60, 61, 130, 400):
+            said = [learner.predict(waves(40, asked)), learner.predict(waves(40, asked), waves(41, 60))]
+            assert {shown for one in said for shown, _ in one.ranking} == set(learner.materials)
+            assert np.allclose([sum(share for _, share in one.ranking) for one in said], 1.0)
+            assert np.isfinite([one.novelty for one in said]).all()
+            assert learner.estimate(waves(40, asked)).keys() == {"force"}  # R1
+            if i:
+                assert learner.predict(waves(40, asked), of="slip").probability == 1.0  # R2
+        with learner.live(contact="manual", of="slip" if i else None) as live:
+            assert touched(live, waves(40, 60)).prediction.probability > 0
+
+
+def test_more_materials_than_the_sample_has_touches_each_of_one_short_touch():
+    """R3."""
+    learner = learned([(f"m{i}", waves(i, 20) + 15 * np.sin(i * np.arange(1, 7))) for i in range(1030)])
+    said = learner.predict(waves(5, 20) + 15 * np.sin(5 * np.arange(1, 7)))
+    assert (said.material, len(said.ranking)) == ("m5", 1030)
+
+
+def test_a_material_comes_to_a_ridge_after_opening(path):
+    """R4."""
+    how = {"sensor": SKIN, "embedding": Kernels(dimension=84), "readout": "ridge", "kept_touches": 0, "exemplars": 0}
+    with TactileLearner.open(path, **how) as learner:
+        for name, touch in TOUCHES:
+            learner.observe(name, touch)
+        learner.predict(TOUCHES[0][1])
+    with TactileLearner.open(path, readout="ridge") as learner:
+        learner.observe("new", waves(3, 60))
+        assert learner.predict(waves(3, 60)).material == "new"
 
 
 @pytest.mark.parametrize("kept_touches", [0, None])
@@ -157,18 +173,7 @@ def test_touches_with_gaps_are_held_out_too():
         readings = touch.readings.copy()
         readings[rng.random(readings.shape) < 0.1] = np.nan
         learner.observe(name, readings)
-    assert np.isfinite(learner.model().fusion.trajectories.chances).all()
     assert learner.predict(TOUCHES[0][1].readings[:12]).material in NAMES
-
-
-def test_a_touch_at_another_pace_is_blended_from_its_neighbours():
-    levels = np.array([[0, 10, 20, 30], [5, MISSING, 7, 8]], np.uint8)
-    assert at_pace(levels, 0.5).shape == (2, 8)
-    assert at_pace(levels, 2.0).tolist() == [[0, 30], [MISSING, 8]]
-    slow = at_pace(levels, 0.57)
-    assert slow[0].tolist() == [0, 5, 10, 15, 20, 25, 30]
-    assert slow[1].tolist() == [MISSING, MISSING, MISSING, MISSING, 7, 8, 8]
-    assert at_pace(levels[:1], 1.0).tolist() == levels[:1].tolist()
 
 
 def test_what_was_fitted_to_single_touches_takes_in_second_ones_after_opening(tmp_path):

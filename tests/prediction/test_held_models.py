@@ -14,7 +14,6 @@ from touches import PAD, SMALL
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError
 from scroll_tactile.live import session
-from scroll_tactile.matching.likelihood import Noise
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft
 
@@ -102,36 +101,14 @@ def test_a_session_begins_while_another_thread_observes_and_predicts(monkeypatch
     def decision_rule(model, risk):
         if len(ruled) == 1:  # in the midst of beginning
             beside(changing(learner))
-        ruled.append((model.fusion, own(model, risk)))
-        return ruled[-1][1]
+        ruled.append(own(model, risk))
+        return ruled[-1]
 
     monkeypatch.setattr(session, "decision_rule", decision_rule)
     other.live(contact="manual").close()
     learner.live(contact="manual").close()
     assert "n" in learner.materials
-    (undisturbed, rule), (found, again) = ruled
-    assert again == rule
-    assert found.trajectories.chances.tobytes() == undisturbed.trajectories.chances.tobytes()
-    assert found.trajectories.novelty.tobytes() == undisturbed.trajectories.novelty.tobytes()
-
-
-def test_a_model_is_followed_while_a_session_asks_the_one_that_it_holds(monkeypatch):
-    learner, count = learned(), []
-    with learner.live(contact="manual") as live:
-        live.begin()
-        live.push(touch("a", 9, 30))
-        model = live._under_way.frozen.model
-        likelihood = model.matcher.deviation.likelihood
-
-        def copied(noise, memo):
-            if not count:
-                count.append(True)
-                beside(lambda: likelihood.table(Noise(777)))
-            return noise
-
-        monkeypatch.setattr(Noise, "__deepcopy__", copied, raising=False)
-        changing(learner)()
-        assert live.end().prediction.material == "a"
+    assert ruled[0] == ruled[1]
 
 
 def test_a_live_touch_is_answered_by_the_memory_as_it_was_when_it_began(monkeypatch):
@@ -159,32 +136,15 @@ def test_a_prediction_is_of_one_state_that_there_was(monkeypatch, readings):
     assert prediction == before.predict(touch("b", 9, readings))
 
 
-def test_a_held_model_stays_as_it_is_and_what_nobody_holds_is_followed_in_place():
+def test_a_held_model_stays_as_it_is_to_the_bit():
     learner = learned()
-    held = learner._predictor.current.frozen(learner._ledger)
-    arrays = {name: value.copy() for name, value in _arrays(held.model).items()}
+    model, extractor = learner._predictor.present(), learner._predictor.extractor
+    encoded = extractor.encode(extractor.stream(touch("b", 9, 20)), model.longest, lambda at: model.scales_for("abc", at))
+    before = learner._predictor.answer_of(model, list("abc"), [encoded])
     changing(learner)()
-    now = _arrays(held.model)
-    assert held.model.names == ["a", "b", "c"]
-    assert all(np.array_equal(now[name], arrays[name]) for name in arrays)
-    current = learner._predictor.current.frozen(learner._ledger).model
-    assert current is not held.model
-    learner.observe("c", touch("c", 70))
-    assert learner._predictor.current.present(learner._ledger) is current  # not fitted anew: what follows shows that
-    assert current.readouts[min(current.readouts)].counts.sum() > 0
-
-
-def _arrays(model):
-    found = {}
-    for scale, readout in model.readouts.items():
-        found |= {f"{scale} {name}": getattr(readout.near, name) for name in ("means", "solved", "sizes")}
-        found[f"{scale} counts"] = readout.counts
-        rank = readout.system.rank
-        found |= {f"{scale} e": readout.system._e[:rank, :rank], f"{scale} white": readout.system._white[:rank]}
-    matcher, conformal = model.matcher, model.conformal
-    found |= {f"kept {name}": getattr(matcher.kept, name) for name in ("blocks", "wide_blocks", "labels")}
-    found |= {"steps": conformal._steps, "places": conformal._places, "held": np.array(len(conformal._touches))}
-    return found
+    learner.settle()
+    assert learner._predictor.present() is not model
+    assert learner._predictor.answer_of(model, list("abc"), [encoded]) == before
 
 
 def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
@@ -193,7 +153,7 @@ def test_a_model_is_fitted_to_the_memory_as_it_was_when_that_began():
     for seed in range(12):
         learner.observe("a", touch("a", 60 + seed, 20))
     assert learner.memory.statistics.fifth_percentile_length == 20
-    assert draft.fit(learner._predictor.extractor).least == other.model().least == 50
+    assert draft.fit().fitted.least == other.model().fitted.least == 50
 
 
 # Embedded again

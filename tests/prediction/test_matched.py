@@ -99,7 +99,7 @@ def test_noise_alone_and_what_was_never_touched_is_unknown(matching):
 
 
 def test_a_touch_that_the_model_is_sure_of_is_its_alone(matching, alone):
-    outliers = alone.model().fusion.complete.model_outlier_rate
+    outliers = alone.model().fitted.complete.readout_outliers
     most = 1 - outliers * (1 - 1 / len(NAMES))  # what forty touches can vouch for
     sure = [values for _, values in ASKED if alone.predict(values).probability > 0.999 * most]
     assert len(sure) > len(ASKED) / 2

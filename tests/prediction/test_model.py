@@ -62,7 +62,7 @@ def require_same_odds(part, whole, scene, odd):
 def test_the_probabilities_of_a_scene_are_those_of_its_materials_alone(readout, scene, seed):
     whole = shared(readout, WINDOWED).predict(stream(seed % 12, seed))
     part = shared(readout, WINDOWED).predict(stream(seed % 12, seed), scene=sorted(scene, reverse=True))
-    require_same_odds(part, whole, scene, model_of(readout, WINDOWED).fusion.complete.model_outlier_rate)
+    require_same_odds(part, whole, scene, model_of(readout, WINDOWED).fitted.complete.readout_outliers)
 
 
 @settings(max_examples=40, deadline=None)
@@ -75,7 +75,7 @@ def test_how_strange_a_view_looks_depends_on_what_can_be_there(readout, scene, s
     for scale in learner.plan.scales:
         scores = model.readouts[scale].scores(means[scale], np.arange(len(NAMES)), readout)
         scene = scene | {NAMES[int(scores.argmax())]}
-    odd = model.fusion.complete.model_outlier_rate
+    odd = model.fitted.complete.readout_outliers
     require_same_odds(learner.predict(probe, scene=sorted(scene)), learner.predict(probe), scene, odd)
 
 

@@ -187,7 +187,7 @@ FORGED = [
     *((f"{ROW}.calibration.weights", value) for value in ([], [[1.0]], [1.0] * 9, ["x"], [float("nan")], None)),
     *((f"{ROW}.calibration.median_distances", value) for value in ([], [1.0] * 9, None)),
     *((f"{ROW}.calibration.scale_novelty", value) for value in ([], [1.0], None)),
-    *((f"{ROW}.excess", value) for value in (None, 1, ["x", 1.0])),
+    *((f"{ROW}.excess", value) for value in (None, 1, ["x", 1.0], [1.0], [1.0] * 3)),
     ("weighing.dependence", None),
     ("kept.0", [1.0]),
     ("kept.2", None),

@@ -1,4 +1,4 @@
-"""The weighing that a checkpoint has: every checkpoint at the end has it, and whoever opens the memory answers by it."""
+"""Each checkpoint that a writer leaves at the end has a weighing, and whoever opens the memory answers by it."""
 
 from touches import filled
 

@@ -54,8 +54,9 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
         reached = model.stages[: len(weighing.rows)]
         whole = [*reached[-1], *model.views]
         scales = [*reached, whole, model.views or whole]
-        for row, own in zip([*weighing.rows, weighing.complete, weighing.paced], scales, strict=True):
+        for i, (row, own) in enumerate(zip([*weighing.rows, weighing.complete, weighing.paced], scales, strict=True)):
             _require_fitting(row, own, model)
+            _require(row.stage == min(i, len(reached) - 1), "the stage of each row")
         _require_sound(weighing, model)
         matcher = model.matcher
         if matcher is not None:
@@ -87,7 +88,7 @@ def _require_fitting(row: Row, scales: list[Scale], model: Model) -> None:
     _require(np.isfinite(weights).all() and min(0, *weights, *away, row.distance_limit) == 0, "numbers that are >= 0")
     _require(min(spreads) >= LEAST_SPREAD, "spreads")
     _require(0 <= row.readout_outliers <= 1 and 0 <= row.outliers <= 1, "shares")
-    _require(1 <= row.steps <= LARGEST and 0 <= row.stage < len(model.stages), "a length and its stage")
+    _require(1 <= row.steps <= LARGEST, "a length")
 
 
 def _require_sound(weighing: Weighing, model: Model) -> None:

@@ -181,7 +181,7 @@ FORGED = [
     *((place, value) for place in ("weighing.rows", "weighing.complete", "kept") for value in (None, [], {}, 1, "x")),
     *((place, value) for place in ("weighing.tau", "weighing.touches") for value in (None, True, "1", [1])),
     *((place, value) for place in ("weighing.tau", f"{ROW}.outliers") for value in (10**400, -1.0, 1.5, float("nan"))),
-    *((f"weighing.complete.{name}", 0) for name in ("steps", "excess.1", "calibration.scale_novelty.0.1")),
+    *((f"weighing.complete.{name}", 0) for name in ("steps", "stage", "excess.1", "calibration.scale_novelty.0.1")),
     *((f"{ROW}.{name}", -1.0) for name in ("steps", "stage", "distance_limit", "calibration.weights.0")),
     *((f"{ROW}.calibration.weights.0", value) for value in (1e308, float("inf"))),
     *((f"{ROW}.calibration.thresholds.{name}", [0]) for name in ("names", "targets", "novelties", "if_new")),

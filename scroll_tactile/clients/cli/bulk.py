@@ -38,7 +38,7 @@ from scroll_tactile.clients.cli.terminal import (
     verdict,
     with_options,
 )
-from scroll_tactile.errors import InputError
+from scroll_tactile.errors import InputError, ScrollTactileError
 from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
@@ -77,6 +77,8 @@ def learn(
             opening = nullcontext(TactileLearner(sensor=chosen))
         with opening as learner:
             done = learn_sources(learner, found, options, progress)
+            with suppress(ScrollTactileError):  # the touches are learned: who opens the memory is told
+                learner.settle()
             held = sum(learner.materials.values())
     done.refused[:0] = missing
     _report_learned(done, held, as_json)

@@ -317,6 +317,8 @@ def merge(
     """Make a memory the one that observed all that both did, exactly; what both observed counts once."""
     with opened_for_upkeep(folder) as learner, progress_bar() as progress:
         done = learner.merge(other, progress=progress)
+        with suppress(ScrollTactileError):  # what came in is there: who opens the memory is told
+            learner.settle()
         digest, count = learner.digest(), sum(learner.materials.values())
     say(
         f"{counted(done.observations, 'observation')} came in, {counted(done.shared, 'stream')} observed by both; "

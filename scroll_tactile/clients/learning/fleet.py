@@ -21,7 +21,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from itertools import accumulate
 from multiprocessing import get_all_start_methods, get_context, parent_process
@@ -397,6 +397,8 @@ class Destination:
             raise InputError(f"nothing was learned, and no memory made: {len(refused)} sources were refused{first}")
         self._report.held, self._report.digest = sum(self.learner.materials.values()), self.learner.digest()
         self.learner._ledger.saves = True
+        with suppress(ScrollTactileError):  # the touches are learned: who opens the memory is told
+            self.learner.settle()
         self.learner.close()
 
 

@@ -91,13 +91,13 @@ class Draft:
     before: Model | None
     longest: int
     least: int
-    touches: int
+    counts: list[int]
 
     @classmethod
     def of(cls, memory: Memory, kind: ReadoutName, before: Model | None = None) -> Draft:
         """The draft of a memory as it is now. before: an earlier model of it."""
         statistics, sample = memory.statistics, list(memory.sample)
-        names = list(statistics.materials)
+        names, counts = list(statistics.materials), list(statistics.materials.values())
         if kind == "ridge" and len(names) > MOST_OF_RIDGE:
             raise InputError(
                 f'the readout "ridge" weighs {MOST_OF_RIDGE} materials at most; there are {len(names)}: take "lda"'
@@ -110,7 +110,7 @@ class Draft:
         views = [view for view in memory.plan.views if view in tasks]
         kept = memory.kept.touches() if memory.kept is not None and views else []
         lengths = statistics.longest, max(1, min(statistics.fifth_percentile_length, statistics.longest))
-        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, statistics.touches)
+        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, counts)
 
     def fit(self, *, rehearsed: bool = False) -> Model:
         """Solve the readouts and weigh them. Can be called once: it frees the tasks. rehearsed: with trajectories."""
@@ -119,6 +119,8 @@ class Draft:
             if (weighing := _weighed(self, model)) is not None and model.matcher is not None:
                 weighing, matcher = _by_kept_touches(weighing, model.matcher)
                 model = replace(model, matcher=matcher)
+        if weighing is not None:
+            weighing = _with_all_touches(weighing, self.counts)
         model = replace(model, weighing=weighing)
         if rehearsed:
             rehearse(model)
@@ -194,11 +196,25 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
         tau=UNMATCHED,
         dependence=dependence_of(held),
         least=draft.least,
-        touches=draft.touches,
+        touches=sum(draft.counts),
         sample=draft.sample,
         held_out=held_out,
         neighbours=found_near,
     )
+
+
+def _with_all_touches(weighing: Weighing, counts: Sequence[int]) -> Weighing:
+    """The weighing for touches to come, which are scored more surely than those held out. counts: of the materials."""
+    several = [count for count in counts if count > 1]
+    if not several:
+        return weighing
+    median = float(np.median(several))
+
+    def surer(row: Row) -> Row:
+        return replace(row, calibration=row.calibration.with_all_touches(median))
+
+    rows = tuple(map(surer, weighing.rows))
+    return replace(weighing, rows=rows, complete=surer(weighing.complete), paced=surer(weighing.paced))
 
 
 def _outlier_rate(own: FloatArray, materials: int) -> float:
@@ -381,7 +397,7 @@ def _measured_paces(
         novelties = np.sort(((values - mean) / spread).mean(axis=1))
         # As many of these lie above the threshold as of touches in their own time.
         rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
-        high = float(novelties[rank]) / max(row.calibration.thresholds.above(1 - WITHIN), LEAST_SPREAD)
+        high = float(novelties[rank]) / max(row.calibration.thresholds.above("", 1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
         for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
             scores = match_scores(matcher, held.names, match)

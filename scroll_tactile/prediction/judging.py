@@ -111,7 +111,7 @@ def answer(
 
 def _known(novelty: float, material: str, thresholds: Sequence[NoveltyThresholds], false_alarms: float) -> bool | None:
     """Whether touches of one thing that are answered by a material are of a known one; None where that is not told."""
-    above = [each.above(false_alarms, material) for each in thresholds]
+    above = [each.above(material, false_alarms) for each in thresholds]
     below = [each.below(false_alarms) for each in thresholds]
     if novelty > math.fsum(above) / len(above):
         return False
@@ -217,7 +217,7 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     """The judgement by the readouts. For a novel touch its match names how it differs."""
     unusual = _of_length(model, encoded)
-    if model.matcher is not None and alone.novelty > alone.row.calibration.thresholds.above(1 - WITHIN):
+    if model.matcher is not None and alone.novelty > alone.row.calibration.thresholds.above("", 1 - WITHIN):
         match = model.matcher.match(_levels_of(encoded.stream), noise=None)
         unusual = _unusual(model, encoded, match, _own_hypothesis(model, encoded))
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
@@ -330,7 +330,7 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
             names = tuple(held.names)
             called = names[int(result.probability.argmax())]
-            threshold = row.calibration.thresholds.above(false_alarms, called)
+            threshold = row.calibration.thresholds.above(called, false_alarms)
             answers[place] = HeldOutTouch(material, key, names, result.probability, result.novelty, threshold)
     return list(answers.values())
 

@@ -83,11 +83,11 @@ def enough_memory() -> Iterator[None]:
 class Row:
     """How touches are judged from a length on, by readouts and kept touches.
 
-    steps: that length; of a complete touch, that of most. stage: that it belongs to. scales: that judge.
-    calibration: of their scores. readout_outliers: ε of the readouts' own probabilities, the share of touches unlike all others of their material;
-    outliers: ε where kept touches judge beside them. distance_limit: the relative distance that 19 of 20 complete
-    touches stay below; infinite in the rows of prefixes. excess: mean and spread of the excess loss of known touches
-    beside the kept ones.
+    steps: that length; of a complete touch, that of most. stage: that it belongs to. scales: that judge. calibration:
+    of their scores. readout_outliers: ε of the readouts' own probabilities, the share of touches unlike all others of
+    their material; outliers: ε where kept touches judge beside them. distance_limit: the relative distance that 19 of
+    20 complete touches stay below; infinite in the rows of prefixes. excess: mean and spread of the excess loss of
+    known touches beside the kept ones.
     """
 
     steps: int

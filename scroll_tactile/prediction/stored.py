@@ -28,6 +28,7 @@ MADE_BY = f"{__version__}, 1"  # the release, in which judging may differ, and t
 # Of a weighing: made again from the memory where they are asked for.
 NOT_STORED = "sample", "held_out", "neighbours", "trajectories"
 LATER: dict[str, Any] = {"held_out": None, "neighbours": {}, "trajectories": None}
+LARGEST, LEAST_SPREAD = 1e12, 1e-30  # of a number that was fitted, and of a spread: no answer is NaN by those within
 
 
 def weighing_text(model: Model) -> str | None:
@@ -53,13 +54,16 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
         reached = model.stages[: len(weighing.rows)]
         whole = [*reached[-1], *model.views]
         scales = [*reached, whole, model.views or whole]
-        for row, own in zip([*weighing.rows, weighing.complete, weighing.paced], scales, strict=True):
+        for i, (row, own) in enumerate(zip([*weighing.rows, weighing.complete, weighing.paced], scales, strict=True)):
             _require_fitting(row, own, model)
+            _require(row.stage == min(i, len(reached) - 1), "the stage of each row")
+        _require_sound(weighing, model)
         matcher = model.matcher
         if matcher is not None:
             spread, weights, *natural = found["kept"]
             tables = Likelihood(_numbers(spread, (LEVELS,)), _numbers(weights, (LEVELS,)))
             coherence, energy, most = _numbers(natural, (3,)).tolist()
+            _require(min(*spread, *weights, *natural) > 0, "numbers above 0")
             matcher = TouchMatcher(matcher.kept, NaturalDeviation(tables, coherence, energy, most))
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"it is no weighing ({type(error).__name__}: {error})") from error
@@ -70,17 +74,41 @@ def _require_fitting(row: Row, scales: list[Scale], model: Model) -> None:
     calibration, count = row.calibration, len(scales)
     if list(row.scales) != scales or not set(scales) <= model.readouts.keys():
         raise ValueError(f"expected a row of the scales {scales}; came {row.scales}")
-    _numbers(calibration.weights, (count,))
-    _numbers(calibration.median_distances, (count,))
+    weights = _numbers(calibration.weights, (count,))
+    away = _numbers(calibration.median_distances, (count,))
     measures = len(measuring(scales))
     if len(calibration.thresholds.novelties):
         measures += sum(1 for scale in scales if scale.width)
-    _numbers(calibration.scale_novelty, (measures, 2))
+    spreads = [*_numbers(calibration.scale_novelty, (measures, 2))[:, 1], _numbers(row.excess, (2,))[1]]
+    held = calibration.thresholds
+    for values in (held.targets, held.novelties, held.if_new):
+        _numbers(values, (len(held.novelties),))
+    _require(isinstance(held.names, list) and all(isinstance(name, str) for name in held.names), "names")
+    _require(all(0 <= place < len(held.names) for place in held.targets), "places of names")
+    _require(np.isfinite(weights).all() and min(0, *weights, *away, row.distance_limit) == 0, "numbers that are >= 0")
+    _require(min(spreads) >= LEAST_SPREAD, "spreads")
+    _require(0 <= row.readout_outliers <= 1 and 0 <= row.outliers <= 1, "shares")
+    _require(1 <= row.steps <= LARGEST, "a length")
+
+
+def _require_sound(weighing: Weighing, model: Model) -> None:
+    dependence, paces = weighing.dependence, weighing.paces
+    _require(0 < weighing.tau <= 1 and 0 <= min(vars(dependence).values()) <= max(vars(dependence).values()) <= 1, "τ")
+    _require(1 <= weighing.least <= LARGEST and 1 <= weighing.touches <= LARGEST, "a length and a count")
+    if paces is not None:
+        measures = len(measuring(model.views)) + 1
+        own, others = _numbers(paces.own, (measures, 2)), _numbers(paces.others, (2, measures, 2))
+        _require(min(own[:, 1].min(), others[..., 1].min()) >= LEAST_SPREAD and 0 <= paces.power <= LARGEST, "paces")
+
+
+def _require(holds: bool | np.bool, expected: str) -> None:
+    if not holds:
+        raise ValueError(f"expected {expected}; came others")
 
 
 def _numbers(values: Any, shape: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.float64]]:
     found = np.array(values, dtype=np.float64)
-    if found.shape != shape or np.isnan(found).any():
+    if found.shape != shape or np.isnan(found).any() or (np.abs(found[np.isfinite(found)]) > LARGEST).any():
         raise ValueError(f"expected {shape} numbers; came {found.shape}")
     return found
 

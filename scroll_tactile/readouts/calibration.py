@@ -93,10 +93,10 @@ class NoveltyThresholds:
     novelties: FloatArray = field(default_factory=lambda: np.zeros(0))
     if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
 
-    def above(self, false_alarms: float, material: str = "") -> float:
+    def above(self, material: str, false_alarms: float) -> float:
         """The novelty above which a touch that is answered `material` is new: a share `false_alarms` of known ones.
 
-        Without a material, that which all share.
+        Of "", and of a material with few touches, that which all share.
         """
         if len(self.novelties) < FEWEST:
             return UNMEASURED
@@ -117,7 +117,7 @@ class NoveltyThresholds:
 
     def detects(self, false_alarms: float) -> bool:
         """Whether most touches would lie above the shared threshold, had their materials never been observed."""
-        return np.isfinite(self.below(false_alarms)) and float(np.median(self.if_new)) > self.above(false_alarms)
+        return np.isfinite(self.below(false_alarms)) and float(np.median(self.if_new)) > self.above("", false_alarms)
 
     @cached_property
     def _alike(self) -> FloatArray:
@@ -331,14 +331,6 @@ class HeldOutProbabilities:
     distance: FloatArray
     novelty: FloatArray
 
-    @property
-    def margins(self) -> FloatArray:
-        """How far each one's own material is ahead of the next, in logits; below 0 where it is behind, (N,)."""
-        rows = np.arange(len(self.targets))
-        others = self.logs.copy()
-        others[rows, self.targets] = -np.inf
-        return np.asarray(self.logs[rows, self.targets] - others.max(axis=1, initial=-np.inf))
-
 
 def held_out_probabilities(
     found: StageScores, scales: Sequence[Scale], calibration: Calibration, neighbours: Sequence[Neighbours] = ()
@@ -367,18 +359,13 @@ def scale_weights(scores: FloatArray, targets: Sequence[int], prior: float) -> F
 
 
 def fit_weights(
-    scores: FloatArray,
-    targets: Sequence[int],
-    prior: FloatArray,
-    touches: float = PRIOR_TOUCHES,
-    counts: FloatArray | None = None,
+    scores: FloatArray, targets: Sequence[int], prior: FloatArray, touches: float = PRIOR_TOUCHES
 ) -> FloatArray:
     """Weights ≥ 0 of least log loss, a convex problem, drawn to the prior where touches are few.
 
     scores: of held-out touches, shape (touches, scales, classes). targets: the class of each. touches: how many the
-    prior counts as. counts: how many touches each of them stands for, shape (touches,); 1 unless given.
+    prior counts as.
     """
-    counted = np.ones(len(scores)) if counts is None else counts
     gap = scores - np.take_along_axis(scores, np.array(targets)[:, None, None], axis=2)
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -388,11 +375,10 @@ def fit_weights(
         total = chances.sum(axis=1, keepdims=True)
         chances /= total
         mean = np.einsum("tsc,tc->ts", gap, chances)
-        chances *= counted[:, None]
         pull = weights / prior - 1
-        value = float(counted @ (np.log(total) + top)[:, 0]) + touches * float(pull @ pull) / 2
-        curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ (counted[:, None] * mean)
-        return value, counted @ mean + touches * pull / prior, curve + np.diag(touches / prior**2)
+        value = float((np.log(total) + top).sum()) + touches * float(pull @ pull) / 2
+        curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ mean
+        return value, mean.sum(axis=0) + touches * pull / prior, curve + np.diag(touches / prior**2)
 
     # Newton's steps, projected (Bertsekas 1982), in one to three weights: scipy.optimize is 20 MB and a tenth of a
     # second to import, of the quarter of a second in which a memory that was just opened answers.

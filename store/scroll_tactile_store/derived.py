@@ -1,7 +1,7 @@
 """What follows from a checkpoint, in files of the folder `derived`, and counts where it is of that checkpoint.
 
 A file is a mark and version, the checkpoint's sha256, the lengths of the two parts that come next, a JSON object, and
-arrays as a row has them, compressed where that halves them; then a digest of all before. The digest has no key: a file
+arrays as a row has them; then a digest of all before. The digest has no key: a file
 from elsewhere can hold anything, and whoever reads it has to check what he needs.
 """
 
@@ -36,7 +36,7 @@ def write_derived(folder: Path, name: str, follows: str, attributes: str, arrays
 
     follows: the sha256 of the checkpoint, in hexadecimal. attributes: JSON. Raises OSError, RecordError.
     """
-    parts = [attributes.encode("ascii"), encode_payload(arrays, sparingly=True)]
+    parts = [attributes.encode("ascii"), encode_payload(arrays)]
     write_digested(folder / DERIVED / name, HEADER.pack(MARK, bytes.fromhex(follows), *map(len, parts)), *parts)
 
 

@@ -150,10 +150,8 @@ def array_digest(array: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def encode_payload(arrays: Mapping[str, np.ndarray], *, sparingly: bool = False) -> bytes:
+def encode_payload(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return checked arrays as the bytes of a journal row's payload.
-
-    sparingly: only what compressing halves is compressed, and the rest is read at once.
 
     Raises RecordError when they hold more than 256 MiB together.
     """
@@ -164,7 +162,7 @@ def encode_payload(arrays: Mapping[str, np.ndarray], *, sparingly: bool = False)
         )
     if len(arrays) > 0xFFFF:
         raise RecordError(f"one record has {len(arrays)} arrays, more than 65535")
-    payload = _packed(arrays, _halved if sparingly else _compressed)
+    payload = _packed(arrays, _compressed)
     return payload if size <= SPARE + RATIO * len(payload) else _packed(arrays, _plain)
 
 
@@ -188,11 +186,6 @@ def _compressed(array: np.ndarray) -> tuple[int, bytes]:
     if raw.size >= SMALL and len(frame := compress(raw, item_size(array.dtype))) < raw.size:
         return ZSTD, frame
     return _plain(array)
-
-
-def _halved(array: np.ndarray) -> tuple[int, bytes]:
-    codec, buffer = _compressed(array)
-    return (codec, buffer) if 2 * len(buffer) <= array.nbytes else _plain(array)
 
 
 def _plain(array: np.ndarray) -> tuple[int, bytes]:

@@ -11,7 +11,7 @@ from scroll_tactile_store.records import LARGEST_NUMBER, Head, check_key, check_
 __all__ = [
     "HEAD_BYTES",
     "ROW",
-    "Row",
+    "JournalRow",
     "decode_head",
     "decode_row",
     "encode_row",
@@ -31,7 +31,7 @@ DIGEST_BYTES = 16
 HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 
 
-class Row(NamedTuple):
+class JournalRow(NamedTuple):
     """A record's head, and the payload of its arrays; None where compaction gave that up."""
 
     head: Head
@@ -123,7 +123,7 @@ def decode_head(data: bytes, whole: int) -> Head:
     )
 
 
-def decode_row(data: bytes) -> Row:
+def decode_row(data: bytes) -> JournalRow:
     """Return the record; raise ValueError for what `encode_row` never made. Anybody can make a checksum."""
     head, kept = decode_head(data, len(data)), FIELDS.unpack_from(data)[3]
-    return Row(head, data[head_size(data, len(data)) :] if kept else None)
+    return JournalRow(head, data[head_size(data, len(data)) :] if kept else None)

@@ -93,14 +93,6 @@ def test_the_weights_are_those_of_least_loss_whatever_the_prior(touches, prior):
     np.testing.assert_allclose(found / prior, np.abs(expected.x), atol=2e-3)
 
 
-def test_a_touch_that_stands_for_many_weighs_as_so_many():
-    rng = np.random.default_rng(3)
-    scores, targets, counts = rng.normal(size=(9, 2, 4)), rng.integers(4, size=9), rng.integers(1, 5, size=9)
-    once = fit_weights(scores, targets.tolist(), np.ones(2), 1.0, counts.astype(float))
-    repeated = fit_weights(np.repeat(scores, counts, axis=0), np.repeat(targets, counts).tolist(), np.ones(2), 1.0)
-    np.testing.assert_allclose(once, repeated, rtol=1e-6)
-
-
 def test_scales_that_say_the_same_share_the_weight():
     """However far their common weight lies from the prior, and none runs into a corner."""
     rng = np.random.default_rng(0)
@@ -126,37 +118,24 @@ def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(un
         assert np.median(ahead.min(axis=1)) == pytest.approx(AHEAD, rel=1e-6)
 
 
-@pytest.mark.parametrize("touches", [8, 9, 19, 20, 99, 100, 256])
-@pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.3, 0.5])
-def test_the_threshold_is_the_least_that_keeps_the_conformal_promise(touches, share):
-    """Of n + 1 exchangeable touches the new one lies above rank r with probability (n + 1 − r) / (n + 1)."""
-    known = np.arange(1.0, touches + 1)
-    calibration = Calibration(np.ones(1), np.array([[0.0, 1.0]]), np.ones(1), known, known)
-    alarms = [Fraction(touches + 1 - rank, touches + 1) for rank in range(1, touches + 1)]
-    kept = [rank for rank, alarm in enumerate(alarms, start=1) if alarm <= Fraction(str(share))]
-    # Where not even the largest keeps it, twice that.
-    assert calibration.threshold(share) == (kept[0] if kept else 2 * touches)
-
-
 def test_with_few_touches_a_threshold_is_as_far_from_the_class_means_as_they_are_large():
     statistics, sample = scene(materials=2, touches=4)
     (stage,) = stages_of(statistics, sample, stages=STAGES[:1])
-    assert len(stage.novelties) == 0
+    assert len(stage.thresholds.novelties) == 0
     readout = Task.of(statistics, SCALES[0], ["0", "1"]).solve()
     means = statistics.sums(SCALES[0], ["0", "1"]) / statistics.counts(SCALES[0], ["0", "1"])[:, None]
     typical = np.mean([readout.novelty(mean, [0, 1]) for mean in means])
     size = np.diagonal(readout.derived().gram).mean()
     assert stage.novelty(np.array([typical])) == pytest.approx(0, abs=1e-6)
-    assert stage.novelty(np.array([typical + size])) == pytest.approx(stage.threshold(0.05))
+    assert stage.novelty(np.array([typical + size])) == pytest.approx(stage.thresholds.above("", 0.05))
 
 
 @pytest.mark.parametrize("kind", ["lda", "ridge"])
 def test_the_novelty_of_known_touches_is_standardised(kind):
     for stage in calibrated(kind):
-        assert len(stage.novelties) == 120
-        assert np.mean(stage.novelties) == pytest.approx(0, abs=1e-6)
-        assert np.std(stage.novelties) == pytest.approx(1, abs=1e-6)
-        assert np.array_equal(np.sort(stage.novelties), stage.novelties)
+        assert len(stage.thresholds.novelties) == 120
+        assert np.mean(stage.thresholds.novelties) == pytest.approx(0, abs=1e-6)
+        assert np.std(stage.thresholds.novelties) == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("materials", [1, 2, 3])
@@ -166,7 +145,7 @@ def test_novelty_is_measured_by_eight_touches_or_more_of_materials_that_have_oth
     counts = statistics.materials
     left_out = sum(counts[material] > 1 for material, *_ in sample) if len(counts) > 1 else 0
     for stage in stages_of(statistics, sample):
-        assert len(stage.novelties) == (left_out if left_out >= FEWEST else 0)
+        assert len(stage.thresholds.novelties) == (left_out if left_out >= FEWEST else 0)
         if not left_out:
             # All scales alike, and no more than by the prior, which is of the scores of all of them together.
             assert len(set(stage.weights.tolist())) == 1
@@ -185,8 +164,8 @@ def test_a_touch_counts_only_where_every_scale_left_it_out():
             statistics.add(material, codes)
             sample.add(material, rng.bytes(32), SampledTouch.of(REACHED[: len(codes)], codes))
     narrow, wide = stages_of(statistics, sample)
-    assert len(narrow.novelties) == 27
-    assert len(wide.novelties) == 10  # four of a and six of d
+    assert len(narrow.thresholds.novelties) == 27
+    assert len(wide.thresholds.novelties) == 10  # four of a and six of d
 
 
 positive = st.floats(1e-3, 1e6)
@@ -208,9 +187,9 @@ def test_a_scale_is_weighed_less_the_further_away_a_touch_is_in_it(scales):
 
 
 def test_new_touches_are_told_where_most_of_them_lie_above_the_threshold():
-    known, ones = np.arange(1.0, 100.0), np.ones(1)
-    new = {share: np.sort(np.where(np.arange(99) < 99 * share, 200.0, 0.0)) for share in (0.4, 0.6)}
-    found = {share: Calibration(ones, np.array([[0.0, 1.0]]), ones, known, values) for share, values in new.items()}
+    known, of = np.arange(1.0, 100.0), np.repeat([0, 1], [50, 49])
+    new = {share: np.where(np.arange(99) < 99 * share, 200.0, 0.0) for share in (0.4, 0.6)}
+    found = {share: NoveltyThresholds(("a", "b"), of, known, values) for share, values in new.items()}
     assert {share: one.detects(0.05) for share, one in found.items()} == {0.4: False, 0.6: True}
 
 
@@ -234,7 +213,7 @@ def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_wil
     near, by_first, by_second = np.array([3.0, 5.0]), np.array([10.0, 5.0]), np.array([3.0, 12.0])
     for calibration in (viewed, plain):
         assert len({float(calibration.novelty(distances)) for distances in (near, by_first, by_second)}) == 3
-    assert np.std(viewed.novelties) == pytest.approx(1, abs=1e-6)
+    assert np.std(viewed.thresholds.novelties) == pytest.approx(1, abs=1e-6)
 
 
 def local_novelty(touch, others):
@@ -350,17 +329,22 @@ def test_seldom_felt_materials_are_called_new_no_more_often_than_asked():
     assert (np.mean(alarms, axis=0) <= 0.12).all()
 
 
+def told_of(found, novelty):
+    """Whether a touch that is answered "a" is known."""
+    return False if novelty > found.above("a", 0.05) else True if novelty < found.below(0.05) else None
+
+
 def test_a_touch_is_known_where_hardly_any_new_one_is_as_near():
     known, new = [np.arange(100.0), np.arange(100.0)], [np.arange(60.0, 160), np.arange(60.0, 160)]
     found = thresholds(known, new)
     assert found.below(0.05) == 64  # of 201 ten at most may lie below, one of them the touch that is asked about
-    told = {novelty: found.known(novelty, "a", 0.05) for novelty in (0, 63, 64, 95, 96)}
+    told = {novelty: told_of(found, novelty) for novelty in (0, 63, 64, 95, 96)}
     assert told == {0: True, 63: True, 64: None, 95: None, 96: False}
     # One material alone: no new one was seen. Too few touches: neither can be said, but of one that is far off.
-    assert thresholds([np.arange(100.0)], [np.full(100, 900.0)]).known(1.0, "a", 0.05) is None
+    assert told_of(thresholds([np.arange(100.0)], [np.full(100, 900.0)]), 1.0) is None
     few = thresholds([np.arange(6.0), np.arange(6.0)], [np.full(6, 900.0)] * 2)
-    assert [few.known(novelty, "a", 0.05) for novelty in (0, 9, 10.5)] == [None, None, False]
-    assert NoveltyThresholds().known(4.9, "a", 0.05) is None
+    assert [told_of(few, novelty) for novelty in (0, 9, 10.5)] == [None, None, False]
+    assert told_of(NoveltyThresholds(), 4.9) is None
 
 
 @pytest.mark.parametrize("touches", [1.0, 2.0, 5.0, 1000.0])

@@ -66,7 +66,7 @@ def grown(learner, touches, rule=None):
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan)
     streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
     held_out = [(touch, streams[touch.key]) for touch in held_out_touches(model, 0.05) if touch.key in touches]
-    return model, growing(model, extractor, rule or decision_rule(model, 0.05), 0.05, held_out)
+    return model, growing(model, learner.memory, extractor, rule or decision_rule(model, 0.05), 0.05, held_out)
 
 
 def test_answers_grow_as_those_of_a_memory_without_the_touch(learner):

@@ -121,6 +121,7 @@ UNFIT = {
     "more than zeros": {"readings-rest": np.zeros(1, np.float32)},
     "no rest": {"readings-rest": None},
 }
+WEIGHINGS = b"", b"{", b"[]", b'{"": 1}', b'{"": NaN}', b'{"": "\xff"}', b'{"":' + b"[" * 10**5
 LARGE = 2**20 + 1
 CODES = {
     "large": ("magnitude", lambda codes: codes + LARGE),
@@ -351,6 +352,10 @@ def forged_memories():
     for name, value in pairs(ABOUT):
         said = f"checkpoint 1 .*({name}|tuned|exemplar)"
         yield f"{name} {str(value)[:40]}", "whole", attributed(name, value), said, DamageError
+    for text in WEIGHINGS:
+        weighed = np.frombuffer(text, np.uint8)
+        do = checkpoint(lambda _, arrays, weighed=weighed: arrays.update(weighings=weighed))
+        yield f"weighings {text[:12]}", "whole", do, "checkpoint 1 .*weighings", DamageError
 
 
 @pytest.mark.parametrize(("do", "match", "expected"), [pytest.param(*one, id=name) for name, *one in forged_rows()])

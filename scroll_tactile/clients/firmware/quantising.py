@@ -164,7 +164,7 @@ def _stage(
         _factor(2.0 ** (SPREAD_BITS - scale.bits) / (float(one) * len(among)))
         for one, scale in zip(spread, among, strict=True)
     ]
-    threshold = 2.0**SPREAD_BITS * (calibration.thresholds.above(false_alarms) + float((mean / spread).mean()))
+    threshold = 2.0**SPREAD_BITS * (calibration.thresholds.above("", false_alarms) + float((mean / spread).mean()))
     return ExportedStage(
         least=least,
         detects=several and calibration.thresholds.detects(false_alarms),

@@ -237,7 +237,7 @@ def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_al
                 probability=chance,
                 ranking=((name, chance),),
                 novelty=float(novelty[touch]),
-                known=bool(novelty[touch] <= row.calibration.thresholds.above(false_alarms)),
+                known=bool(novelty[touch] <= row.calibration.thresholds.above("", false_alarms)),
                 seconds=row.steps / rate,
             )
             if rule.decided(prediction, row.steps):

@@ -311,7 +311,7 @@ def novelty_measures(found: StageScores, neighbours: Sequence[Neighbours]) -> tu
     Both (N, S'): the least distance at each scale that measures novelty, then u among neighbours.
     """
     local = [each.held_out(found.places) for each in neighbours]
-    known, new = found.distances().min(axis=2), found.distances_if_new()
+    known, new = found.distances().min(axis=2, initial=np.inf), found.distances_if_new()
     return np.column_stack([known, *(u for u, _ in local)]), np.column_stack([new, *(u for _, u in local)])
 
 

@@ -54,7 +54,6 @@ def require_same_odds(part, whole, scene, odd):
     shares = {name: share - odd / len(whole.ranking) for name, share in whole.ranking if name in scene}
     expected = {name: (1 - odd) * share / sum(shares.values()) + odd / len(scene) for name, share in shares.items()}
     assert dict(part.ranking) == pytest.approx(expected, rel=1e-6, abs=1e-12)
-    assert part.novelty >= whole.novelty - 1e-9 * abs(whole.novelty)
 
 
 @settings(max_examples=40, deadline=None)
@@ -127,7 +126,8 @@ def test_competing_kernels_weigh_in_probabilities_and_not_in_novelty_or_distance
     scales = moment.scales
     assert COMPETING in scales
     assert moment.calibration.weights[scales.index(COMPETING)] > 0
-    assert len(moment.calibration.scale_novelty) == len(scales) - 1
+    windows = sum(bool(scale.width) for scale in scales)  # they measure how near sampled touches lie, too
+    assert len(moment.calibration.scale_novelty) == len(scales) - 1 + windows
     image = tactile_image(validate(touch, PAD))
     means = FeatureExtractor(PAD, SMALL, model.plan).means(image, scales)
     moved = means | {COMPETING: means[COMPETING][::-1]}

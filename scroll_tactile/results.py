@@ -172,8 +172,8 @@ class Prediction:
     ranking: every candidate with its probability, likeliest first; equal ones in alphabetical order.
     novelty: how unlike the candidates the touch is, in standard deviations above held-out touches of known materials.
         Infinite where nothing was ever observed; 0 where only one material was: there is nothing to compare it with.
-    known: False means "never felt this", and `material` is then only the nearest: the novelty is above that of all but a
-        share of the material's touches, the false-alarm rate. True: it is below that of all but as large a share of
+    known: False means "never felt this", and `material` is then only the nearest: the novelty is above that of all but
+        a share of the material's touches, the false-alarm rate. True: it is below that of all but as large a share of
         touches of materials that were left out whole. None: neither holds, or too few touches could be left out, fewer
         than 1 / rate − 1 (19 at the usual 0.05), or one material was observed. These rates hold for touches that could
         as well have been among the learned ones: not for those of another run, speed or sensor.

@@ -249,7 +249,10 @@ def _by_kept_touches(weighing: Weighing, matcher: TouchMatcher) -> tuple[Weighin
     matches = [matcher.result(each) for each in found]
     targets = kept.labels[list(chosen)].tolist()
     early = [row.steps for row in weighing.early]
-    losses = np.stack([matcher.excess_at(each, early) for each in found])
+    losses = np.full((len(found), len(early)), np.nan)
+    for of, each in zip(losses, found, strict=True):
+        reached = [steps for steps in early if steps < each.query.columns]
+        of[: len(reached)] = matcher.excess_at(each, reached)
     whole = np.array([match.excess_loss for match in matches])
 
     def weighed(row: Row, loss: FloatArray) -> Row:
@@ -318,16 +321,13 @@ def rehearse(model: Model) -> None:
                     answered = tempered(own, row.readout_outliers)
                 elif place in chosen:
                     kept = chosen[place]
-                    match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept)
+                    match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept, noise=CLEAN)
                     fused = weighing.fused("prefix", own, match, match_scores(matcher, names, match), 0.0)
                     answered = tempered(fused, row.outliers)
                 else:
                     continue
-                chances[place, stage], novelty[place, stage], targets[place] = (
-                    answered,
-                    held.novelty[i],
-                    held.targets[i],
-                )
+                chances[place, stage], novelty[place, stage] = answered, held.novelty[i]
+                targets[place] = held.targets[i]
     reached = np.isfinite(novelty).any(axis=1)
     weighing.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
 

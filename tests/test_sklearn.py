@@ -116,7 +116,6 @@ def test_what_does_not_fit_is_said():
 
 
 CANNOT = {
-    "check_estimators_overwrite_params": "an embedding keeps the kernels that it has made: it gives the same features",
     "check_classifiers_train": "it fits lists of touches, whose lengths may differ, and then tables of any width",
 }
 """Why checks of scikit-learn's fail: what they ask for is not what touches are."""

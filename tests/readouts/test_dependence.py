@@ -38,8 +38,10 @@ def held(rows):
 
 def picked(found, places):
     """Some of them, in this order."""
-    every = list(zip(found.keys, found.targets.tolist(), found.logs, found.novelty.tolist(), strict=True))
-    return held([every[place] for place in places])
+    at = list(places)
+    keys = [found.keys[place] for place in at]
+    logs, targets, novelty = found.logs[at], found.targets[at], found.novelty[at]
+    return HeldOutProbabilities(NAMES, at, keys, targets, logs, found.distance[at], novelty)
 
 
 def test_touches_that_say_the_same_count_less():

@@ -243,8 +243,10 @@ def test_launch_files_start_what_they_say(name, spinning, own, tmp_path, monkeyp
 def test_the_command_from_start_to_ctrl_c(spinning, own):
     """Every reading since the topic was heard counts, a second node is refused, and what was learned is there."""
     remote, named = Remote(spinning, "/left/scroll_tactile"), ("--ros-args", "-r", "__ns:=/left")
-    with publishing(500, 250) as publisher, node_command(own, *named) as process:
-        spinning.silent_after(publisher)
+    with node_command(own, *named) as process:
+        spinning.until(lambda: remote.state() == "active", 300)  # then it is heard, too
+        with publishing(500, 250) as publisher:
+            spinning.silent_after(publisher)
         assert f"is being written by process {process.pid}" in refused(
             "ros2", "--memory", own, "--topic", TOPIC, "--field", "position"
         )

@@ -60,7 +60,6 @@ class CurrentModel:
         self._exact = False  # whether the model was fitted to the present memory
         self._job: _Job | None = None
         self._worker: ThreadPoolExecutor | None = None
-        self._rehearses = False  # whether fits are for live sessions, too
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
         self._estimator: Estimator | None = None
@@ -112,12 +111,12 @@ class CurrentModel:
         with suppress(MemoryError, InputError, RuntimeError):
             draft = Draft.of(memory, self._kind, model)
             self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-            fitted = self._worker.submit(draft.fit, rehearsed=self._rehearses)
+            fitted = self._worker.submit(draft.fit)
             self._job = _Job(fitted, memory.retractions, self._version)
 
     def rehearsed(self, ledger: Ledger) -> Model:
-        """The present model with the trajectories of held-out touches; fits have them from now on."""
-        self._rehearses, model = True, self.present(ledger)
+        """The present model with the trajectories of held-out touches; later fits have them, too."""
+        model = self.present(ledger)
         rehearse(model)
         return model
 
@@ -150,7 +149,7 @@ class CurrentModel:
 
     def _fitted(self, memory: Memory, before: Model | None) -> Model:
         self._model, self._job = None, None
-        self._model = model = Draft.of(memory, self._kind, before).fit(rehearsed=self._rehearses)
+        self._model = model = Draft.of(memory, self._kind, before).fit()
         self._behind, self._exact, self._retractions = set(), True, memory.retractions
         return model
 

@@ -112,8 +112,8 @@ class Draft:
         lengths = statistics.longest, max(1, min(statistics.fifth_percentile_length, statistics.longest))
         return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, counts)
 
-    def fit(self, *, rehearsed: bool = False) -> Model:
-        """Solve the readouts and weigh them. Can be called once: it frees the tasks. rehearsed: with trajectories."""
+    def fit(self) -> Model:
+        """Solve the readouts and weigh them. Can be called once: it frees the tasks."""
         model = self.solved()
         with one_thread():
             if (weighing := _weighed(self, model)) is not None and model.matcher is not None:
@@ -122,8 +122,11 @@ class Draft:
         if weighing is not None:
             weighing = _with_all_touches(weighing, self.counts)
         model = replace(model, weighing=weighing)
-        if rehearsed:
+        asked = None if self.before is None else self.before.weighing
+        if asked is not None and asked.trajectories is not None:  # a live session would have to wait for it
             rehearse(model)
+        if asked is not None and asked.noisy_excess is not None and model.names:
+            noisy_excess_of(model)
         give_back_scratch()
         return model
 

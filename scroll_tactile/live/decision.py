@@ -82,8 +82,8 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
     if weighing is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
         return DecisionRule((least,), risk, sure=1 - risk, together=1 - risk, least_new=2 * UNMEASURED)
     rows = weighing.early
-    known_ones = [row.calibration.thresholds.novelties for row in rows]
-    thresholds = np.array([np.quantile(own, KNOWN) if len(own) else np.inf for own in known_ones])
+    novelties = (row.calibration.thresholds.novelties for row in rows)
+    thresholds = np.array([np.quantile(own, KNOWN) if len(own) else np.inf for own in novelties])
     sure = _least_sure_of(held_out, held_out.novelty <= thresholds, risk)
     pairs, known = in_pairs(held_out, thresholds, weighing.dependence)
     together = _least_sure_of(pairs, known, risk) if len(pairs.targets) >= FEWEST else 1 - risk

@@ -244,9 +244,8 @@ class LiveSession:
         self._again = False  # whether the next touch is one more of them
         self._closed = self._settled = False
         self.touch: Stream | None = None
-        first = model.weighing is not None and model.weighing not in _RULES
         rule = self._rule(model, risk)
-        if first and not sensor.camera:
+        if model.names and not sensor.camera:
             self._warm_up(model, rule)
 
     def push(self, reading: npt.ArrayLike, time: Any = None) -> LiveState:

@@ -136,6 +136,7 @@ class Draft:
             # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
             matcher, conformal = self._matched()
+        give_back_scratch()
         return Model(
             kind=self.kind,
             plan=self.plan,

@@ -227,6 +227,7 @@ class Model:
     with a sampled touch. stages: for each, the windows that
     judge there. views: the views that judge beside them. readouts: scale → its readout. weighing: None where nothing
     was learned. matcher, conformal: of the kept touches. longest: the longest learned touch, in steps.
+    since: the touches that were sampled since the fit.
     """
 
     kind: ReadoutName
@@ -239,9 +240,11 @@ class Model:
     matcher: TouchMatcher | None
     conformal: Conformal | None
     longest: int
+    since: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
     known: frozenset[str] = field(init=False)
     sampled: frozenset[str] = field(init=False)
     _of_all: dict[Scale, npt.NDArray[np.intp]] = field(init=False, default_factory=dict)
+    _extended: dict[int, list[Neighbours]] = field(init=False, default_factory=dict)  # by stage
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "known", frozenset(self.names))
@@ -283,7 +286,7 @@ class Model:
             if (kept := followed_to(matcher.kept, conformal, memory.kept.touches())) is None:
                 return None
             matcher, conformal = matcher.followed(kept[0]), kept[1]
-        statistics = memory.statistics
+        statistics, there = memory.statistics, {(material, key) for material, key, _ in self.fitted.sample}
         return replace(
             self,
             names=list(statistics.materials),
@@ -291,6 +294,7 @@ class Model:
             matcher=matcher,
             conformal=conformal,
             longest=statistics.longest,
+            since=[(material, key, touch) for material, key, touch in memory.sample if (material, key) not in there],
         )
 
     def is_last(self, steps: int) -> bool:
@@ -401,7 +405,11 @@ class Model:
         """The standardised novelty of a touch judged by a row, among these materials."""
         among = None if len(names) == len(self.names) and self.sampled <= self.known else set(names)
         windows = (scale for scale in row.scales if scale.width)
-        local = [own.novelty(means[scale], among) for own, scale in zip(self.neighbours(row), windows, strict=False)]
+        near = self.neighbours(row)
+        if self.since and near:
+            near = self._extended.get(row.stage) or [own.extended(self.since) for own in near]
+            self._extended[row.stage] = near
+        local = [own.novelty(means[scale], among) for own, scale in zip(near, windows, strict=False)]
         return float(row.calibration.novelty(np.array([*self.distances(row.scales, means, names), *local])))
 
     def distances(self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]) -> FloatArray:

@@ -29,6 +29,7 @@ the windows, each standardised by held-out touches: weights that were fitted to 
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -191,23 +192,43 @@ class Neighbours:
     """
 
     def __init__(self, readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]], stage: int) -> None:
-        self._origin, self._scale = readout.origin, np.sqrt(readout.precision)
-        self.places: list[int] = []
-        self.names: list[str] = []
-        rows = []
-        for place, (material, _, touch) in enumerate(sample):
-            for row in rows_at(touch, stages, readout.scale):
-                if touch.pairs[row, 0] == stage:
-                    self.places.append(place)
-                    self.names.append(material)
-                    rows.append(touch.rows[row])
-        self._rows = self._scaled(np.array(rows).reshape(len(rows), len(self._origin)))
+        self._origin, self._scale, self._read = (
+            readout.origin,
+            np.sqrt(readout.precision),
+            (stages, readout.scale, stage),
+        )
+        self.places, self.names, rows = self._rows_of(sample)
+        self._rows = self._scaled(rows)
         self._sizes = np.square(self._rows).sum(axis=1)
         # Nearer than it is rounded no distance is told from 0.
-        self._least = max(1e-6 * float(self._sizes.mean()), TINY) if rows else TINY
+        self._least = max(1e-6 * float(self._sizes.mean()), TINY) if len(rows) else TINY
         self._between = self._distances(self._rows)
         np.fill_diagonal(self._between, np.inf)
         self._around = np.log(_mean_of_nearest(self._between))
+
+    def _rows_of(self, sample: Sampled) -> tuple[list[int], list[str], npt.NDArray[np.int32]]:
+        """The places of touches that have such a row, their materials, and the rows, (N, d)."""
+        stages, scale, stage = self._read
+        found = [
+            (place, material, touch.rows[row])
+            for place, (material, _, touch) in enumerate(sample)
+            for row in rows_at(touch, stages, scale)
+            if touch.pairs[row, 0] == stage
+        ]
+        rows = np.array([row for *_, row in found], dtype=np.int32).reshape(len(found), len(self._origin))
+        return [place for place, *_ in found], [material for _, material, _ in found], rows
+
+    def extended(self, sample: Sampled) -> Neighbours:
+        """These and touches that were sampled since, which are never held out."""
+        _, names, rows = self._rows_of(sample)
+        other, scaled = copy.copy(self), self._scaled(rows)
+        other.names, other._rows = [*self.names, *names], np.concatenate([self._rows, scaled])
+        other._sizes = np.square(other._rows).sum(axis=1)
+        far = other._distances(scaled)
+        other._between = np.block([[self._between, far[:, : len(self.names)].T], [far]])
+        np.fill_diagonal(other._between, np.inf)
+        other._around = np.log(_mean_of_nearest(other._between))
+        return other
 
     def novelty(self, features: FloatArray, names: Collection[str] | None = None) -> float:
         """u of features in grid units, (d,). names: materials of whose touches one is the nearest; all unless given."""
@@ -251,7 +272,8 @@ class Neighbours:
 
 def _mean_of_nearest(distances: FloatArray) -> FloatArray:
     """The mean of the NEAREST least distances of each row that are finite, (N,); infinite where none is."""
-    nearest = np.sort(distances, axis=1)[:, :NEAREST]
+    few = np.partition(distances, NEAREST, axis=1)[:, :NEAREST] if distances.shape[1] > NEAREST else distances
+    nearest = np.sort(few, axis=1)
     there = np.isfinite(nearest)
     count = there.sum(axis=1)
     mean = np.where(there, nearest, 0.0).sum(axis=1) / np.maximum(count, 1)

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from touches import PAD, SMALL
 
-from scroll_tactile import TactileLearner
+from scroll_tactile import Scene, TactileLearner, sensors
 from scroll_tactile.errors import CapacityError
 from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.model import Model
@@ -361,3 +361,19 @@ def test_a_process_may_end_in_any_way_while_a_fit_runs(tmp_path, how, code):
     with TactileLearner.open(tmp_path / "m", **SETTINGS) as learner:
         observed = *((name, i) for i in range(8) for name in "ab"), *(("a", 90 + i) for i in range(3))
         assert bits(learner) == expected(observed)
+
+
+def test_a_material_that_was_just_told_is_not_called_new(monkeypatch):
+    """Its touches are among those that novelty looks around at, before any fit has them."""
+    scene, learner = Scene(sensor=sensors.BIOTAC), TactileLearner(sensor=sensors.BIOTAC, exemplars=0)
+    for name in ("cork", "denim", "felt", "oak", "silk"):
+        for repetition in range(6):
+            learner.observe(name, scene.touch(name, repetition))
+    assert learner.predict(scene.touch("bark", 50)).known is False
+    monkeypatch.setattr("scroll_tactile.prediction.current.GROWTH", 1)  # no fit begins
+    for repetition in range(6):
+        learner.observe("bark", scene.touch("bark", repetition))
+    answers = [learner.predict(scene.touch("bark", 50 + repetition)) for repetition in range(6)]
+    assert [answer.material for answer in answers] == ["bark"] * 6 and sum(
+        answer.known is True for answer in answers
+    ) >= 5

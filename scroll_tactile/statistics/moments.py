@@ -144,6 +144,9 @@ class _Late(Generic[T]):
                 self._found = self._read()
             return self._found
 
+    def __deepcopy__(self, memo: object) -> _Late[T]:
+        return self
+
 
 class _Rows:
     """All rows of a second moment, at most as many as features, with room for more; read when they are first needed."""

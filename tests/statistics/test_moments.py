@@ -1,5 +1,6 @@
 """The second moment and the scatter within classes, against integers and fractions that cannot round."""
 
+import copy
 import time
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
@@ -261,7 +262,7 @@ def test_what_is_read_late_is_read_once_for_all_copies_of_whatever_thread(kept):
         return batch.copy() if kept == "rows" else np.array(truth(batch))
 
     moment = SecondMoment.of_codes(read, 4, 4) if kept == "rows" else SecondMoment.of(read, 4, 4)
-    copies = [moment.copy() for _ in range(3)]
+    copies = [moment.copy(), moment.copy(), copy.deepcopy(moment)]
     moment.add(codes(1, 4, 7))
     moment.remove(batch[:1])
     with ThreadPoolExecutor() as pool:

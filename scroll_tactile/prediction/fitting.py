@@ -34,11 +34,13 @@ from scroll_tactile.prediction.model import (
     followed_to,
     held_out_of,
     match_scores,
+    neighbours_of,
     tempered,
 )
 from scroll_tactile.readouts.calibration import (
     AHEAD,
     FEWEST,
+    TINY,
     HeldOutProbabilities,
     Neighbours,
     calibrate_stage,
@@ -68,7 +70,6 @@ SOUGHT = 16  # kept touches, to twice as many, in which noise is sought: a searc
 EVEN = 4.0  # times the energy of noise that those stay below: there the share of noise is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 POWER_TOUCHES = 2.0  # how many touches the prior of a power, 1, counts as
-TINY = 1e-300
 LEAST_SPREAD, LEAST_INFORMATION, LEAST_WEIGHT = 1e-9, 1e-3, 1e-9
 
 
@@ -168,21 +169,14 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
     if not reached:
         return None
     last, milestones = len(reached) - 1, model.plan.milestones()
-    held_out = held_out_of(model.readouts, draft.sample, model.stages, model.views, model.kind)
-    viewed, found_near = [[*stage, *model.views] for stage in model.stages], dict[tuple[int, Scale], Neighbours]()
-
-    def neighbours(stage: int, scale: Scale) -> Neighbours:
-        """The sampled touches that a touch lies among at a stage and a scale; made once for both rows of a stage."""
-        if (stage, scale) not in found_near:
-            found_near[stage, scale] = Neighbours(model.readouts[scale], draft.sample, viewed, stage)
-        return found_near[stage, scale]
+    held_out = held_out_of(model, draft.sample)
+    made = dict[tuple[int, Scale], Neighbours]()  # once for both rows of a stage
 
     def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
         """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
         found = StageScores(stage, draft.sample, [held_out[scale] for scale in scales])
         readouts = [model.readouts[scale] for scale in scales]
-        windows = [scale for scale in scales if scale.width]
-        near = [neighbours(stage, scale) for scale in windows] if len(found.places) >= FEWEST else []
+        near = neighbours_of(model, draft.sample, stage, scales, made) if len(found.places) >= FEWEST else []
         calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views), neighbours=near)
         held = held_out_probabilities(found, scales, calibration, near)
         own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
@@ -203,7 +197,7 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
         touches=sum(draft.counts),
         sample=draft.sample,
         held_out=held_out,
-        neighbours=found_near,
+        neighbours=made,
     )
 
 
@@ -385,9 +379,8 @@ def _measured_paces(
             image = extractor.image(stream_of(other, extractor.sensor))
             for view, mean in extractor.means(image, model.views).items():
                 queries[view].setdefault(place, {})[number] = mean
-    viewed = [[*stage, *model.views] for stage in model.stages]
     held_out = [
-        held_out_scores(model.readouts[view], weighing.sample, viewed, model.kind, queries[view])
+        held_out_scores(model.readouts[view], weighing.sample, model.viewed, model.kind, queries[view])
         for view in model.views
     ]
     others, logs, targets = [], list[FloatArray](), list[int]()

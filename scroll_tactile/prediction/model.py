@@ -22,9 +22,9 @@ from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.readouts.calibration import Calibration, Neighbours
+from scroll_tactile.readouts.calibration import TINY, Calibration, Neighbours
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.leave_one_out import HeldOutScores, held_out_scores
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, Sampled, held_out_scores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
@@ -44,6 +44,7 @@ __all__ = [
     "followed_to",
     "held_out_of",
     "match_scores",
+    "neighbours_of",
     "softmax",
     "tempered",
 ]
@@ -200,7 +201,7 @@ class Weighing:
         power = self.paces.power if hypothesis == "paced" and self.paces is not None else 1.0
         sure = (1 - match.noise_share) * self.distance_weight(hypothesis, distance)
         beta = (BESIDE * sure + (1 - sure)) / (1 + (1 / self.tau - 1) * match.information)
-        return softmax(power * (sure * np.log(np.maximum(chances, 1e-300)) + beta * scores))
+        return softmax(power * (sure * np.log(np.maximum(chances, TINY)) + beta * scores))
 
 
 @dataclass(frozen=True)
@@ -223,11 +224,10 @@ class Judgement:
 class Model:
     """Everything that predictions need of one state of a memory; it never changes.
 
-    names: the materials, in alphabetical order; known: the same names, as a set; sampled: those
-    with a sampled touch. stages: for each, the windows that
-    judge there. views: the views that judge beside them. readouts: scale → its readout. weighing: None where nothing
-    was learned. matcher, conformal: of the kept touches. longest: the longest learned touch, in steps.
-    since: the touches that were sampled since the fit.
+    names: the materials, in alphabetical order; known: the same names, as a set; sampled: those with a sampled touch.
+    stages: for each, the windows that judge there. views: the views that judge beside them. readouts: scale → its
+    readout. weighing: None where nothing was learned. matcher, conformal: of the kept touches. longest: the longest
+    learned touch, in steps. since: the touches that were sampled since the fit.
     """
 
     kind: ReadoutName
@@ -258,12 +258,17 @@ class Model:
         return self.weighing
 
     @property
+    def viewed(self) -> list[list[Scale]]:
+        """The scales of each stage and the views: in their order stand the rows of a sampled touch."""
+        return [[*stage, *self.views] for stage in self.stages]
+
+    @property
     def held_out(self) -> dict[Scale, HeldOutScores]:
         """Each scale's scores of the sampled touches, each held out of its readout."""
         weighing = self.fitted
         if weighing.held_out is None:
             with one_thread():
-                weighing.held_out = held_out_of(self.readouts, weighing.sample, self.stages, self.views, self.kind)
+                weighing.held_out = held_out_of(self, weighing.sample)
         return weighing.held_out
 
     @property
@@ -394,12 +399,7 @@ class Model:
         """The sampled touches that a row's windows lie among; none where too few were held out to measure that."""
         if not len(row.calibration.thresholds.novelties):
             return []
-        found, stages = self.fitted.neighbours, [[*stage, *self.views] for stage in self.stages]
-        windows = [scale for scale in row.scales if scale.width]
-        for scale in windows:
-            if (row.stage, scale) not in found:
-                found[row.stage, scale] = Neighbours(self.readouts[scale], self.fitted.sample, stages, row.stage)
-        return [found[row.stage, scale] for scale in windows]
+        return neighbours_of(self, self.fitted.sample, row.stage, row.scales, self.fitted.neighbours)
 
     def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch judged by a row, among these materials."""
@@ -433,16 +433,23 @@ def followed_to(
     return followed, conformal.followed(added, removed)
 
 
-def held_out_of(
-    readouts: Mapping[Scale, Readout],
-    sample: list[tuple[str, bytes, SampledTouch]],
-    stages: Sequence[Sequence[Scale]],
-    views: Sequence[Scale],
-    kind: ReadoutName,
-) -> dict[Scale, HeldOutScores]:
+def held_out_of(model: Model, sample: Sampled) -> dict[Scale, HeldOutScores]:
     """Each scale's scores of sampled touches, each held out of its readout."""
-    viewed = [[*stage, *views] for stage in stages]
-    return {scale: held_out_scores(readout, sample, viewed, kind) for scale, readout in readouts.items()}
+    return {scale: held_out_scores(own, sample, model.viewed, model.kind) for scale, own in model.readouts.items()}
+
+
+def neighbours_of(
+    model: Model, sample: Sampled, stage: int, scales: Sequence[Scale], made: dict[tuple[int, Scale], Neighbours]
+) -> list[Neighbours]:
+    """The sampled touches that a touch lies among at a stage, for each window of these scales.
+
+    made: those of other calls, (stage, scale) → which; it is added to.
+    """
+    windows = [scale for scale in scales if scale.width]
+    for scale in windows:
+        if (stage, scale) not in made:
+            made[stage, scale] = Neighbours(model.readouts[scale], sample, model.viewed, stage)
+    return [made[stage, scale] for scale in windows]
 
 
 def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:

@@ -297,9 +297,9 @@ def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
     """The model as if it had never observed a touch, nor kept it, but for how it is weighed."""
     weighing, own = model.fitted, (touch.material, touch.key)
     sampled = next(item for *which, item in weighing.sample if tuple(which) == own)
-    stages, readouts = [[*stage, *model.views] for stage in model.stages], dict(model.readouts)
+    readouts = dict(model.readouts)
     for scale, readout in model.readouts.items():
-        if rows := rows_at(sampled, stages, scale):
+        if rows := rows_at(sampled, model.viewed, scale):
             # As many rows as it added: of windows that are learned one by one the sample has the mean.
             times = max(1, round(sampled.pairs[rows[0], 2] / len(rows)))
             task = Task.of(memory.statistics, scale, readout.reference, model.plan.shrinkage)

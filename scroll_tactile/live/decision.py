@@ -78,7 +78,7 @@ def decision_rule(model: Model, risk: float) -> DecisionRule:
         raise InputError(f"expected risk as a share of wrong answers between 0 and 1; came {risk!r}")
     weighing = model.weighing
     least = 1 if weighing is None else weighing.least
-    held_out = None if weighing is None else weighing.trajectories
+    held_out = model.held_out.trajectories
     if weighing is None or held_out is None or len(held_out.targets) < FEWEST or not held_out.novelty.size:
         return DecisionRule((least,), risk, sure=1 - risk, together=1 - risk, least_new=2 * UNMEASURED)
     rows = weighing.early

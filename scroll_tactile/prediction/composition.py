@@ -21,7 +21,6 @@ from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.attributes import GAMMAS, Curve, RidgeSystem, fit_curve, solve
 from scroll_tactile.readouts.calibration import novelty_measures
-from scroll_tactile.readouts.leave_one_out import StageScores
 from scroll_tactile.results import Constituent
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
@@ -88,12 +87,12 @@ class HeadFitter:
     def __init__(self, model: Model, stage: int) -> None:
         weighing = model.fitted
         row = weighing.rows[stage]
-        found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in row.scales])
+        found = model.held_out.at(stage, row.scales)
         weights = _weights(model, stage)
         self.space = _space_of(model, stage, found.names)
         self.materials = [found.names[place] for place in found.targets]
         self.z = sum(weight * z for weight, z in zip(weights, np.moveaxis(found.z(), 1, 0), strict=True))
-        measures = novelty_measures(found, model.neighbours(row))
+        measures = novelty_measures(found, model.held_out.around(row))
         self.known_novelty, self.new_novelty = map(row.calibration.novelty, measures)
         self._systems: dict[tuple[float, bytes], RidgeSystem] = {}
 

@@ -18,7 +18,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.fitting import Draft, rehearse
+from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.prediction.stored import read_weighing, weighing_text
 from scroll_tactile.readouts.estimation import Estimator
@@ -35,17 +35,23 @@ FASTER = 2  # times the touches of the last fit: where there are more, or fewer 
 
 
 @dataclass
-class _Job:
-    """A fit in a thread.
+class _Fit:
+    """A fit of a memory, done or in a thread, and what changed since it began.
 
-    retractions, version: of the memory when it began. changed: the materials that changed since; None where that is
-    not known.
+    version, retractions: of the memory then. changed: the materials that changed since; None where any may have.
     """
 
-    future: Future[Model]
-    retractions: int
+    model: Future[Model]
     version: int
+    retractions: int
     changed: set[str] | None = field(default_factory=set)
+
+    @classmethod
+    def done(cls, model: Model, version: int, retractions: int) -> _Fit:
+        """Of a model that is there."""
+        made = cls(Future(), version, retractions)
+        made.model.set_result(model)
+        return made
 
 
 class CurrentModel:
@@ -53,12 +59,9 @@ class CurrentModel:
 
     def __init__(self, settings: Settings) -> None:
         self._kind = settings.readout
-        self._model: Model | None = None
-        self._behind: set[str] | None = set()  # the materials that changed since the model; None where any may have
-        self._version = -1  # of the memory up to which that is so
-        self._retractions = 0  # of the memory when the model was fitted
-        self._exact = False  # whether the model was fitted to the present memory
-        self._job: _Job | None = None
+        self._fit: _Fit | None = None  # its model follows the memory
+        self._job: _Fit | None = None
+        self._version = -1  # of the memory up to which changes are noted
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
         self._composer: tuple[Model, int, int, Composer] | None = None
@@ -68,22 +71,17 @@ class CurrentModel:
         """The model that predictions are made with; it never changes."""
         memory = ledger.memory  # first: after an interrupted change this reads the memory again, a new version
         self._note_changes(ledger)
-        (model, self._model), behind = (self._model, None), self._behind  # an interrupted call leaves no model
-        if (job := self._job) is not None and job.future.done():
+        (fit, self._fit), job = (self._fit, None), self._job  # an interrupted call leaves no model
+        if job is not None and job.model.done():
             self._job = None
-            if job.changed is not None and job.future.exception() is None:
-                model, behind, self._exact = job.future.result(), job.changed, job.version == self._version
-                self._retractions = job.retractions
-        elif model is None:
-            model = self._restored(ledger)
-        followed = None
-        if model is not None and behind is not None and not _outgrown(model, memory):
-            self._exact = self._exact and not behind
-            followed = model.followed(memory, behind) if behind else model
-        if followed is None:
-            return self._fitted(memory, model)
-        self._model = model = followed
-        self._behind = set()
+            if job.model.exception() is None and job.changed is not None:
+                fit = job
+        elif fit is None:
+            fit = self._restored(ledger)
+        model = None if fit is None else _followed(fit, memory)
+        if fit is None or model is None:
+            return self._fitted(memory, None if fit is None else fit.model.result())
+        self._fit = _Fit.done(model, fit.version, fit.retractions)
         self.prepare(ledger)
         return model
 
@@ -93,42 +91,35 @@ class CurrentModel:
             self._process, self._worker, self._job = os.getpid(), None, None
         if ledger.version == self._version:
             return
-        changed, ledger.changed = ledger.changed, set()
-        self._version, self._exact = ledger.version, False  # of an axis, a touch without a label changes samples alone
-        self._behind = _joined(self._behind, changed)
-        if self._job is not None:
-            self._job.changed = _joined(self._job.changed, changed)
+        changed, ledger.changed, self._version = ledger.changed, set(), ledger.version
+        for fit in (self._fit, self._job):
+            if fit is not None:
+                fit.changed = None if fit.changed is None or changed is None else fit.changed | changed
 
     def prepare(self, ledger: Ledger) -> None:
         """Begin a fit if enough touches came or went. A lack of memory or threads raises nothing here."""
         self._note_changes(ledger)
-        model, memory = self._model, ledger.memory
-        if model is None or self._job is not None:
+        if self._fit is None or self._job is not None:
             return
+        model, memory = self._fit.model.result(), ledger.memory
         if abs(memory.statistics.touches - model.touches) < max(LEAST, model.touches // GROWTH):
             return
         # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
         with suppress(MemoryError, InputError, RuntimeError):
             draft = Draft.of(memory, self._kind, model)
             self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-            fitted = self._worker.submit(draft.fit)
-            self._job = _Job(fitted, memory.retractions, self._version)
-
-    def rehearsed(self, ledger: Ledger) -> Model:
-        """The present model with the trajectories of held-out touches; later fits have them, too."""
-        model = self.present(ledger)
-        rehearse(model)
-        return model
+            self._job = _Fit(self._worker.submit(draft.fit), self._version, memory.retractions)
 
     def settle(self, ledger: Ledger) -> Model:
         """The model fitted to the present memory: a function of the set of observations alone."""
         memory = ledger.memory
         self._note_changes(ledger)
-        if self._model is None or self._behind != set() or not self._exact:
-            return self._fitted(memory, self._model)
-        return self._model
+        before = None if self._fit is None else self._fit.model.result()
+        if before is None or self._fit is None or self._fit.version != self._version:
+            return self._fitted(memory, before)
+        return before
 
-    def _restored(self, ledger: Ledger) -> Model | None:
+    def _restored(self, ledger: Ledger) -> _Fit | None:
         """The model by the weighing of the checkpoint that the memory was read from; None where it has none that fits.
 
         It was fitted to these touches or to fewer: a retraction drops it.
@@ -136,21 +127,22 @@ class CurrentModel:
         if (text := ledger.take_weighing()) is None:
             return None
         try:
-            return read_weighing(text, Draft.of(ledger.memory, self._kind).solved(), ledger.memory)
+            model = read_weighing(text, Draft.of(ledger.memory, self._kind).solved())
         except ValueError as error:
             logger.warning("the weighing in the memory's checkpoint is not used, and fitted anew: %.300s", error)
             return None
+        return _Fit.done(model, -1, ledger.memory.retractions)
 
     def stored(self, ledger: Ledger) -> str | None:
         """The weighing of the present model, for a checkpoint; None where there is none of touches that all count."""
-        if self._model is None or self._retractions != ledger.memory.retractions:
+        if self._fit is None or self._fit.retractions != ledger.memory.retractions:
             return None
-        return weighing_text(self._model)
+        return weighing_text(self._fit.model.result())
 
     def _fitted(self, memory: Memory, before: Model | None) -> Model:
-        self._model, self._job = None, None
-        self._model = model = Draft.of(memory, self._kind, before).fit()
-        self._behind, self._exact, self._retractions = set(), True, memory.retractions
+        self._fit, self._job = None, None
+        model = Draft.of(memory, self._kind, before).fit()
+        self._fit = _Fit.done(model, self._version, memory.retractions)
         return model
 
     def close(self) -> None:
@@ -162,8 +154,7 @@ class CurrentModel:
     def composer(self, ledger: Ledger) -> Composer:
         """The heads of all constituents that were described, over a model of this memory."""
         model = self.present(ledger)
-        weighing = model.weighing
-        if weighing is not None and not {material for material, *_ in weighing.sample} <= model.known:
+        if not {material for material, *_ in model.held_out.sample} <= model.known:
             model = self.settle(ledger)
         state = model, ledger.version, ledger.described
         if self._composer is None or self._composer[:3] != state:
@@ -182,13 +173,15 @@ def estimator_of(memory: Memory, before: Estimator | None = None) -> Estimator:
     return Estimator.of(memory.plan, memory.sample, memory.quantities, least, before)
 
 
-def _outgrown(model: Model, memory: Memory) -> bool:
-    """Whether so many touches came or went that a call waits for the fit."""
-    now, fitted = memory.statistics.touches, model.touches
-    if fitted <= FEW:
-        return abs(now - fitted) >= min(LEAST, fitted + 1)
-    return not fitted <= FASTER * now <= FASTER * FASTER * fitted
-
-
-def _joined(before: set[str] | None, changed: set[str] | None) -> set[str] | None:
-    return None if before is None or changed is None else before | changed
+def _followed(fit: _Fit, memory: Memory) -> Model | None:
+    """A fit's model with what changed since; None where a call waits for another fit."""
+    model, now = fit.model.result(), memory.statistics.touches
+    if fit.changed is None:
+        return None
+    if model.touches <= FEW:
+        outgrown = abs(now - model.touches) >= min(LEAST, model.touches + 1)
+    else:
+        outgrown = not model.touches <= FASTER * now <= FASTER * FASTER * model.touches
+    if outgrown:
+        return None
+    return model.followed(memory, fit.changed) if fit.changed else model

@@ -26,32 +26,30 @@ from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.model import (
     WITHIN,
+    HeldOut,
     Model,
     Paces,
     Row,
     Trajectories,
     Weighing,
     followed_to,
-    held_out_of,
     match_scores,
-    neighbours_of,
+    softmax,
     tempered,
 )
 from scroll_tactile.readouts.calibration import (
     AHEAD,
     FEWEST,
-    TINY,
     HeldOutProbabilities,
-    Neighbours,
     calibrate_stage,
     fit_weights,
     held_out_probabilities,
 )
 from scroll_tactile.readouts.dependence import dependence_of
-from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
+from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.task import Task
-from scroll_tactile.signals.windows import Scale, WindowPlan
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
@@ -77,28 +75,23 @@ LEAST_SPREAD, LEAST_INFORMATION, LEAST_WEIGHT = 1e-9, 1e-3, 1e-9
 class Draft:
     """The input of a fit, copied from a memory at one moment, so that fitting needs no lock.
 
-    kept: the kept touches. before: an earlier model, which has arrays of most of them. Raises InputError, from `of`,
-    for the ridge of more materials than it can weigh.
+    bare: the model without readouts. tasks: of these. kept: the kept touches. before: an earlier model, which has
+    arrays of most of them. least: the 5th percentile of the lengths of touches, in steps. counts: of the materials.
     """
 
-    kind: ReadoutName
-    plan: WindowPlan
-    names: list[str]
-    stages: list[list[Scale]]
-    views: list[Scale]
+    bare: Model
     tasks: dict[Scale, Task]
     sample: list[tuple[str, bytes, SampledTouch]]
     kept: list[KeptTouch]
     before: Model | None
-    longest: int
     least: int
     counts: list[int]
 
     @classmethod
     def of(cls, memory: Memory, kind: ReadoutName, before: Model | None = None) -> Draft:
-        """The draft of a memory as it is now. before: an earlier model of it."""
-        statistics, sample = memory.statistics, list(memory.sample)
-        names, counts = list(statistics.materials), list(statistics.materials.values())
+        """The draft of a memory as it is now. Raises InputError for the ridge of more materials than it can weigh."""
+        statistics, sample, plan = memory.statistics, list(memory.sample), memory.plan
+        names = list(statistics.materials)
         if kind == "ridge" and len(names) > MOST_OF_RIDGE:
             raise InputError(
                 f'the readout "ridge" weighs {MOST_OF_RIDGE} materials at most; there are {len(names)}: take "lda"'
@@ -106,85 +99,69 @@ class Draft:
         # The ridge's reference materials are all, as in the paper; LDA's are those with a sampled touch.
         reference = names if kind == "ridge" else sorted({material for material, *_ in sample})
         judging = [scale for scale in statistics.scales if statistics.second(scale).rows]
-        tasks = {scale: Task.of(statistics, scale, reference, memory.plan.shrinkage) for scale in judging}
-        stages = [memory.plan.judging(length) for length in memory.plan.milestones()]
-        views = [view for view in memory.plan.views if view in tasks]
+        tasks = {scale: Task.of(statistics, scale, reference, plan.shrinkage) for scale in judging}
+        stages = [plan.judging(length) for length in plan.milestones()]
+        views = [view for view in plan.views if view in tasks]
+        bare = Model(kind, plan, names, stages, views, statistics.longest, HeldOut(kind, [], {}, []))
+        least = max(1, min(statistics.fifth_percentile_length, statistics.longest))
         kept = memory.kept.touches() if memory.kept is not None and views else []
-        lengths = statistics.longest, max(1, min(statistics.fifth_percentile_length, statistics.longest))
-        return cls(kind, memory.plan, names, stages, views, tasks, sample, kept, before, *lengths, counts)
+        return cls(bare, tasks, sample, kept, before, least, list(statistics.materials.values()))
 
     def fit(self) -> Model:
         """Solve the readouts and weigh them. Can be called once: it frees the tasks."""
         model = self.solved()
         with one_thread():
-            if (weighing := _weighed(self, model)) is not None and model.matcher is not None:
-                weighing, matcher = _by_kept_touches(weighing, model.matcher)
-                model = replace(model, matcher=matcher)
-        if weighing is not None:
-            weighing = _with_all_touches(weighing, self.counts)
-        model = replace(model, weighing=weighing)
-        asked = None if self.before is None else self.before.weighing
-        if asked is not None and asked.trajectories is not None:  # a live session would have to wait for it
-            rehearse(model)
-        if asked is not None and asked.noisy_excess is not None and model.names:
-            noisy_excess_of(model)
+            if (weighing := _weighed(model, self.least, self.counts)) is not None:
+                model = replace(model, weighing=weighing)
+                if model.matcher is not None:
+                    model = _by_kept_touches(model, model.matcher)
+        if self.before is not None and model.weighing is not None:
+            # What was asked of the earlier model: else the next to ask of this one would wait for it.
+            if self.before.held_out.trajectories is not None:
+                rehearse(model)
+            if self.before.weighing is not None and self.before.weighing.noisy_excess is not None:
+                noisy_excess_of(model)
         give_back_scratch()
         return model
 
     def solved(self) -> Model:
         """A model without a weighing. Can be called once: it frees the tasks."""
+        bare, before, kept = self.bare, self.before, None
         with one_thread():
             # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
-            matcher, conformal = self._matched()
+            if self.kept and before is not None and before.matcher is not None and before.conformal is not None:
+                kept = followed_to(before.matcher.kept, before.conformal, self.kept)
+            elif self.kept:
+                kept = KeptArrays.of(self.kept), Conformal.of(self.kept)
+            matcher, conformal = (None, None) if kept is None else (TouchMatcher.of(kept[0]), kept[1])
         give_back_scratch()
-        return Model(
-            kind=self.kind,
-            plan=self.plan,
-            names=self.names,
-            stages=self.stages,
-            views=self.views,
-            readouts=readouts,
-            weighing=None,
-            matcher=matcher,
-            conformal=conformal,
-            longest=self.longest,
-        )
-
-    def _matched(self) -> tuple[TouchMatcher | None, Conformal | None]:
-        """What touches are matched by, where any are kept; what an earlier model made of them is not made again."""
-        if not self.kept:
-            return None, None
-        before = self.before
-        if before is None or before.matcher is None or before.conformal is None:
-            return TouchMatcher.of(KeptArrays.of(self.kept)), Conformal.of(self.kept)
-        followed = followed_to(before.matcher.kept, before.conformal, self.kept)
-        assert followed is not None  # some are kept
-        return TouchMatcher.of(followed[0]), followed[1]
+        held_out = HeldOut(bare.kind, self.sample, readouts, [[*stage, *bare.views] for stage in bare.stages])
+        return replace(bare, readouts=readouts, held_out=held_out, matcher=matcher, conformal=conformal)
 
 
-def _weighed(draft: Draft, model: Model) -> Weighing | None:
-    """How the readouts are to be believed; None where no touch reached a stage."""
+def _weighed(model: Model, least: int, counts: Sequence[int]) -> Weighing | None:
+    """How the readouts are to be believed; None where no touch reached a stage. least, counts: see `Draft`."""
     reached = [scales for scales in model.stages if all(scale in model.readouts for scale in scales)]
     if not reached:
         return None
-    last, milestones = len(reached) - 1, model.plan.milestones()
-    held_out = held_out_of(model, draft.sample)
-    made = dict[tuple[int, Scale], Neighbours]()  # once for both rows of a stage
+    last, milestones, held_out = len(reached) - 1, model.plan.milestones(), model.held_out
+    several = [count for count in counts if count > 1]
 
     def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
         """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
-        found = StageScores(stage, draft.sample, [held_out[scale] for scale in scales])
-        readouts = [model.readouts[scale] for scale in scales]
-        near = neighbours_of(model, draft.sample, stage, scales, made) if len(found.places) >= FEWEST else []
+        found, readouts = held_out.at(stage, scales), [model.readouts[scale] for scale in scales]
+        near = held_out.neighbours(stage, scales) if len(found.places) >= FEWEST else []
         calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views), neighbours=near)
         held = held_out_probabilities(found, scales, calibration, near)
         own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
         rate = _outlier_rate(own, len(held.names)) if len(own) else 0.0
+        if several:  # touches to come are scored more surely than those held out
+            calibration = calibration.with_all_touches(float(np.median(several)))
         return Row(steps, stage, tuple(scales), calibration, rate, rate), held
 
     rows = [row(stage, scales, milestones[stage])[0] for stage, scales in enumerate(reached)]
-    complete, held = row(last, [*reached[last], *model.views], draft.least)
+    complete, held = row(last, [*reached[last], *model.views], least)
     if len(held.keys):
         complete = replace(complete, distance_limit=float(np.quantile(held.distance, WITHIN)))
     return Weighing(
@@ -193,26 +170,9 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
         paced=row(last, model.views, 1)[0] if model.views else complete,
         tau=UNMATCHED,
         dependence=dependence_of(held),
-        least=draft.least,
-        touches=sum(draft.counts),
-        sample=draft.sample,
-        held_out=held_out,
-        neighbours=made,
+        least=least,
+        touches=sum(counts),
     )
-
-
-def _with_all_touches(weighing: Weighing, counts: Sequence[int]) -> Weighing:
-    """The weighing for touches to come, which are scored more surely than those held out. counts: of the materials."""
-    several = [count for count in counts if count > 1]
-    if not several:
-        return weighing
-    median = float(np.median(several))
-
-    def surer(row: Row) -> Row:
-        return replace(row, calibration=row.calibration.with_all_touches(median))
-
-    rows = tuple(map(surer, weighing.rows))
-    return replace(weighing, rows=rows, complete=surer(weighing.complete), paced=surer(weighing.paced))
 
 
 def _outlier_rate(own: FloatArray, materials: int) -> float:
@@ -224,28 +184,26 @@ def _outlier_rate(own: FloatArray, materials: int) -> float:
     return rate
 
 
-def _chosen(weighing: Weighing, held_out: Mapping[Scale, HeldOutScores], matcher: TouchMatcher) -> dict[int, int]:
+def _chosen(model: Model, matcher: TouchMatcher) -> dict[int, int]:
     """Row among the kept touches → place in the sample, of at most MOST_HELD_OUT held-out touches, evenly by key.
 
     Of a material of which none but itself is kept, a touch says nothing.
     """
-    labels = matcher.kept.labels
-    found = StageScores(len(weighing.rows) - 1, weighing.sample, [held_out[s] for s in weighing.complete.scales])
+    complete, labels = model.fitted.complete, matcher.kept.labels
+    found = model.held_out.at(complete.stage, complete.scales)
     places, counts = dict(zip(found.keys, found.places, strict=True)), np.bincount(labels)
     keys = [(key, row) for key, row in sorted(matcher.kept.rows().items()) if key in places and counts[labels[row]] > 1]
     spread = np.linspace(0, len(keys) - 1, min(MOST_HELD_OUT, len(keys))).round().astype(int).tolist()
     return {keys[i][1]: places[keys[i][0]] for i in spread}
 
 
-def _by_kept_touches(weighing: Weighing, matcher: TouchMatcher) -> tuple[Weighing, TouchMatcher]:
-    """The weighing with τ, and what is natural among kept touches, by some of them matched with the others."""
-    assert weighing.held_out is not None
-    kept, chosen = matcher.kept, _chosen(weighing, weighing.held_out, matcher)
+def _by_kept_touches(model: Model, matcher: TouchMatcher) -> Model:
+    """The model with τ, and what is natural among kept touches, by some of them matched with the others."""
+    kept, chosen, weighing = matcher.kept, _chosen(model, matcher), model.fitted
     if len(chosen) < FEWEST or len(kept.materials) < 2:
-        return weighing, matcher
+        return model
     found = [matcher.beside(matcher.query(kept.levels(row), held_out=row), CLEAN) for row in chosen]
     matches = [matcher.result(each) for each in found]
-    targets = kept.labels[list(chosen)].tolist()
     early = [row.steps for row in weighing.early]
     losses = np.full((len(found), len(early)), np.nan)
     for of, each in zip(losses, found, strict=True):
@@ -255,10 +213,8 @@ def _by_kept_touches(weighing: Weighing, matcher: TouchMatcher) -> tuple[Weighin
 
     def weighed(row: Row, loss: FloatArray) -> Row:
         loss = loss[np.isfinite(loss)]
-        outliers = max(row.readout_outliers, PRIOR_OUTLIERS / (len(chosen) + 1))
-        if len(loss) < FEWEST:
-            return replace(row, outliers=outliers)
-        return replace(row, outliers=outliers, excess=(float(loss.mean()), max(float(loss.std()), LEAST_SPREAD)))
+        row = replace(row, outliers=max(row.readout_outliers, PRIOR_OUTLIERS / (len(chosen) + 1)))
+        return row if len(loss) < FEWEST else replace(row, excess=_mean_and_spread(loss))
 
     rows = [weighed(row, losses[:, i] if i < len(early) else whole) for i, row in enumerate(weighing.rows)]
     fitted = replace(
@@ -266,9 +222,13 @@ def _by_kept_touches(weighing: Weighing, matcher: TouchMatcher) -> tuple[Weighin
         rows=tuple(rows),
         complete=weighed(weighing.complete, whole),
         paced=weighed(weighing.paced, whole),
-        tau=_tau(matches, targets),
+        tau=_tau(matches, kept.labels[list(chosen)].tolist()),
     )
-    return fitted, _natural(matcher, matches)
+    return replace(model, weighing=fitted, matcher=_natural(matcher, matches))
+
+
+def _mean_and_spread(values: FloatArray) -> tuple[float, float]:
+    return float(values.mean()), max(float(values.std()), LEAST_SPREAD)
 
 
 def _tau(matches: Sequence[Match], targets: Sequence[int]) -> float:
@@ -299,20 +259,17 @@ def rehearse(model: Model) -> None:
 
     Each prefix is matched with those of the other kept touches; where none are kept the readouts answer alone.
     """
-    weighing = model.weighing
-    if weighing is None or weighing.trajectories is not None:
+    weighing, held_out, matcher = model.weighing, model.held_out, model.matcher
+    if weighing is None or held_out.trajectories is not None:
         return
-    matcher, held_out = model.matcher, model.held_out
-    chosen = None if matcher is None else {place: row for row, place in _chosen(weighing, held_out, matcher).items()}
-    early = weighing.early
-    names = StageScores(0, weighing.sample, [held_out[scale] for scale in weighing.rows[0].scales]).names
-    shape = len(weighing.sample), len(early)
+    chosen = None if matcher is None else {place: row for row, place in _chosen(model, matcher).items()}
+    names = held_out.at(0, weighing.rows[0].scales).names
+    shape = len(held_out.sample), len(weighing.early)
     chances, novelty = np.full((*shape, len(names)), np.nan), np.full(shape, np.nan)
     targets = np.zeros(shape[0], np.intp)
     with one_thread():
-        for stage, row in enumerate(early):
-            found = StageScores(stage, weighing.sample, [held_out[scale] for scale in row.scales])
-            held = held_out_probabilities(found, row.scales, row.calibration, model.neighbours(row))
+        for stage, row in enumerate(weighing.early):
+            held = held_out.by(row)
             for i, place in enumerate(held.places if held.names == names else ()):
                 own = np.exp(held.logs[i])
                 if matcher is None or chosen is None:
@@ -320,14 +277,32 @@ def rehearse(model: Model) -> None:
                 elif place in chosen:
                     kept = chosen[place]
                     match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept, noise=CLEAN)
-                    fused = weighing.fused("prefix", own, match, match_scores(matcher, names, match), 0.0)
-                    answered = tempered(fused, row.outliers)
+                    logits = weighing.logits("prefix", own, match, match_scores(matcher, names, match), 0.0)
+                    answered = tempered(softmax(logits), row.outliers)
                 else:
                     continue
                 chances[place, stage], novelty[place, stage] = answered, held.novelty[i]
                 targets[place] = held.targets[i]
     reached = np.isfinite(novelty).any(axis=1)
-    weighing.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
+    held_out.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
+
+
+def noisy_excess_of(model: Model) -> tuple[float, float]:
+    """Mean and spread of the excess loss of known touches in which noise was sought; measured when first asked for.
+
+    Under the likeliest noise a touch has far less excess than under none, noise by itself included.
+    """
+    weighing, matcher = model.fitted, model.matcher
+    if weighing.noisy_excess is None and matcher is not None:
+        rows = list(_chosen(model, matcher))
+        rows = rows[:: max(1, len(rows) // SOUGHT)]
+        if len(rows) < FEWEST:
+            return weighing.complete.excess
+        with one_thread():
+            queries = [matcher.query(matcher.kept.levels(row), held_out=row) for row in rows]
+            losses = np.array([matcher.beside(query, None).excess for query in queries])
+        weighing.noisy_excess = _mean_and_spread(losses)
+    return weighing.noisy_excess or weighing.complete.excess
 
 
 def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:
@@ -338,36 +313,18 @@ def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:
     """
     weighing, matcher = model.fitted, model.matcher
     if weighing.paces is None and matcher is not None:
-        chosen = dict(list(_chosen(weighing, model.held_out, matcher).items())[::2])
+        chosen = dict(list(_chosen(model, matcher).items())[::2])
         if len(chosen) >= FEWEST:
             with one_thread():
                 weighing.paces = _measured_paces(model, extractor, matcher, chosen)
     return weighing.paces
 
 
-def noisy_excess_of(model: Model) -> tuple[float, float]:
-    """Mean and spread of the excess loss of known touches in which noise was sought; measured when first asked for.
-
-    Under the likeliest noise a touch has far less excess than under none, noise by itself included.
-    """
-    weighing, matcher = model.fitted, model.matcher
-    if weighing.noisy_excess is None and matcher is not None:
-        rows = list(_chosen(weighing, model.held_out, matcher))
-        rows = rows[:: max(1, len(rows) // SOUGHT)]
-        if len(rows) < FEWEST:
-            return weighing.complete.excess
-        with one_thread():
-            queries = [matcher.query(matcher.kept.levels(row), held_out=row) for row in rows]
-            losses = np.array([matcher.beside(query, None).excess for query in queries])
-        weighing.noisy_excess = float(losses.mean()), max(float(losses.std()), LEAST_SPREAD)
-    return weighing.noisy_excess or weighing.complete.excess
-
-
 def _measured_paces(
     model: Model, extractor: FeatureExtractor, matcher: TouchMatcher, chosen: Mapping[int, int]
 ) -> Paces:
     """As `paces_of`. chosen: row among the kept touches → place in the sample."""
-    weighing, row = model.fitted, model.fitted.paced
+    weighing, row, held_out = model.fitted, model.fitted.paced, model.held_out
     queries: dict[Scale, dict[int, dict[int, FloatArray]]] = {view: {} for view in model.views}
     matches: dict[tuple[int, int], Match] = {}
     for kept, place in chosen.items():
@@ -379,13 +336,13 @@ def _measured_paces(
             image = extractor.image(stream_of(other, extractor.sensor))
             for view, mean in extractor.means(image, model.views).items():
                 queries[view].setdefault(place, {})[number] = mean
-    held_out = [
-        held_out_scores(model.readouts[view], weighing.sample, model.viewed, model.kind, queries[view])
+    scores = [
+        held_out_scores(held_out.readouts[view], held_out.sample, held_out.stages, model.kind, queries[view])
         for view in model.views
     ]
-    others, logs, targets = [], list[FloatArray](), list[int]()
+    others, logits, targets = [], list[FloatArray](), list[int]()
     for number in range(len(PACES)):
-        found = StageScores(number, weighing.sample, held_out)
+        found = StageScores(number, held_out.sample, scores)
         held = held_out_probabilities(found, model.views, row.calibration)
         own = [matches[number, place] for place in found.places]
         values = np.column_stack([found.distances().min(axis=2), [match.excess_loss for match in own]])
@@ -397,9 +354,9 @@ def _measured_paces(
         high = float(novelties[rank]) / max(row.calibration.thresholds.above("", 1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
         for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
-            scores = match_scores(matcher, held.names, match)
-            logs.append(np.log(weighing.fused("paced", chances, match, scores, distance) + TINY))
+            scored = match_scores(matcher, held.names, match)
+            logits.append(weighing.logits("paced", chances, match, scored, distance))
         targets += held.targets.tolist()
     natural = np.vstack([row.calibration.scale_novelty, row.excess])
-    power = fit_weights(np.stack(logs)[:, None], targets, np.ones(1), POWER_TOUCHES)
+    power = fit_weights(np.stack(logits)[:, None], targets, np.ones(1), POWER_TOUCHES)
     return Paces(natural, np.stack(others), float(power[0]))

@@ -32,10 +32,9 @@ from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
 from scroll_tactile.matching.match import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import noisy_excess_of, paces_of
-from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, tempered
-from scroll_tactile.readouts.calibration import NoveltyThresholds, held_out_probabilities
+from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, softmax, tempered
+from scroll_tactile.readouts.calibration import NoveltyThresholds
 from scroll_tactile.readouts.estimation import Estimator
-from scroll_tactile.readouts.leave_one_out import StageScores
 from scroll_tactile.results import Estimate, Prediction, Unusual
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.moments import one_thread
@@ -176,7 +175,7 @@ def _matches(
     clean = found = [matcher.beside(query, CLEAN) for query in queries]
     likeliest = max(range(len(found)), key=lambda i: found[i].gain)
     row = alone.row if hypotheses[likeliest] != "paced" else model.fitted.paced
-    if row.unlikely(found[likeliest].excess, LIKELY):
+    if found[likeliest].excess > row.excess[0] + LIKELY * row.excess[1]:
         found = [matcher.beside(query, None) for query in queries]
     most, span = max(each.gain for each in found), -math.log(LEAST_SHARE) / COUNTED
     return [
@@ -228,11 +227,11 @@ def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: M
     assert model.matcher is not None
     match = matched.match
     scores = match_scores(model.matcher, candidates, match)
-    chances = model.fitted.fused(matched.hypothesis, alone.probability, match, scores, alone.distance)
+    logits = model.fitted.logits(matched.hypothesis, alone.probability, match, scores, alone.distance)
     share = match.noise_share
     mean, spread = alone.row.excess if match.noise == CLEAN else noisy_excess_of(model)
     novelty = (1 - share) * alone.novelty + share * (match.excess_loss - mean) / spread
-    return replace(alone, probability=tempered(chances, alone.row.outliers), novelty=float(novelty))
+    return replace(alone, probability=tempered(softmax(logits), alone.row.outliers), novelty=float(novelty))
 
 
 def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
@@ -315,12 +314,11 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     rows = {} if matcher is None else matcher.kept.rows()
     for stage in range(len(weighing.rows) - 1, -1, -1):
         row = weighing.row("complete", stage)
-        found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in row.scales])
-        held = held_out_probabilities(found, row.scales, row.calibration, model.neighbours(row))
+        held = model.held_out.by(row)
         for i, place in enumerate(held.places):
             if place in answers:
                 continue
-            material, key, _ = weighing.sample[place]
+            material, key, _ = model.held_out.sample[place]
             chances = np.exp(held.logs[i])
             alone = Judgement(chances, float(held.novelty[i]), row, float(held.distance[i]))
             if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):

@@ -11,6 +11,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -22,9 +23,15 @@ from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.readouts.calibration import TINY, Calibration, Neighbours
+from scroll_tactile.readouts.calibration import (
+    TINY,
+    Calibration,
+    HeldOutProbabilities,
+    Neighbours,
+    held_out_probabilities,
+)
 from scroll_tactile.readouts.dependence import Dependence
-from scroll_tactile.readouts.leave_one_out import HeldOutScores, Sampled, held_out_scores
+from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
@@ -33,6 +40,7 @@ from scroll_tactile.statistics.sample import SampledTouch
 
 __all__ = [
     "BESIDE",
+    "HeldOut",
     "Hypothesis",
     "Judgement",
     "Model",
@@ -42,9 +50,7 @@ __all__ = [
     "Weighing",
     "enough_memory",
     "followed_to",
-    "held_out_of",
     "match_scores",
-    "neighbours_of",
     "softmax",
     "tempered",
 ]
@@ -95,8 +101,8 @@ class Row:
     stage: int
     scales: tuple[Scale, ...]
     calibration: Calibration
-    readout_outliers: float
-    outliers: float
+    readout_outliers: float = 0.0
+    outliers: float = 0.0
     distance_limit: float = np.inf
     excess: tuple[float, float] = (0.0, 1.0)
 
@@ -106,10 +112,6 @@ class Row:
         If no touch could be held out, any probability suffices: every new touch would look noisy to the kept ones.
         """
         return probability >= (SURE if self.readout_outliers else 0.0) and distance <= self.distance_limit
-
-    def unlikely(self, excess: float, spreads: float) -> bool:
-        """Whether an excess loss is so many spreads above that of known touches."""
-        return excess > self.excess[0] + spreads * self.excess[1]
 
 
 @dataclass(frozen=True)
@@ -146,13 +148,12 @@ class Paces:
 
 @dataclass(eq=False)
 class Weighing:
-    """What a fit found out of held-out touches: how readouts and kept touches are to be weighed.
+    """How readouts and kept touches are to be weighed, as a fit found by held-out touches.
 
     rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
     another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
     of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
-    to. sample: those that were held out. held_out, neighbours, trajectories, paces, noisy_excess: see `Model`,
-    `fitting.rehearse`, `fitting.paces_of` and `fitting.noisy_excess_of`; made when they are first asked for.
+    to. paces, noisy_excess: measured when they are first asked for, see `fitting`.
     """
 
     rows: tuple[Row, ...]
@@ -162,10 +163,6 @@ class Weighing:
     dependence: Dependence
     least: int
     touches: int
-    sample: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
-    held_out: dict[Scale, HeldOutScores] | None = None
-    trajectories: Trajectories | None = None
-    neighbours: dict[tuple[int, Scale], Neighbours] = field(default_factory=dict)
     paces: Paces | None = None
     noisy_excess: tuple[float, float] | None = None
 
@@ -180,7 +177,19 @@ class Weighing:
         """The rows of prefixes alone, which are shorter than complete touches."""
         return [row for row in self.rows if row.steps < self.least]
 
-    def distance_weight(self, hypothesis: Hypothesis, distance: float) -> float:
+    def logits(
+        self, hypothesis: Hypothesis, chances: FloatArray, match: Match, scores: FloatArray, distance: float
+    ) -> FloatArray:
+        """The logits by readouts and kept touches together, before outliers, (C,); see `prediction.judging`.
+
+        chances: probabilities by the readouts; scores: log-likelihoods by the kept touches; both (C,).
+        """
+        power = self.paces.power if hypothesis == "paced" and self.paces is not None else 1.0
+        sure = (1 - match.noise_share) * self._distance_weight(hypothesis, distance)
+        beta = (BESIDE * sure + (1 - sure)) / (1 + (1 / self.tau - 1) * match.information)
+        return np.asarray(power * (sure * np.log(np.maximum(chances, TINY)) + beta * scores))
+
+    def _distance_weight(self, hypothesis: Hypothesis, distance: float) -> float:
         """The weight of the readouts for a touch at a relative distance, in (0, 1]: less, the further it is off.
 
         Of a complete touch at least 1 / limit, at another pace half of that; of a prefix it is 1.
@@ -191,17 +200,51 @@ class Weighing:
         least = (1.0 if hypothesis == "complete" else LEAST_DISTANCE_WEIGHT) / max(limit, 1.0)
         return float(np.clip(1.0 / max(distance, 1e-9), least, 1.0))
 
-    def fused(
-        self, hypothesis: Hypothesis, chances: FloatArray, match: Match, scores: FloatArray, distance: float
-    ) -> FloatArray:
-        """The probabilities by readouts and kept touches together, before outliers, (C,).
 
-        chances: by the readouts; scores: log-likelihoods by the kept touches; both (C,).
-        """
-        power = self.paces.power if hypothesis == "paced" and self.paces is not None else 1.0
-        sure = (1 - match.noise_share) * self.distance_weight(hypothesis, distance)
-        beta = (BESIDE * sure + (1 - sure)) / (1 + (1 / self.tau - 1) * match.information)
-        return softmax(power * (sure * np.log(np.maximum(chances, TINY)) + beta * scores))
+@dataclass(eq=False)
+class HeldOut:
+    """The sampled touches of a fit, each held out of the readouts as they were solved; scored when first asked for.
+
+    sample: material, key and rows of each. stages: the scales of each stage and the views, in whose order stand the
+    rows of a sampled touch. trajectories: see `fitting.rehearse`.
+    """
+
+    kind: ReadoutName
+    sample: list[tuple[str, bytes, SampledTouch]]
+    readouts: dict[Scale, Readout]
+    stages: list[list[Scale]]
+    trajectories: Trajectories | None = None
+    _neighbours: dict[tuple[int, Scale], Neighbours] = field(default_factory=dict)
+
+    @cached_property
+    def scores(self) -> dict[Scale, HeldOutScores]:
+        """Each scale's scores of these touches."""
+        with one_thread():
+            return {
+                scale: held_out_scores(readout, self.sample, self.stages, self.kind)
+                for scale, readout in self.readouts.items()
+            }
+
+    def at(self, stage: int, scales: Sequence[Scale]) -> StageScores:
+        """Their scores at a stage by some scales."""
+        return StageScores(stage, self.sample, [self.scores[scale] for scale in scales])
+
+    def by(self, row: Row) -> HeldOutProbabilities:
+        """Their probabilities and novelties by the readouts, as a row weighs them."""
+        return held_out_probabilities(self.at(row.stage, row.scales), row.scales, row.calibration, self.around(row))
+
+    def around(self, row: Row) -> list[Neighbours]:
+        """Those among which a touch lies in a row's windows; none where too few were held out to measure that."""
+        return self.neighbours(row.stage, row.scales) if len(row.calibration.thresholds.novelties) else []
+
+    def neighbours(self, stage: int, scales: Sequence[Scale]) -> list[Neighbours]:
+        """Those among which a touch lies at a stage, for each window among the scales."""
+        windows = [scale for scale in scales if scale.width]
+        for scale in windows:
+            if (stage, scale) not in self._neighbours:
+                made = Neighbours(self.readouts[scale], self.sample, self.stages, stage)
+                self._neighbours[stage, scale] = made
+        return [self._neighbours[stage, scale] for scale in windows]
 
 
 @dataclass(frozen=True)
@@ -224,10 +267,10 @@ class Judgement:
 class Model:
     """Everything that predictions need of one state of a memory; it never changes.
 
-    names: the materials, in alphabetical order; known: the same names, as a set; sampled: those with a sampled touch.
-    stages: for each, the windows that judge there. views: the views that judge beside them. readouts: scale → its
-    readout. weighing: None where nothing was learned. matcher, conformal: of the kept touches. longest: the longest
-    learned touch, in steps. since: the touches that were sampled since the fit.
+    names: the materials, in alphabetical order. stages: for each, the windows that judge there. views: the views that
+    judge beside them. longest: the longest learned touch, in steps. readouts: scale → its readout. matcher, conformal:
+    of the kept touches. held_out: the touches that it was weighed by, weighing: how; None where nothing was learned.
+    since: the touches that were sampled since the fit.
     """
 
     kind: ReadoutName
@@ -235,21 +278,15 @@ class Model:
     names: list[str]
     stages: list[list[Scale]]
     views: list[Scale]
-    readouts: dict[Scale, Readout]
-    weighing: Weighing | None
-    matcher: TouchMatcher | None
-    conformal: Conformal | None
     longest: int
+    held_out: HeldOut
+    weighing: Weighing | None = None
+    matcher: TouchMatcher | None = None
+    conformal: Conformal | None = None
+    readouts: dict[Scale, Readout] = field(default_factory=dict)
     since: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
-    known: frozenset[str] = field(init=False)
-    sampled: frozenset[str] = field(init=False)
     _of_all: dict[Scale, npt.NDArray[np.intp]] = field(init=False, default_factory=dict)
     _extended: dict[int, list[Neighbours]] = field(init=False, default_factory=dict)  # by stage
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "known", frozenset(self.names))
-        sample = [] if self.weighing is None else self.weighing.sample
-        object.__setattr__(self, "sampled", frozenset(material for material, *_ in sample))
 
     @property
     def fitted(self) -> Weighing:
@@ -258,23 +295,18 @@ class Model:
         return self.weighing
 
     @property
-    def viewed(self) -> list[list[Scale]]:
-        """The scales of each stage and the views: in their order stand the rows of a sampled touch."""
-        return [[*stage, *self.views] for stage in self.stages]
-
-    @property
-    def held_out(self) -> dict[Scale, HeldOutScores]:
-        """Each scale's scores of the sampled touches, each held out of its readout."""
-        weighing = self.fitted
-        if weighing.held_out is None:
-            with one_thread():
-                weighing.held_out = held_out_of(self, weighing.sample)
-        return weighing.held_out
-
-    @property
     def touches(self) -> int:
         """The touches that it was fitted to."""
         return 0 if self.weighing is None else self.weighing.touches
+
+    @cached_property
+    def known(self) -> frozenset[str]:
+        """The materials, as a set."""
+        return frozenset(self.names)
+
+    @cached_property
+    def _sampled_are_known(self) -> bool:
+        return {material for material, *_ in self.held_out.sample} <= self.known
 
     def followed(self, memory: Memory, changed: Collection[str]) -> Model | None:
         """The model of the memory as it is now, some materials of which have changed; None where one must be fitted.
@@ -291,14 +323,14 @@ class Model:
             if (kept := followed_to(matcher.kept, conformal, memory.kept.touches())) is None:
                 return None
             matcher, conformal = matcher.followed(kept[0]), kept[1]
-        statistics, there = memory.statistics, {(material, key) for material, key, _ in self.fitted.sample}
+        there = {(material, key) for material, key, _ in self.held_out.sample}
         return replace(
             self,
-            names=list(statistics.materials),
+            names=list(memory.statistics.materials),
             readouts=readouts,
             matcher=matcher,
             conformal=conformal,
-            longest=statistics.longest,
+            longest=memory.statistics.longest,
             since=[(material, key, touch) for material, key, touch in memory.sample if (material, key) not in there],
         )
 
@@ -328,22 +360,22 @@ class Model:
         Each stage that is the last one of some candidate weighs the candidates that have rows there. Those without rows
         at a later stage keep their probability; the later stages divide the remaining probability among the others.
         """
+        weighing = self.fitted
+        decided = self._decided(candidates, len(self.plan.stages(steps)))
         if hypothesis == "paced":  # every touch has views, of all of it
-            decided: list[tuple[int, Sequence[int]]] = [(len(self.fitted.rows) - 1, range(len(candidates)))]
-        else:
-            decided = self._decided(candidates, len(self.plan.stages(steps)))
-        probability, mass, distance = np.ones(len(candidates)), 1.0, 0.0
+            decided = [(len(weighing.rows) - 1, range(len(candidates)))]
+        probability, distance = np.ones(len(candidates)), 0.0
         for i, (stage, members) in enumerate(decided):
+            among = np.asarray(members, dtype=np.intp)
+            mass = float(probability[among].sum()) if i else 1.0
             names = candidates if len(members) == len(candidates) else [candidates[place] for place in members]
             if tuned is not None and stage == len(self.stages) - 1:
                 logits = np.array([tuned[name] for name in names])
             else:
-                logits, distance = self._weighted(self.fitted.row(hypothesis, stage), means, names, steps)
-            probability[np.asarray(members)] = softmax(logits) * mass
-            later = np.asarray(decided[i + 1][1] if i + 1 < len(decided) else [], dtype=np.intp)
-            mass = float(probability[later].sum())
+                logits, distance = self._weighted(weighing.row(hypothesis, stage), means, names, steps)
+            probability[among] = softmax(logits) * mass
         best = int(np.argmax(probability))
-        row = self.fitted.row(hypothesis, max(stage for stage, members in decided if best in members))
+        row = weighing.row(hypothesis, max(stage for stage, members in decided if best in members))
         return Judgement(probability, self.novelty(row, means, candidates), row, distance)
 
     def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
@@ -376,41 +408,32 @@ class Model:
         self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str], steps: int
     ) -> tuple[FloatArray, float]:
         """The logits of some materials, weighed as they are calibrated, and the distance of `Judgement`."""
-        readouts, features = [self.readouts[scale] for scale in row.scales], [means[scale] for scale in row.scales]
-        places = [self._places(scale, names) for scale in row.scales]
-        found = [
-            readout.scores(own, among, self.kind)
-            for readout, own, among in zip(readouts, features, places, strict=True)
-        ]
-        weights, distance = row.calibration.weights, 0.0
-        if np.isfinite(row.calibration.median_distances).all():
-            nearest = [int(among[int(scores.argmax())]) for among, scores in zip(places, found, strict=True)]
-            away = [
-                readout.diagonal_distance(own, place)
-                for readout, own, place in zip(readouts, features, nearest, strict=True)
-            ]
-            weights = row.calibration.weights_at(np.array(away))
-            distance = float(row.calibration.relative(np.array(away))[measuring(row.scales)].min())
+        logits, away = [], []
+        for scale in row.scales:
+            readout, places = self.readouts[scale], self._places(scale, names)
+            logits.append(readout.scores(means[scale], places, self.kind))
+            away.append(readout.diagonal_distance(means[scale], int(places[int(logits[-1].argmax())])))
+        weights = row.calibration.weights_at(np.array(away))
+        distance = float(row.calibration.relative(np.array(away))[measuring(row.scales)].min())
         # A beginning shorter than the first stage is read by fewer readings than the scores are calibrated for.
         begun = min(1.0, steps / row.steps) ** 2
-        return begun * np.asarray(sum(weight * scores for weight, scores in zip(weights, found, strict=True))), distance
-
-    def neighbours(self, row: Row) -> list[Neighbours]:
-        """The sampled touches that a row's windows lie among; none where too few were held out to measure that."""
-        if not len(row.calibration.thresholds.novelties):
-            return []
-        return neighbours_of(self, self.fitted.sample, row.stage, row.scales, self.fitted.neighbours)
+        return begun * np.asarray(sum(weight * own for weight, own in zip(weights, logits, strict=True))), distance
 
     def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch judged by a row, among these materials."""
-        among = None if len(names) == len(self.names) and self.sampled <= self.known else set(names)
+        among = None if len(names) == len(self.names) and self._sampled_are_known else set(names)
         windows = (scale for scale in row.scales if scale.width)
-        near = self.neighbours(row)
-        if self.since and near:
-            near = self._extended.get(row.stage) or [own.extended(self.since) for own in near]
-            self._extended[row.stage] = near
-        local = [own.novelty(means[scale], among) for own, scale in zip(near, windows, strict=False)]
+        local = [own.novelty(means[scale], among) for own, scale in zip(self._near(row), windows, strict=False)]
         return float(row.calibration.novelty(np.array([*self.distances(row.scales, means, names), *local])))
+
+    def _near(self, row: Row) -> list[Neighbours]:
+        """The sampled touches, also those sampled since the fit, among which a touch lies in a row's windows."""
+        near = self.held_out.around(row)
+        if not (near and self.since):
+            return near
+        if row.stage not in self._extended:
+            self._extended[row.stage] = [own.extended(self.since) for own in near]
+        return self._extended[row.stage]
 
     def distances(self, scales: Sequence[Scale], means: Mapping[Scale, FloatArray], names: Sequence[str]) -> FloatArray:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
@@ -431,25 +454,6 @@ def followed_to(
     if followed.longest != arrays.longest:
         return followed, Conformal.of(kept)
     return followed, conformal.followed(added, removed)
-
-
-def held_out_of(model: Model, sample: Sampled) -> dict[Scale, HeldOutScores]:
-    """Each scale's scores of sampled touches, each held out of its readout."""
-    return {scale: held_out_scores(own, sample, model.viewed, model.kind) for scale, own in model.readouts.items()}
-
-
-def neighbours_of(
-    model: Model, sample: Sampled, stage: int, scales: Sequence[Scale], made: dict[tuple[int, Scale], Neighbours]
-) -> list[Neighbours]:
-    """The sampled touches that a touch lies among at a stage, for each window of these scales.
-
-    made: those of other calls, (stage, scale) → which; it is added to.
-    """
-    windows = [scale for scale in scales if scale.width]
-    for scale in windows:
-        if (stage, scale) not in made:
-            made[stage, scale] = Neighbours(model.readouts[scale], sample, model.viewed, stage)
-    return [made[stage, scale] for scale in windows]
 
 
 def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:

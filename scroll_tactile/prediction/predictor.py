@@ -26,7 +26,7 @@ from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
-from scroll_tactile.prediction.fitting import Draft
+from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.judging import Touch, answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.readouts.estimation import Estimator
@@ -252,9 +252,10 @@ class Predictor:
             return self.current.present(self.ledger)
 
     def rehearsed(self) -> Model:
-        """As `present`, for live sessions: with what `fitting.rehearse` finds."""
+        """As `present`, for live sessions: with what `fitting.rehearse` finds, as later fits will have it."""
         with self.ledger.lock, enough_memory():
-            return self.current.rehearsed(self.ledger)
+            rehearse(model := self.current.present(self.ledger))
+        return model
 
     def answer_of(self, model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
         """The prediction of a model for touches of one thing."""

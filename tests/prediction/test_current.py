@@ -194,7 +194,7 @@ def test_a_fit_that_ends_answers_and_has_followed_what_came_since(monkeypatch):
         learner.observe("a", stream("a", 90 + i))
     job = learner._predictor.current._job
     learner.observe("d", stream("d", 93))
-    job.future.result()
+    job.model.result()
     require_followed(learner)
     assert present(learner).touches == len(OBSERVED) + 3
     learner.settle()
@@ -245,7 +245,7 @@ def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monk
             require_followed(learner)
     require_followed(learner)
     job = learner._predictor.current._job
-    job.future.result()  # a fit that failed beside is made again
+    job.model.result()  # a fit that failed beside is made again
     assert bits(learner) == expected(later(5))
 
 
@@ -262,7 +262,7 @@ def fitting(monkeypatch, tmp_path):
         learner.predict(stream(*PROBES[0]))
         for i in range(3):
             learner.observe("a", stream("a", 90 + i))
-        assert not learner._predictor.current._job.future.done()
+        assert not learner._predictor.current._job.model.done()
         yield learner
 
 
@@ -271,7 +271,7 @@ def test_closed_pickled_and_copied_while_a_fit_runs(fitting):
         assert bits(snapshot) == expected(later(3))
     job = fitting._predictor.current._job
     fitting.close()
-    assert job.future.done()
+    assert job.model.done()
     for _ in range(3):
         require_followed(fitting)
     fitting.close()
@@ -281,7 +281,7 @@ def test_a_material_that_is_forgotten_while_a_fit_runs_is_gone(fitting):
     job = fitting._predictor.current._job
     fitting.forget("b")
     require_followed(fitting)
-    job.future.result()
+    job.model.result()
     require_followed(fitting)
     assert fitting._predictor.current.stored(fitting._ledger) is None
     with fitting.live(contact="manual") as live:

@@ -51,8 +51,8 @@ def faster(readings, times):
 def test_what_is_rehearsed_is_what_the_model_says_of_a_touch_that_it_lacks(learner, model, extractor):
     """Of each beginning of a touch that readouts and kept touches never observed."""
     rehearse(model)
-    said, weighing, apart = model.fitted.trajectories, model.fitted, []
-    rows, keys = model.matcher.kept.rows(), [key for _, key, _ in weighing.sample]
+    said, weighing, apart = model.held_out.trajectories, model.fitted, []
+    rows, keys = model.matcher.kept.rows(), [key for _, key, _ in model.held_out.sample]
     assert len(said.targets) == len(rows) == len(TOUCHES)  # all are held out: they are few
     for touch in held_out_touches(model, 0.05)[::7]:
         stream = stream_of(model.matcher.kept.levels(rows[touch.key]), SKIN)
@@ -88,7 +88,7 @@ def test_a_touch_at_another_pace_is_known_and_right(learner, times):
 
 def test_beginnings_are_right_sooner_than_later_and_no_surer_than_that(model):
     rehearse(model)
-    said = model.fitted.trajectories
+    said = model.held_out.trajectories
     right = (said.chances.argmax(axis=2) == said.targets[:, None]).mean(axis=0)
     assert right[-1] >= max(0.95, right[0])
     assert np.abs(said.chances.max(axis=2).mean(axis=0) - right).max() < 0.12

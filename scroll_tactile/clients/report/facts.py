@@ -220,10 +220,10 @@ class Soon:
 
 def soon(model: Model, extractor: FeatureExtractor, rule: DecisionRule, false_alarms: float) -> Soon | None:
     """How soon answers come, by prefixes of held-out touches; None where too few touches were held out."""
-    weighing = model.weighing
-    if weighing is None or weighing.trajectories is None or len(weighing.trajectories.targets) < FEWEST:
+    held_out = model.held_out.trajectories
+    if model.weighing is None or held_out is None or len(held_out.targets) < FEWEST:
         return None
-    held_out, rows, rate = weighing.trajectories, weighing.early, extractor.sensor.rate
+    rows, rate = model.weighing.early, extractor.sensor.rate
     done, wrong = np.zeros((2, len(held_out.targets)), bool)
     right, decided, mistaken = [], [], []
     for i, row in enumerate(rows):
@@ -295,11 +295,11 @@ def growing(
 
 def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
     """The model as if it had never observed a touch, nor kept it, but for how it is weighed."""
-    weighing, own = model.fitted, (touch.material, touch.key)
-    sampled = next(item for *which, item in weighing.sample if tuple(which) == own)
+    own = touch.material, touch.key
+    sampled = next(item for *which, item in model.held_out.sample if tuple(which) == own)
     readouts = dict(model.readouts)
     for scale, readout in model.readouts.items():
-        if rows := rows_at(sampled, model.viewed, scale):
+        if rows := rows_at(sampled, model.held_out.stages, scale):
             # As many rows as it added: of windows that are learned one by one the sample has the mean.
             times = max(1, round(sampled.pairs[rows[0], 2] / len(rows)))
             task = Task.of(memory.statistics, scale, readout.reference, model.plan.shrinkage)

@@ -417,7 +417,7 @@ class TactileLearner:
         Raises StreamError; AnnotationError where nothing, or one of these, was not declared; InputError for a risk.
         """
         require_arguments({"risk": risk}, {"known": known})
-        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)[1]
+        return self._predictor.estimate(stream, names_of("of", of, AnnotationError), risk, known)
 
     def compose(
         self, stream: Readings, *, constituents: Sequence[str] | None = None, unfamiliar: float = 0.5

@@ -96,7 +96,7 @@ def _fold(recordings: Recordings, fold: int, every: int, progress: Progress) -> 
     def predicted(stream: Stream) -> Prediction:
         # By the model that the rules are of: the learner's own would be fitted once more, to the same end.
         encoded = extractor.encode(stream, model.longest, lambda columns: model.scales_for(model.names, columns))
-        return answer(model, extractor, model.names, [(encoded, None)], learner.settings.false_alarms)
+        return answer(model, extractor, model.names, [encoded], learner.settings.false_alarms)
 
     said: list[list[Prediction]] = []
     for done, i in enumerate(tested):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,8 @@ __all__ = ["Encoded", "FeatureExtractor", "Readings", "WindowCache", "stream_of"
 
 Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 Image = npt.NDArray[np.float32]
+Rows = dict[Scale, npt.NDArray[np.floating]]
+Features = dict[int, npt.NDArray[np.floating]]  # width of windows → rows of features
 
 
 @dataclass(frozen=True)
@@ -39,13 +42,14 @@ class Encoded:
     """A touch as it is evaluated.
 
     stream: the whole touch. image: (C, T) in [-1, 1], of as much of it as is judged. means: scale → mean features in
-    grid units, (d,). seconds: how much touch is judged.
+    grid units, (d,). seconds: how much touch is judged. logits: those of f*, by material, where it answers.
     """
 
     stream: Stream
     image: Image
     means: dict[Scale, npt.NDArray[np.float64]]
     seconds: float
+    logits: Mapping[str, float] | None = None
 
     @property
     def steps(self) -> int:
@@ -54,44 +58,28 @@ class Encoded:
 
 
 class WindowCache:
-    """Features of the complete windows of a touch in progress, so that no window is embedded twice.
-
-    A cached row is used while the steps that it was made of are the same, to the bit, in the present image.
-    """
+    """Features of the windows of a touch in progress, by what they read, so that no window is embedded twice."""
 
     def __init__(self) -> None:
-        self._image: Image = np.empty((0, 0), np.float32)
-        self._rows: dict[tuple[int, int], npt.NDArray[np.floating]] = {}
+        self._rows: dict[tuple[int, bytes], npt.NDArray[np.floating]] = {}
 
-    def update(self, image: Image) -> None:
-        """Drop the rows that are not valid for an image (C, T)."""
-        steps, same = min(self._image.shape[1], image.shape[1]), 0
-        if steps and len(self._image) == len(image):
-            changed = (self._image[:, :steps] != image[:, :steps]).any(axis=0)
-            same = int(changed.argmax()) if changed.any() else steps
-        self._rows = {(width, start): row for (width, start), row in self._rows.items() if start + width <= same}
-        self._image = image
-
-    def missing(self, windows: Extent) -> Extent:
-        """Those of the windows, width → first steps, without a cached row."""
+    def embedded(self, image: Image, windows: Extent, embed: Callable[[Image, Extent], Features]) -> Features:
+        """Width → features (windows, d) of an image (C, T). embed: makes those that are not here."""
+        read = {
+            width: [(width, image[:, at : at + width].tobytes()) for at in starts] for width, starts in windows.items()
+        }
         absent = {
-            width: [start for start in starts if (width, start) not in self._rows] for width, starts in windows.items()
+            width: new
+            for width, starts in windows.items()
+            if (new := [at for at, key in zip(starts, read[width], strict=True) if key not in self._rows])
         }
-        return {width: starts for width, starts in absent.items() if starts}
-
-    def joined(
-        self, windows: Extent, absent: Extent, embedded: Mapping[int, npt.NDArray[np.floating]]
-    ) -> dict[int, npt.NDArray[np.floating]]:
-        """Width → features (windows, d): the newly embedded ones, at `absent`, and the cached ones."""
-        steps = self._image.shape[1]
-        fresh = {
-            (width, start): row
-            for width, starts in absent.items()
-            for start, row in zip(starts, embedded[width], strict=True)
-        }
-        self._rows |= {(width, start): row for (width, start), row in fresh.items() if start + width <= steps}
-        every = self._rows | fresh
-        return {width: np.stack([every[width, start] for start in starts]) for width, starts in windows.items()}
+        if absent:  # of the image, only the steps that these need
+            first = min(map(min, absent.values()))
+            shifted = {width: [at - first for at in starts] for width, starts in absent.items()}
+            for width, rows in embed(np.ascontiguousarray(image[:, first:]), shifted).items():
+                keys = [(width, image[:, at : at + width].tobytes()) for at in absent[width]]
+                self._rows |= zip(keys, rows, strict=True)
+        return {width: np.stack([self._rows[key] for key in keys]) for width, keys in read.items()}
 
 
 class FeatureExtractor:
@@ -109,22 +97,9 @@ class FeatureExtractor:
         plan: WindowPlan,
         check: FingerprintCheck | None = None,
     ) -> None:
-        self._check = check
-        self._sensor = sensor
-        self._embedding = embedding
-        self._plan = plan
+        self.sensor, self.embedding, self._plan, self._check = sensor, embedding, plan, check
         require_rest(embedding, sensor)
         self._rest: Rest = capabilities_of(embedding).rest
-
-    @property
-    def sensor(self) -> Sensor:
-        """Whose touches it reads."""
-        return self._sensor
-
-    @property
-    def embedding(self) -> Embedding:
-        """What makes the features."""
-        return self._embedding
 
     @property
     def check(self) -> FingerprintCheck | None:
@@ -134,24 +109,24 @@ class FeatureExtractor:
     def verified(self) -> FeatureExtractor:
         """This extractor, whose embedding is the memory's. Raises EmbeddingMismatchError."""
         if self.check is not None:
-            self.check.require(self._embedding)
+            self.check.require(self.embedding)
         return self
 
     def verifying(self) -> AbstractContextManager[None]:
         """As `verified`, in a thread while the block runs; raises at the end of the block."""
-        return nullcontext() if self.check is None else self.check.beside(self._embedding)
+        return nullcontext() if self.check is None else self.check.beside(self.embedding)
 
     def stream(self, readings: Readings) -> Stream:
         """The validated stream of some readings; of a camera's, the frames in contact.
 
         Raises StreamError: see `validate` and `pressed`.
         """
-        stream = validate(readings, self._sensor)
-        return pressed(stream, self._rest) if self._sensor.camera else stream
+        stream = validate(readings, self.sensor)
+        return pressed(stream, self._rest) if self.sensor.camera else stream
 
     def image(self, stream: Stream) -> Image:
         """The tactile image of a `stream`."""
-        return image_of(stream, self._rest) if self._sensor.camera else tactile_image(stream)
+        return image_of(stream, self._rest) if self.sensor.camera else tactile_image(stream)
 
     def learned(self, stream: Stream) -> tuple[int, Codes]:
         """What a memory learns of a `stream`: its steps, and the `codes` that it adds. Raises as `verified`."""
@@ -162,7 +137,7 @@ class FeatureExtractor:
         """The quantised features that a touch adds to the statistics, rows by scale."""
         stages, places = self._plan.scored_stages(image.shape[1]), self._plan.places(image.shape[1])
         features = self.features(image, places=places)
-        codes = {scale: to_codes(rows, self._embedding.bound) for scale, rows in features.items()}
+        codes = {scale: to_codes(rows, self.embedding.bound) for scale, rows in features.items()}
         among = {scale: {place: i for i, place in enumerate(chosen)} for scale, chosen in places.items()}
         groups = [
             {scale: [[among[scale][place] for place in group] for group in stage[scale]] for scale in stage}
@@ -195,7 +170,7 @@ class FeatureExtractor:
         places = self._plan.places(image.shape[1])
         # Not rounded: the grid is for sums, and would only add its error here.
         return {
-            scale: in_units(rows, self._embedding.bound).mean(axis=0)
+            scale: in_units(rows, self.embedding.bound).mean(axis=0)
             for scale, rows in self.features(image, scales, whole, places, cache).items()
         }
 
@@ -206,64 +181,45 @@ class FeatureExtractor:
         whole: Image | None = None,
         places: Mapping[Scale, Sequence[int]] | None = None,
         cache: WindowCache | None = None,
-    ) -> dict[Scale, npt.NDArray[np.floating]]:
+    ) -> Rows:
         """The features of a tactile image, (windows, d) by scale, one row of a view: all, or those of some scales.
 
         places: the windows of each scale that are embedded; all unless given, though half of the dense ones at the
         beginning are never scored. cache: of the image when it had fewer steps.
         """
-        wanted = self._plan.scales if scales is None else scales
-        extent = self._plan.extent(image.shape[1])
-        windows = {scale: extent[scale.width] for scale in wanted if scale.width in extent}
+        plan, wanted = self._plan, self._plan.scales if scales is None else scales
+        extent = plan.extent(image.shape[1])
+        windows = {scale.width: extent[scale.width] for scale in wanted if scale.width in extent}
         if places is not None:
-            windows = {scale: [starts[place] for place in places[scale]] for scale, starts in windows.items()}
-        views = self._views(image if whole is None else whole) if self._plan.views and WHOLE in wanted else {}
-        by_width = {int(scale): starts for scale, starts in windows.items()}
-        if views and views[WHOLE] is image and cache is None and self._plan.whole not in by_width:
+            windows = {width: [own[at] for at in places[Scale("window", width)]] for width, own in windows.items()}
+        embedded, views, viewed = Features(), Rows(), image if whole is None else whole
+        if plan.views and WHOLE in wanted:
+            viewed = viewed if viewed.shape[1] == plan.whole else stretched(viewed, plan.whole)
             # A touch of the default length is convolved once for its windows and for itself.
-            embedded, found = self._whole(image, by_width)
-        else:
-            embedded = self._embedded(image, by_width) if cache is None else self._completed(image, by_width, cache)
-            found = self._whole(views[WHOLE], {})[1] if views else {}
-        if views:
-            found[SHAPE] = self._embedded(views[SHAPE], {self._plan.whole: [0]})[self._plan.whole]
-        return {Scale("window", width): rows for width, rows in embedded.items()} | dict(sorted(found.items()))
+            once = viewed is image and cache is None and plan.whole not in windows
+            embedded, views = self._whole(viewed, windows if once else {})
+            views[SHAPE] = self._embedded(shape_image(viewed), {plan.whole: [0]})[plan.whole]
+            windows = {} if once else windows
+        if windows:
+            embed = self._embedded if cache is None else partial(cache.embedded, embed=self._embedded)
+            embedded = embed(image, windows)
+        return {Scale("window", width): rows for width, rows in embedded.items()} | dict(sorted(views.items()))
 
-    def _whole(
-        self, image: Image, windows: Extent
-    ) -> tuple[dict[int, npt.NDArray[np.floating]], dict[Scale, npt.NDArray[np.floating]]]:
+    def _whole(self, image: Image, windows: Extent) -> tuple[Features, Rows]:
         """The features of windows of a whole touch, and of its views but SHAPE, (1, d) each."""
         width, every = self._plan.whole, {**windows, self._plan.whole: [0]}
         if not self._plan.competes:
             embedded = self._embedded(image, every)
             return embedded, {WHOLE: embedded.pop(width)}
-        features, competing = embed_competing(self._embedding, image, every, width)
+        features, competing = embed_competing(self.embedding, image, every, width)
         embedded = self._sound(image, features, every)
         self._require(image, competing, (), "all, by competing kernels,")
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
-    def _completed(self, image: Image, windows: Extent, cache: WindowCache) -> dict[int, npt.NDArray[np.floating]]:
-        """The features of windows; only those without a cached row are embedded, and only the steps that these need."""
-        cache.update(image)
-        absent = cache.missing(windows)
-        if not absent:
-            return cache.joined(windows, absent, {})
-        first = min(min(starts) for starts in absent.values())
-        part = np.ascontiguousarray(image[:, first:])
-        shifted = {width: [start - first for start in starts] for width, starts in absent.items()}
-        return cache.joined(windows, absent, self._embedded(part, shifted))
+    def _embedded(self, image: Image, windows: Extent) -> Features:
+        return self._sound(image, embed_windows(self.embedding, image, windows), windows)
 
-    def _views(self, image: Image) -> dict[Scale, Image]:
-        """The images of a whole touch by view; WHOLE is the image itself for a touch of the default length."""
-        whole = image if image.shape[1] == self._plan.whole else stretched(image, self._plan.whole)
-        return {WHOLE: whole, SHAPE: shape_image(whole)}
-
-    def _embedded(self, image: Image, windows: Extent) -> dict[int, npt.NDArray[np.floating]]:
-        return self._sound(image, embed_windows(self._embedding, image, windows), windows)
-
-    def _sound(
-        self, image: Image, embedded: dict[int, npt.NDArray[np.floating]], windows: Extent
-    ) -> dict[int, npt.NDArray[np.floating]]:
+    def _sound(self, image: Image, embedded: Features, windows: Extent) -> Features:
         """The features of windows. All features that are learned or judged by pass here, and are checked here."""
         for width, features in embedded.items():
             self._require(image, features, (len(windows[width]),), f"windows of {width} steps")
@@ -272,7 +228,7 @@ class FeatureExtractor:
     def _require(self, image: Image, features: npt.NDArray[np.floating], rows: tuple[int, ...], what: str) -> None:
         channels, steps = image.shape
         touch = f"{what} of a touch of {channels} × {steps}"
-        require_features(self._embedding, features, (*rows, self._embedding.dimension), touch)
+        require_features(self.embedding, features, (*rows, self.embedding.dimension), touch)
 
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.
@@ -280,9 +236,9 @@ class FeatureExtractor:
         Nothing was learned of what comes later, and the later part of a slide differs: learned from 2 s of BioTac,
         touches of 4 s are right in 93.5 % when they are read to their end.
         """
-        frame = self._plan.widths[0] if self._sensor.camera else 1
+        frame = self._plan.widths[0] if self.sensor.camera else 1
         before = 1 if isinstance(self._rest, str) else 0  # the resting image is not in the tactile image
-        return stream.first((longest // frame + before) / self._sensor.rate)
+        return stream.first((longest // frame + before) / self.sensor.rate)
 
 
 def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:

@@ -20,8 +20,8 @@ is the only number fitted to kept touches; b is `BESIDE`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,11 +39,9 @@ from scroll_tactile.results import Estimate, Prediction, Unusual
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.moments import one_thread
 
-__all__ = ["HeldOutTouch", "Touch", "answer", "estimates_of", "held_out_touches", "judged"]
+__all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged"]
 
 FloatArray = npt.NDArray[np.float64]
-Touch = tuple[Encoded, Mapping[str, float] | None]
-"""An encoded touch, and the logits of f* where it answers."""
 
 
 class Matched(NamedTuple):
@@ -64,7 +62,7 @@ def answer(
     model: Model,
     extractor: FeatureExtractor,
     candidates: Sequence[str],
-    touches: Sequence[Touch],
+    touches: Sequence[Encoded],
     false_alarms: float,
 ) -> Prediction:
     """The prediction for touches of one thing, which is one of the candidates; one touch or more.
@@ -76,57 +74,54 @@ def answer(
     typicality is twice the mean of theirs, a bound that holds whatever the dependence between them (Vovk and Wang
     2020).
     """
-    once = {touch.stream.key: (touch, logits) for touch, logits in touches} if len(touches) > 1 else {b"": touches[0]}
-    own = [once[key] for key in sorted(once)]
+    own = [*touches]
+    if len(own) > 1:
+        once = {touch.stream.key: touch for touch in own}
+        own = [once[key] for key in sorted(once)]
     with one_thread():
-        judgements = [judged(model, extractor, candidates, touch, logits) for touch, logits in own]
-        typical = _typicality(model, candidates, [touch for touch, _ in own])
+        judgements = [judged(model, extractor, candidates, touch) for touch in own]
+        typical = _typicality(model, candidates, own)
     probability, novelty = judgements[0].probability, judgements[0].novelty
     if len(judgements) > 1:
         probability = model.fitted.dependence.probability([judgement.probability for judgement in judgements])
         novelty = model.fitted.dependence.standard([judgement.novelty for judgement in judgements])
-    order = np.argsort(-probability, kind="stable")  # candidates come in alphabetical order
-    names = list(map(candidates.__getitem__, order.tolist()))
-    ranking = tuple(zip(names, probability[order].tolist(), strict=True))
-    seconds = math.fsum(touch.seconds for touch, _ in own)
-    tuned = all(logits is not None for _, logits in own)
-    known = _known(novelty, names[0], [judgement.row.calibration.thresholds for judgement in judgements], false_alarms)
-    p_own, least_own, p_all, least_all = typical[order].T.tolist()
-    unusual = tuple(sorted({way for judgement in judgements for way in judgement.unusual}))
-    return Prediction(
-        material=ranking[0][0],
-        probability=ranking[0][1],
-        ranking=ranking,
-        novelty=novelty,
-        known=known,
-        seconds=seconds,
-        tuned=tuned,
-        typicality=tuple(p_own),
-        typicality_of_all=tuple(p_all),
-        least_typicality=(*least_own, max(least_all)),
-        unusual=unusual,
+    thresholds = [judgement.row.calibration.thresholds for judgement in judgements]
+    found = _prediction(candidates, probability, novelty, thresholds, false_alarms)
+    places = {name: place for place, name in enumerate(candidates)}
+    own_share, own_least, all_share, all_least = typical[[places[name] for name, _ in found.ranking]].T.tolist()
+    return replace(
+        found,
+        seconds=math.fsum(touch.seconds for touch in own),
+        tuned=all(touch.logits is not None for touch in own),
+        typicality=tuple(own_share),
+        typicality_of_all=tuple(all_share),
+        least_typicality=(*own_least, max(all_least)),
+        unusual=tuple(sorted({way for judgement in judgements for way in judgement.unusual})),
     )
 
 
-def _known(novelty: float, material: str, thresholds: Sequence[NoveltyThresholds], false_alarms: float) -> bool | None:
-    """Whether touches of one thing that are answered by a material are of a known one; None where that is not told."""
-    above = [each.above(material, false_alarms) for each in thresholds]
+def _prediction(
+    names: Sequence[str],
+    probability: FloatArray,
+    novelty: float,
+    thresholds: Sequence[NoveltyThresholds],
+    false_alarms: float,
+) -> Prediction:
+    """What is said of touches of one thing. names: in alphabetical order. thresholds: of each touch."""
+    order = np.argsort(-probability, kind="stable").tolist()
+    ranking = tuple((names[place], float(probability[place])) for place in order)
+    above = [each.above(ranking[0][0], false_alarms) for each in thresholds]
     below = [each.below(false_alarms) for each in thresholds]
+    known = True if novelty < math.fsum(below) / len(below) else None
     if novelty > math.fsum(above) / len(above):
-        return False
-    return True if novelty < math.fsum(below) / len(below) else None
+        known = False
+    return Prediction(*ranking[0], ranking, novelty, known, seconds=0.0)
 
 
-def judged(
-    model: Model,
-    extractor: FeatureExtractor,
-    candidates: Sequence[str],
-    encoded: Encoded,
-    logits: Mapping[str, float] | None = None,
-) -> Judgement:
+def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
     """The judgement of a touch by a model, or by the logits of f*."""
-    if logits is not None:
-        return model.judge(candidates, encoded.means, encoded.steps, "complete", logits)
+    if encoded.logits is not None:
+        return model.judge(candidates, encoded.means, encoded.steps, "complete", encoded.logits)
     weighing, own = model.fitted, _own_hypothesis(model, encoded)
     alone = model.judge(candidates, encoded.means, encoded.steps, own)
     length, matcher = len(encoded.stream), model.matcher
@@ -270,43 +265,19 @@ def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: 
     return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda steps: scales)
 
 
-@dataclass(frozen=True)
-class HeldOutTouch:
-    """The answer to a touch by a model without it.
-
-    material, key: its own. names: the materials it was weighed among, in alphabetical order. probability: of each,
-    shape (C,). novelty: see `Prediction`. threshold: a novelty above it is called unknown.
-    """
+class HeldOutTouch(NamedTuple):
+    """A sampled touch of a material, and what a model without it says, among materials with a sampled touch."""
 
     material: str
     key: bytes
-    names: tuple[str, ...]
-    probability: FloatArray
-    novelty: float
-    threshold: float
-
-    @property
-    def answer(self) -> str:
-        """The likeliest material."""
-        return self.names[int(self.probability.argmax())]
-
-    @property
-    def confidence(self) -> float:
-        """Its probability."""
-        return float(self.probability.max())
-
-    @property
-    def known(self) -> bool:
-        """Whether it is not called unknown."""
-        return self.novelty <= self.threshold
+    said: Prediction
 
 
 def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     """Answers of a model, just fitted, to the sampled touches, each held out of readouts and kept touches.
 
-    They are weighed among the materials that have a sampled touch. A touch that is its material's only one is omitted.
-    The calibration was fitted to all of them, each one included; no other pace is tried, no dead channel filled in.
-    false_alarms: as in `Settings`.
+    A touch that is its material's only one is omitted. The calibration was fitted to all of them, each one included; no
+    other pace is tried, no dead channel filled in. false_alarms: as in `Settings`.
     """
     weighing, matcher, answers = model.weighing, model.matcher, dict[int, HeldOutTouch]()
     if weighing is None:
@@ -326,10 +297,9 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
                 result = _fused(model, held.names, alone, matched)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
-            names = tuple(held.names)
-            called = names[int(result.probability.argmax())]
-            threshold = row.calibration.thresholds.above(called, false_alarms)
-            answers[place] = HeldOutTouch(material, key, names, result.probability, result.novelty, threshold)
+            thresholds = [row.calibration.thresholds]
+            said = _prediction(held.names, result.probability, result.novelty, thresholds, false_alarms)
+            answers[place] = HeldOutTouch(material, key, said)
     return list(answers.values())
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, Protocol, Self, TypeVar
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +29,7 @@ from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft, rehearse
-from scroll_tactile.prediction.judging import Touch, answer, estimates_of
+from scroll_tactile.prediction.judging import answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.recipe import Recipe, RecipeRequest
@@ -42,8 +44,6 @@ from scroll_tactile.validation.stored_watch import NAME as HEALTH
 __all__ = ["LogitsReader", "Predictor", "nothing_known"]
 
 logger = logging.getLogger(__name__)
-
-Answer = TypeVar("Answer")
 
 
 class LogitsReader(Protocol):
@@ -144,102 +144,61 @@ class Predictor:
         if not streams:
             raise InputError("expected a stream to predict, or several of one thing; came none")
         touches = [self.stream(stream) for stream in streams]
-
-        def begin(model: Model) -> Callable[[], Prediction]:
+        with self._asked() as model:
             reader = None if reader_of is None else reader_of(self)
             candidates = candidates_of(scene, model.names, model.known)
             if not candidates:
-                return partial(nothing_known, math.fsum({touch.key: touch.seconds for touch in touches}.values()))
-
-            def read(touch: Stream) -> Touch:
-                encoded = self.extractor.encode(touch, model.longest, lambda steps: model.scales_for(candidates, steps))
-                if reader is None or not model.is_last(encoded.steps):
-                    return encoded, None
-                return encoded, reader.logits_of(encoded.image, candidates)
-
-            return lambda: self._answer(model, candidates, [read(touch) for touch in touches])
-
-        return self._of_one_state(begin)
+                return nothing_known(math.fsum({touch.key: touch.seconds for touch in touches}.values()))
+            encoded = []
+            for touch in touches:
+                own = self.extractor.encode(touch, model.longest, partial(model.scales_for, candidates))
+                if reader is not None and model.is_last(own.steps):
+                    own = replace(own, logits=reader.logits_of(own.image, candidates))
+                encoded.append(own)
+            return self.answer_of(model, candidates, encoded)
 
     def compose(self, readings: Readings, constituents: Sequence[str] | None, unfamiliar: float) -> Composition:
         """As `TactileLearner.compose`."""
         touch = self.stream(readings)
-
-        def begin(model: Model) -> Callable[[], Composition]:
-            wanted = require_constituents(self.ledger.memory.descriptions, constituents)
-            if not model.names:
-                nothing = tuple(
-                    Constituent(name=name, presence=None, share=None, evidence=(), unlearned="nothing was observed yet")
-                    for name in wanted
-                )
-                return lambda: Composition(nothing, 1.0, nothing_known(touch.seconds))
-            composer = self.current.composer(self.ledger)
-            model = composer.model
-            scales_for = _scales_for([(model, model.names)], composer)
-
-            def composed() -> Composition:
-                encoded = self.extractor.encode(touch, model.longest, scales_for)
-                prediction = self._answer(model, model.names, [(encoded, None)])
-                made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
-                return Composition(made_of, new, prediction)
-
-            return composed
-
-        return self._of_one_state(begin)
+        with self._asked() as model:
+            with self.ledger.lock:
+                wanted = require_constituents(self.ledger.memory.descriptions, constituents)
+                composer = self.current.composer(self.ledger) if model.names else None
+            if composer is None:
+                nothing = Constituent("", presence=None, share=None, evidence=(), unlearned="nothing was observed yet")
+                parts = tuple(replace(nothing, name=name) for name in wanted)
+                return Composition(parts, 1.0, nothing_known(touch.seconds))
+            encoded, prediction = self._among_all(composer.model, touch, composer)
+            made_of, new = composer.compose(wanted, dict(prediction.ranking), encoded, unfamiliar)
+            return Composition(made_of, new, prediction)
 
     def estimate(
-        self,
-        readings: Readings,
-        wanted: Sequence[str] | None = None,
-        risk: float = 0.1,
-        known: bool | None = None,
-        *,
-        scene: Sequence[str] | None = None,
-        axis: str | None = None,
-    ) -> tuple[Prediction, dict[str, Estimate]]:
-        """As `TactileLearner.predict` and `estimate`, of a touch that is encoded once.
-
-        scene, axis: of the prediction alone; the estimates use a prediction among all materials.
-        """
+        self, readings: Readings, wanted: Sequence[str] | None, risk: float, known: bool | None
+    ) -> dict[str, Estimate]:
+        """As `TactileLearner.estimate`."""
         touch = self.stream(readings)
-
-        def begin(model: Model) -> Callable[[], tuple[Prediction, dict[str, Estimate]]]:
-            estimator = self.current.estimator(self.ledger)
-            names, by = estimator.wanted(wanted), self if axis is None else self.of_axis(axis)
-            other = by.current.present(by.ledger)
-            candidates = candidates_of(scene, other.names, other.known)
-            scales_for = _scales_for([(model, model.names), (other, candidates)], estimator)
-
-            def estimated() -> tuple[Prediction, dict[str, Estimate]]:
-                nothing = nothing_known(touch.seconds)
-                if not model.names:
-                    return nothing, estimates_of(estimator, names, None, self.extractor, nothing, risk, known)
-                encoded = self.extractor.encode(touch, model.longest, scales_for)
-                prediction = self._answer(model, model.names, [(encoded, None)])
-                found = estimates_of(estimator, names, encoded, self.extractor, prediction, risk, known)
-                if by is not self or candidates != model.names:
-                    if other.longest != model.longest:
-                        encoded = self.extractor.encode(touch, other.longest, scales_for)
-                    prediction = by.answer_of(other, candidates, [encoded]) if candidates else nothing
-                return prediction, found
-
-            return estimated
-
-        return self._of_one_state(begin)
-
-    def _of_one_state(self, begin: Callable[[Model], Callable[[], Answer]]) -> Answer:
-        """An answer from one state of the memory, which others may change while a touch is embedded.
-
-        begin: called with the lock held; reads from the memory, and returns a function that embeds the touch and
-        answers, which is called without the lock.
-        """
-        with self.extractor.verifying(), enough_memory():
+        with self._asked() as model:
             with self.ledger.lock:
-                answered = begin(self.current.present(self.ledger))
-            return answered()
+                estimator = self.current.estimator(self.ledger)
+            names, encoded, prediction = estimator.wanted(wanted), None, nothing_known(touch.seconds)
+            if model.names:
+                encoded, prediction = self._among_all(model, touch, estimator)
+            return estimates_of(estimator, names, encoded, self.extractor, prediction, risk, known)
 
-    def _answer(self, model: Model, candidates: Sequence[str], touches: Sequence[Touch]) -> Prediction:
-        return answer(model, self.extractor, candidates, touches, self.recipe.settings.false_alarms)
+    @contextmanager
+    def _asked(self) -> Iterator[Model]:
+        """The present model, while the embedding is checked beside; what others change meanwhile is in no answer."""
+        with self.extractor.verifying(), enough_memory():
+            yield self.present()
+
+    def _among_all(self, model: Model, touch: Stream, beside: Composer | Estimator) -> tuple[Encoded, Prediction]:
+        """A touch, and its prediction among all materials. beside: what else reads some scales of it."""
+
+        def scales_for(steps: int) -> list[Scale]:
+            return sorted({*beside.scales_for(steps), *model.scales_for(model.names, steps)})
+
+        encoded = self.extractor.encode(touch, model.longest, scales_for)
+        return encoded, self.answer_of(model, model.names, [encoded])
 
     def estimator(self) -> Estimator | None:
         """What estimates quantities in the present memory; None where none was declared."""
@@ -260,7 +219,7 @@ class Predictor:
     def answer_of(self, model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
         """The prediction of a model for touches of one thing."""
         with enough_memory():
-            return self._answer(model, candidates, [(touch, None) for touch in touches])
+            return answer(model, self.extractor, candidates, touches, self.recipe.settings.false_alarms)
 
     def settle(self) -> None:
         """As `TactileLearner.settle`."""
@@ -298,18 +257,6 @@ def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> Feature
 def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) -> Codes:
     """The rows of codes of a touch, from readings that the memory stored."""
     return extractor.learned(Stream(extractor.sensor, readings))[1]
-
-
-def _scales_for(
-    queries: Sequence[tuple[Model, Sequence[str]]], beside: Composer | Estimator
-) -> Callable[[int], Sequence[Scale]]:
-    """Steps → the scales of a touch that models read to choose among candidates, and what rests on it beside them."""
-
-    def scales_for(steps: int) -> list[Scale]:
-        judging = (model.scales_for(candidates, steps) for model, candidates in queries if candidates)
-        return sorted({*beside.scales_for(steps), *(scale for own in judging for scale in own)})
-
-    return scales_for
 
 
 def nothing_known(seconds: float) -> Prediction:

@@ -25,6 +25,7 @@ from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
+from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
 
 SENSOR = known.BIOTAC
@@ -55,10 +56,10 @@ def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
         answer = taught(leave=(name, i)).predict(touch)
         judged = held_out[touch.key]
         assert judged.material == name
-        assert judged.answer == answer.material
+        assert judged.said.material == answer.material
         # The calibration is that of all, and not of all others.
-        assert judged.confidence == pytest.approx(answer.probability, abs=0.05)
-        assert judged.probability.sum() == pytest.approx(1)
+        assert judged.said.probability == pytest.approx(answer.probability, abs=0.05)
+        assert sum(share for _, share in judged.said.ranking) == pytest.approx(1)
 
 
 def grown(learner, touches, rule=None):
@@ -98,7 +99,7 @@ def test_a_few_touches_of_different_materials_are_chosen(learner):
     few = chosen(held_out, [touch.key for touch in held_out], camera=False)
     assert len(few) == 6
     assert {touch.material for touch in few} == set(NAMES)
-    least = min(held_out, key=lambda touch: touch.probability[touch.names.index(touch.material)])
+    least = min(held_out, key=lambda touch: dict(touch.said.ranking)[touch.material])
     assert few[0].key == least.key
     assert chosen(held_out, [], camera=False) == []
 
@@ -134,10 +135,8 @@ def test_separations_are_the_log_odds_between_means(learner):
 
 
 def touch(material, answer, confidence, known=True):
-    names = tuple(sorted({material, answer, "z"}))
-    rest = (1 - confidence) / (len(names) - 1)
-    chances = np.array([confidence if name == answer else rest for name in names])
-    return HeldOutTouch(material, material.encode(), names, chances, 0.0 if known else 9.0, 5.0)
+    said = Prediction(answer, confidence, ((answer, confidence),), novelty=0.0, known=known, seconds=1.0)
+    return HeldOutTouch(material, material.encode(), said)
 
 
 def test_trust_is_counted():
@@ -146,8 +145,8 @@ def test_trust_is_counted():
     assert trust.count == 20
     assert trust.right == 0.95
     assert trust.unknown == 0.05
-    right = [one.answer == one.material for one in touches]
-    assert trust.error == pytest.approx(calibration_error([one.confidence for one in touches], right, bins=10))
+    right = [one.said.material == one.material for one in touches]
+    assert trust.error == pytest.approx(calibration_error([one.said.probability for one in touches], right, bins=10))
     assert [(one.material, one.answer, one.count, one.tested) for one in mistakes(touches)] == [("a", "b", 1, 19)]
     several = [touch("b", "a", 0.9), *[touch("a", "b", 0.9)] * 2]
     assert [(one.material, one.count) for one in mistakes(several)] == [("a", 2), ("b", 1)]

@@ -171,9 +171,8 @@ def answers(
 def _answered(
     learner: TactileLearner, touch: SourceTouch, scene: Sequence[str] | None = None, of: str | None = None
 ) -> Answered:
-    if not learner.quantities:
-        return Answered(touch, learner.predict(touch.stream, of=of, scene=scene))
-    return Answered(touch, *learner._predictor.estimate(touch.stream, scene=scene, axis=of))
+    said = learner.predict(touch.stream, of=of, scene=scene)
+    return Answered(touch, said, learner.estimate(touch.stream) if learner.quantities else {})
 
 
 def _touches(

@@ -94,8 +94,8 @@ def mistakes(held_out: Sequence[HeldOutTouch]) -> list[Mistake]:
     tested = Counter(touch.material for touch in held_out)
     wrong: dict[tuple[str, str], list[float]] = {}
     for touch in held_out:
-        if touch.answer != touch.material:
-            wrong.setdefault((touch.material, touch.answer), []).append(touch.confidence)
+        if touch.said.material != touch.material:
+            wrong.setdefault((touch.material, str(touch.said.material)), []).append(touch.said.probability)
     found = [Mistake(*pair, len(sure), tested[pair[0]], float(np.mean(sure))) for pair, sure in wrong.items()]
     return sorted(found, key=lambda m: (-m.count, -m.count / m.tested, m.material, m.answer))
 
@@ -143,14 +143,14 @@ def trust_in(held_out: Sequence[HeldOutTouch]) -> Trust:
         confidence=float(confidence.mean()),
         error=_error(confidence, right),
         chance=float(np.mean([_error(confidence, drawn) for drawn in draws])),
-        unknown=float(np.mean([not touch.known for touch in held_out])),
+        unknown=float(np.mean([touch.said.known is False for touch in held_out])),
     )
 
 
 def _answered(held_out: Sequence[HeldOutTouch]) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """How sure each answer was, and whether it was right."""
-    sure = np.array([touch.confidence for touch in held_out])
-    return sure, np.array([touch.answer == touch.material for touch in held_out])
+    sure = np.array([touch.said.probability for touch in held_out])
+    return sure, np.array([touch.said.material == touch.material for touch in held_out])
 
 
 def _places(confidence: FloatArray) -> npt.NDArray[np.intp]:
@@ -176,7 +176,7 @@ def bins_of(held_out: Sequence[HeldOutTouch]) -> list[Bin]:
 
 def unknown_by(held_out: Sequence[HeldOutTouch]) -> list[tuple[str, int, int]]:
     """Material, its left-out touches that were called unknown, and all of them; the largest share first."""
-    unknown = Counter(touch.material for touch in held_out if not touch.known)
+    unknown = Counter(touch.material for touch in held_out if touch.said.known is False)
     tested = Counter(touch.material for touch in held_out)
     found = [(name, unknown[name], count) for name, count in tested.items()]
     return sorted(found, key=lambda row: (-row[1] / row[2], row[0]))
@@ -258,7 +258,7 @@ def chosen(held_out: Sequence[HeldOutTouch], keys: Container[bytes], camera: boo
     """A few touches to look at: the two hardest, and others from hard to easy, of different materials if there are."""
     ranked = sorted(
         (touch for touch in held_out if touch.key in keys),
-        key=lambda touch: (touch.probability[touch.names.index(touch.material)], touch.key),
+        key=lambda touch: (dict(touch.said.ranking)[touch.material], touch.key),
     )
     count, picked = CAMERA_TOUCHES if camera else TOUCHES, list[HeldOutTouch]()
     for place in [0, 1, *np.rint(np.linspace(0.1, 0.95, count - 2) * (len(ranked) - 1)).astype(int).tolist()]:
@@ -286,7 +286,7 @@ def growing(
         for count in sorted({min(max(least, moment), len(stream)) for moment in moments}):
             prefix = stream.first(count / sensor.rate)
             encoded = extractor.encode(prefix, other.longest, lambda steps: model.scales_for(names, steps))
-            predictions.append(answer(other, extractor, names, [(encoded, None)], false_alarms))
+            predictions.append(answer(other, extractor, names, [encoded], false_alarms))
             if decided is None and rule.decided(predictions[-1], encoded.steps):
                 decided = len(predictions) - 1
         found.append(Growing(touch.material, tuple(predictions), decided))

@@ -182,7 +182,7 @@ def _known(facts: MemoryFacts) -> str:
         nearest[first], nearest[second] = (second, apart), (first, apart)
     began = {row.material: row.time for row in reversed(facts.journal) if row.state != "retracted"}
     tested = Counter(touch.material for touch in facts.held_out)
-    right = Counter(touch.material for touch in facts.held_out if touch.answer == touch.material)
+    right = Counter(touch.material for touch in facts.held_out if touch.said.material == touch.material)
     rows = [
         [
             name,
@@ -281,7 +281,7 @@ def _mixed_up(facts: MemoryFacts, order: list[str]) -> str:
         return note(words) + found
     names = [name for name in order or facts.counts if name in tested]
     names += sorted(tested - set(names))
-    counts = Counter((touch.material, touch.answer) for touch in facts.held_out)
+    counts = Counter((touch.material, str(touch.said.material)) for touch in facts.held_out)
     drawn = figure(
         drawing.confusions(names, counts),
         "Rows: what was touched; columns, by number: what it was called. Right answers lie on the diagonal, and "
@@ -300,15 +300,15 @@ def _one_by_one(facts: MemoryFacts) -> str:
     }
     wrong = [
         (touch, row)
-        for touch in sorted(facts.held_out, key=lambda touch: (-touch.confidence, touch.key))
-        if touch.answer != touch.material and (row := noted.get((touch.material, touch.key))) is not None
+        for touch in sorted(facts.held_out, key=lambda touch: (-touch.said.probability, touch.key))
+        if touch.said.material != touch.material and (row := noted.get((touch.material, touch.key))) is not None
     ][:MOST_MISTAKES]
     if not wrong:
         return ""
-    rows = [[row.sequence, row.source, t.material, t.answer, f"{t.confidence:.0%}"] for t, row in wrong]
+    rows = [[row.sequence, row.source, t.material, t.said.material, f"{t.said.probability:.0%}"] for t, row in wrong]
     listed = table(["observation", "touch", "of", "called", "probability"], rows, "wrong touches")
     words = [
-        ["scroll-tactile", "memory", "relabel", str(facts.learner.path), str(row.sequence), touch.answer]
+        ["scroll-tactile", "memory", "relabel", str(facts.learner.path), str(row.sequence), str(touch.said.material)]
         for touch, row in wrong
         if row.state == "kept" and facts.of is None and facts.learner.path is not None
     ]
@@ -324,7 +324,7 @@ def _calibration(facts: MemoryFacts) -> str:
         return facts.lacks("Whether to trust it", facts.nothing_left_out)
     verdict = "more than chance explains" if trust.miscalibrated else "no more than matters"
     drawn = figure(
-        drawing.reliability(bins_of(facts.held_out), [touch.confidence for touch in facts.held_out]),
+        drawing.reliability(bins_of(facts.held_out), [touch.said.probability for touch in facts.held_out]),
         "On the dashed line a probability is what it says; dots below it are overconfident answers. Expected "
         f"calibration error (ECE) {trust.error:.3f}, {verdict}: {trust.chance:.3f} is the mean of perfect answers. "
         "Upright lines are 95% intervals.",

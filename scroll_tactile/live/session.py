@@ -430,7 +430,7 @@ class LiveSession:
             rule=rule,
             moments=sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True),
             earlier=earlier,
-            estimator=self._predictor.estimator(),
+            estimator=self._predictor.estimator() if self._predictor.ledger.memory.quantities else None,
             widths=self._widths,
             rest=rest,
             correction=self._predictor.ledger.correction,
@@ -556,7 +556,7 @@ def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[s
     for name, width in requested.items():
         if not (isinstance(width, Real) and 0 < float(width) < math.inf):
             raise InputError(f"expected the width of {name!r} as a number above 0; came {width!r:.60}")
-    if estimator is None:
+    if not estimator.quantities:
         if requested:
             why = "none was declared, or answers are by labels"
             raise InputError(f"expected widths of declared quantities; came {sorted(requested)}, and {why}")

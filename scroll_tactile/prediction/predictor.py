@@ -1,4 +1,10 @@
-"""The predictor: it answers from one open memory, which other threads may change meanwhile."""
+"""The predictor: it answers from one open memory, which other threads may change meanwhile.
+
+After a fit the class means, the kept touches and the materials follow at once, while the scatter and the weighing stay
+as they were fitted: measured right as often as a fit of all touches. When the memory has grown or shrunk by an eighth,
+a thread fits again, from a copy of the sums; its model is taken as soon as it is there, and follows what came since. In
+memories of at most FEW touches, and where touches came much faster than fits, a call waits.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +12,9 @@ import logging
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, Protocol, Self
 
@@ -26,11 +33,11 @@ from scroll_tactile.persistence.ledger import AxisLedger, Ledger
 from scroll_tactile.persistence.replaying import exemplar_candidates, load
 from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
-from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.judging import answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
+from scroll_tactile.prediction.stored import read_weighing, weighing_text
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.results import Composition, Constituent, Estimate, Prediction
@@ -46,6 +53,32 @@ __all__ = ["LogitsReader", "Predictor", "nothing_known"]
 logger = logging.getLogger(__name__)
 
 
+GROWTH = 8  # a fit begins when the memory has changed by one in so many touches
+LEAST = 2  # touches by which it has changed at least
+FEW = 16  # touches: in a memory with no more, a call waits for the fit
+FASTER = 2  # times the touches of the last fit: where there are more, or fewer than their share, a call waits
+
+
+@dataclass
+class _Fit:
+    """A fit of a memory, done or in a thread, and what changed since it began.
+
+    version, retractions: of the memory then. changed: the materials that changed since; None where any may have.
+    """
+
+    model: Future[Model]
+    version: int
+    retractions: int
+    changed: set[str] | None = field(default_factory=set)
+
+    @classmethod
+    def done(cls, model: Model, version: int, retractions: int) -> _Fit:
+        """Of a model that is there."""
+        made = cls(Future(), version, retractions)
+        made.model.set_result(model)
+        return made
+
+
 class LogitsReader(Protocol):
     """What reads touches with a tuned model."""
 
@@ -56,7 +89,7 @@ class LogitsReader(Protocol):
 
 
 class Predictor:
-    """All objects of one open memory: its feature extractor, its ledger and its current model; it answers from them.
+    """All objects of one open memory: its feature extractor, its ledger and its model; it answers from them.
 
     recipe: of the memory. tuned_reader: made when a tuned model first answers. replaced: whether the memory was
     embedded again since; then another predictor has it.
@@ -64,10 +97,16 @@ class Predictor:
 
     def __init__(self, recipe: Recipe, extractor: FeatureExtractor, ledger: Ledger) -> None:
         self.recipe, self.extractor, self.ledger = recipe, extractor, ledger
-        self.current = CurrentModel(recipe.settings)
         self.tuned_reader: LogitsReader | None = None
         self.replaced = False
         self._axes: dict[str, Predictor] = {}
+        self._fit: _Fit | None = None  # its model follows the memory
+        self._job: _Fit | None = None
+        self._version = -1  # of the memory up to which changes are noted
+        self._worker: ThreadPoolExecutor | None = None
+        self._process = os.getpid()
+        self._composer: tuple[Model, int, int, Composer] | None = None
+        self._estimator: Estimator | None = None
 
     @classmethod
     def new(cls, recipe: Recipe) -> Self:
@@ -163,7 +202,7 @@ class Predictor:
         with self._asked() as model:
             with self.ledger.lock:
                 wanted = require_constituents(self.ledger.memory.descriptions, constituents)
-                composer = self.current.composer(self.ledger) if model.names else None
+                composer = self._composed_by() if model.names else None
             if composer is None:
                 nothing = Constituent("", presence=None, share=None, evidence=(), unlearned="nothing was observed yet")
                 parts = tuple(replace(nothing, name=name) for name in wanted)
@@ -178,9 +217,8 @@ class Predictor:
         """As `TactileLearner.estimate`."""
         touch = self.stream(readings)
         with self._asked() as model:
-            with self.ledger.lock:
-                estimator = self.current.estimator(self.ledger)
-            names, encoded, prediction = estimator.wanted(wanted), None, nothing_known(touch.seconds)
+            estimator, encoded, prediction = self.estimator(), None, nothing_known(touch.seconds)
+            names = estimator.wanted(wanted)
             if model.names:
                 encoded, prediction = self._among_all(model, touch, estimator)
             return estimates_of(estimator, names, encoded, self.extractor, prediction, risk, known)
@@ -200,20 +238,37 @@ class Predictor:
         encoded = self.extractor.encode(touch, model.longest, scales_for)
         return encoded, self.answer_of(model, model.names, [encoded])
 
-    def estimator(self) -> Estimator | None:
-        """What estimates quantities in the present memory; None where none was declared."""
+    def estimator(self) -> Estimator:
+        """What estimates quantities in the present memory; it keeps its heads while the sampled touches stay."""
         with self.ledger.lock:
-            return self.current.estimator(self.ledger) if self.ledger.memory.quantities else None
+            memory = self.ledger.memory
+            least = max(1, memory.statistics.fifth_percentile_length)
+            self._estimator = Estimator.of(memory.plan, memory.sample, memory.quantities, least, self._estimator)
+            return self._estimator
 
     def present(self) -> Model:
         """The model of the present memory, which never changes."""
         with self.ledger.lock, enough_memory():
-            return self.current.present(self.ledger)
+            memory = self.ledger.memory  # first: after an interrupted change this reads the memory again, a new version
+            self._note_changes()
+            (fit, self._fit), job = (self._fit, None), self._job  # an interrupted call leaves no model
+            if job is not None and job.model.done():
+                self._job = None
+                if job.model.exception() is None and job.changed is not None:
+                    fit = job
+            elif fit is None:
+                fit = self._restored()
+            model = None if fit is None else _followed(fit, memory)
+            if fit is None or model is None:
+                return self._fit_now(None if fit is None else fit.model.result())
+            self._fit = _Fit.done(model, fit.version, fit.retractions)
+            self._begin_fit()
+            return model
 
     def rehearsed(self) -> Model:
         """As `present`, for live sessions: with what `fitting.rehearse` finds, as later fits will have it."""
         with self.ledger.lock, enough_memory():
-            rehearse(model := self.current.present(self.ledger))
+            rehearse(model := self.present())
         return model
 
     def answer_of(self, model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
@@ -226,28 +281,110 @@ class Predictor:
         with self.ledger.lock, enough_memory():
             self.ledger.memory.weighings.clear()  # an axis that is asked later is fitted, too
             for predictor in (self, *self._axes.values()):
-                predictor.current.settle(predictor.ledger)
+                predictor._settled()
+
+    def _settled(self) -> Model:
+        """The model fitted to the present memory: a function of the set of observations alone."""
+        before = None if self._fit is None else self._fit.model.result()
+        self._note_changes()
+        if self._fit is None or before is None or self._fit.version != self._version:
+            return self._fit_now(before)
+        return before
 
     def prepare(self) -> None:
         """Begin to fit models anew where enough touches came since the last fit; called after an observation."""
         with self.ledger.lock:
             for predictor in (self, *self._axes.values()):
-                predictor.current.prepare(predictor.ledger)
+                predictor._note_changes()
+                predictor._begin_fit()
+
+    def _note_changes(self) -> None:
+        """Have the model and the fit under way know what changed since the last call."""
+        if self._process != os.getpid():  # a forked process has not the thread
+            self._process, self._worker, self._job = os.getpid(), None, None
+        if self.ledger.version == self._version:
+            return
+        changed, self.ledger.changed, self._version = self.ledger.changed, set(), self.ledger.version
+        for fit in (self._fit, self._job):
+            if fit is not None:
+                fit.changed = None if fit.changed is None or changed is None else fit.changed | changed
+
+    def _begin_fit(self) -> None:
+        """Begin a fit if enough touches came or went. A lack of memory or threads raises nothing here."""
+        if self._fit is None or self._job is not None:
+            return
+        model, memory = self._fit.model.result(), self.ledger.memory
+        if abs(memory.statistics.touches - model.touches) < max(LEAST, model.touches // GROWTH):
+            return
+        # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
+        with suppress(MemoryError, InputError, RuntimeError):
+            draft = Draft.of(memory, self.recipe.settings.readout, model)
+            self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
+            self._job = _Fit(self._worker.submit(draft.fit), self._version, memory.retractions)
+
+    def _restored(self) -> _Fit | None:
+        """The model by the weighing of the checkpoint that the memory was read from; None where it has none that fits.
+
+        It was fitted to these touches or to fewer: a retraction drops it.
+        """
+        if (text := self.ledger.take_weighing()) is None:
+            return None
+        memory = self.ledger.memory
+        try:
+            model = read_weighing(text, Draft.of(memory, self.recipe.settings.readout).solved())
+        except ValueError as error:
+            logger.warning("the weighing in the memory's checkpoint is not used, and fitted anew: %.300s", error)
+            return None
+        return _Fit.done(model, -1, memory.retractions)
+
+    def _fit_now(self, before: Model | None) -> Model:
+        self._fit, self._job, memory = None, None, self.ledger.memory
+        model = Draft.of(memory, self.recipe.settings.readout, before).fit()
+        self._fit = _Fit.done(model, self._version, memory.retractions)
+        return model
+
+    def _composed_by(self) -> Composer:
+        """The heads of all constituents that were described, over a model of the present memory."""
+        model = self.present()
+        if not {material for material, *_ in model.held_out.sample} <= model.known:
+            model = self._settled()
+        state = model, self.ledger.version, self.ledger.described
+        if self._composer is None or self._composer[:3] != state:
+            self._composer = *state, Composer.of(model, self.ledger.memory)
+        return self._composer[3]
 
     def close(self) -> None:
         """As `TactileLearner.close`."""
         with self.ledger.lock:
-            predictors = {"": self, **self._axes}
-            for predictor in predictors.values():
-                predictor.current.close()
-            texts = {axis: predictor.current.stored(predictor.ledger) for axis, predictor in predictors.items()}
-            weighings = {axis: text for axis, text in texts.items() if text is not None}
+            weighings = {}
+            for axis, predictor in {"": self, **self._axes}.items():
+                worker, predictor._worker = predictor._worker, None
+                if worker is not None:
+                    worker.shutdown()
+                # Where something was retracted since, what it was fitted to counts no more.
+                fit, now = predictor._fit, predictor.ledger.memory.retractions
+                if fit is not None and fit.retractions == now and (text := weighing_text(fit.model.result())):
+                    weighings[axis] = text
             self.ledger.close({HEALTH: partial(health_to_store, self.ledger)}, weighings)
 
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""
         with self.ledger.lock, enough_memory():
             return Draft.of(self.ledger.memory, self.recipe.settings.readout).fit()
+
+
+def _followed(fit: _Fit, memory: Memory) -> Model | None:
+    """A fit's model with what changed since; None where a call waits for another fit."""
+    model, now = fit.model.result(), memory.statistics.touches
+    if fit.changed is None:
+        return None
+    if model.touches <= FEW:
+        outgrown = abs(now - model.touches) >= min(LEAST, model.touches + 1)
+    else:
+        outgrown = not model.touches <= FASTER * now <= FASTER * FASTER * model.touches
+    if outgrown:
+        return None
+    return model.followed(memory, fit.changed) if fit.changed else model
 
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:

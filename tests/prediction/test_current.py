@@ -93,7 +93,7 @@ def require_followed(learner):
 
 
 def present(learner):
-    return learner._predictor.current.present(learner._ledger)
+    return learner._predictor.present()
 
 
 def beside():
@@ -192,7 +192,7 @@ def test_a_fit_that_ends_answers_and_has_followed_what_came_since(monkeypatch):
     learner = asked_once()
     for i in range(3):
         learner.observe("a", stream("a", 90 + i))
-    job = learner._predictor.current._job
+    job = learner._predictor._job
     learner.observe("d", stream("d", 93))
     job.model.result()
     require_followed(learner)
@@ -243,8 +243,10 @@ def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monk
         for i in range(5):
             assert learner.observe("a", stream("a", 90 + i)).sequence == len(OBSERVED) + 1 + i
             require_followed(learner)
+        if (job := learner._predictor._job) is not None:
+            assert job.model.exception() is error  # it has ended
     require_followed(learner)
-    job = learner._predictor.current._job
+    job = learner._predictor._job
     job.model.result()  # a fit that failed beside is made again
     assert bits(learner) == expected(later(5))
 
@@ -262,14 +264,14 @@ def fitting(monkeypatch, tmp_path):
         learner.predict(stream(*PROBES[0]))
         for i in range(3):
             learner.observe("a", stream("a", 90 + i))
-        assert not learner._predictor.current._job.model.done()
+        assert not learner._predictor._job.model.done()
         yield learner
 
 
 def test_closed_pickled_and_copied_while_a_fit_runs(fitting):
     for snapshot in (pickle.loads(pickle.dumps(fitting)), copy.deepcopy(fitting)):
         assert bits(snapshot) == expected(later(3))
-    job = fitting._predictor.current._job
+    job = fitting._predictor._job
     fitting.close()
     assert job.model.done()
     for _ in range(3):
@@ -278,12 +280,11 @@ def test_closed_pickled_and_copied_while_a_fit_runs(fitting):
 
 
 def test_a_material_that_is_forgotten_while_a_fit_runs_is_gone(fitting):
-    job = fitting._predictor.current._job
+    job = fitting._predictor._job
     fitting.forget("b")
     require_followed(fitting)
     job.model.result()
     require_followed(fitting)
-    assert fitting._predictor.current.stored(fitting._ledger) is None
     with fitting.live(contact="manual") as live:
         live.begin()
         live.push(stream(*PROBES[0]))
@@ -370,7 +371,7 @@ def test_a_material_that_was_just_told_is_not_called_new(monkeypatch):
         for repetition in range(6):
             learner.observe(name, scene.touch(name, repetition))
     assert learner.predict(scene.touch("bark", 50)).known is False
-    monkeypatch.setattr("scroll_tactile.prediction.current.GROWTH", 1)  # no fit begins
+    monkeypatch.setattr("scroll_tactile.prediction.predictor.GROWTH", 1)  # no fit begins
     for repetition in range(6):
         learner.observe("bark", scene.touch("bark", repetition))
     answers = [learner.predict(scene.touch("bark", 50 + repetition)) for repetition in range(6)]

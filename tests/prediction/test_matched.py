@@ -164,7 +164,7 @@ def test_one_channel():
 
 def present(learner):
     """The matcher that answers now."""
-    return learner._predictor.current.present(learner._ledger).matcher
+    return learner._predictor.present().matcher
 
 
 def test_a_model_that_followed_keeps_what_one_fitted_anew_does(tmp_path):

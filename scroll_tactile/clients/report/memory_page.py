@@ -24,7 +24,6 @@ from scroll_tactile.clients.report.facts import MOST_NEAR, Growing, MemoryFacts,
 from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
 from scroll_tactile.errors import printable
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.prediction.current import estimator_of
 from scroll_tactile.readouts.estimation import Heads
 from scroll_tactile.readouts.regression import RegressionHead
 
@@ -390,7 +389,7 @@ def _grown(touch: Growing) -> str:
 
 def _estimated(facts: MemoryFacts) -> str:
     """Quantities of complete touches: what was said of them held out, and how many lie in their intervals."""
-    estimator, parts = estimator_of(facts.memory), []
+    estimator, parts = facts.learner._by(facts.of).estimator(), []
     for name, heads in sorted(estimator.heads(estimator.last).items()):
         parts.append(f"<h3>{shown(name)}</h3>")
         if isinstance(heads, str):

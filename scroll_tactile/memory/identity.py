@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -248,20 +246,6 @@ class FingerprintCheck:
         if self.pending:
             self._identity.require_embedding(self._path, embedding)
             self.pending = False
-
-    @contextmanager
-    def beside(self, embedding: Embedding) -> Iterator[None]:
-        """Compare the memory's own embedding beside what the block does: it embeds, too."""
-        if not self.pending:
-            yield
-            return
-        with ThreadPoolExecutor(1, "scroll-tactile fingerprint") as beside:
-            compared = beside.submit(self._identity.require_embedding, self._path, embedding)
-            try:
-                yield
-            finally:
-                compared.result()  # of another embedding nothing else that the block raised means anything
-        self.pending = False
 
 
 class AbsentEmbedding:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
@@ -97,24 +96,15 @@ class FeatureExtractor:
         plan: WindowPlan,
         check: FingerprintCheck | None = None,
     ) -> None:
-        self.sensor, self.embedding, self._plan, self._check = sensor, embedding, plan, check
+        self.sensor, self.embedding, self._plan, self.check = sensor, embedding, plan, check
         require_rest(embedding, sensor)
         self._rest: Rest = capabilities_of(embedding).rest
-
-    @property
-    def check(self) -> FingerprintCheck | None:
-        """The check of its embedding that is still to be made."""
-        return self._check if self._check is not None and self._check.pending else None
 
     def verified(self) -> FeatureExtractor:
         """This extractor, whose embedding is the memory's. Raises EmbeddingMismatchError."""
         if self.check is not None:
             self.check.require(self.embedding)
         return self
-
-    def verifying(self) -> AbstractContextManager[None]:
-        """As `verified`, in a thread while the block runs; raises at the end of the block."""
-        return nullcontext() if self.check is None else self.check.beside(self.embedding)
 
     def stream(self, readings: Readings) -> Stream:
         """The validated stream of some readings; of a camera's, the frames in contact.

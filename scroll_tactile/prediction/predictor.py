@@ -11,9 +11,9 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, Protocol, Self
@@ -183,7 +183,8 @@ class Predictor:
         if not streams:
             raise InputError("expected a stream to predict, or several of one thing; came none")
         touches = [self.stream(stream) for stream in streams]
-        with self._asked() as model:
+        with enough_memory():
+            model = self.present()
             reader = None if reader_of is None else reader_of(self)
             candidates = candidates_of(scene, model.names, model.known)
             if not candidates:
@@ -199,7 +200,8 @@ class Predictor:
     def compose(self, readings: Readings, constituents: Sequence[str] | None, unfamiliar: float) -> Composition:
         """As `TactileLearner.compose`."""
         touch = self.stream(readings)
-        with self._asked() as model:
+        with enough_memory():
+            model = self.present()
             with self.ledger.lock:
                 wanted = require_constituents(self.ledger.memory.descriptions, constituents)
                 composer = self._composed_by() if model.names else None
@@ -216,18 +218,13 @@ class Predictor:
     ) -> dict[str, Estimate]:
         """As `TactileLearner.estimate`."""
         touch = self.stream(readings)
-        with self._asked() as model:
+        with enough_memory():
+            model = self.present()
             estimator, encoded, prediction = self.estimator(), None, nothing_known(touch.seconds)
             names = estimator.wanted(wanted)
             if model.names:
                 encoded, prediction = self._among_all(model, touch, estimator)
             return estimates_of(estimator, names, encoded, self.extractor, prediction, risk, known)
-
-    @contextmanager
-    def _asked(self) -> Iterator[Model]:
-        """The present model, while the embedding is checked beside; what others change meanwhile is in no answer."""
-        with self.extractor.verifying(), enough_memory():
-            yield self.present()
 
     def _among_all(self, model: Model, touch: Stream, beside: Composer | Estimator) -> tuple[Encoded, Prediction]:
         """A touch, and its prediction among all materials. beside: what else reads some scales of it."""
@@ -247,7 +244,8 @@ class Predictor:
             return self._estimator
 
     def present(self) -> Model:
-        """The model of the present memory, which never changes."""
+        """The model of the present memory, which never changes. Raises EmbeddingMismatchError."""
+        self.extractor.verified()
         with self.ledger.lock, enough_memory():
             memory = self.ledger.memory  # first: after an interrupted change this reads the memory again, a new version
             self._note_changes()

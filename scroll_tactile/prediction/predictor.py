@@ -42,7 +42,6 @@ from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.results import Composition, Constituent, Estimate, Prediction
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
@@ -171,7 +170,8 @@ class Predictor:
 
         Raises as `FeatureExtractor.stream`.
         """
-        return corrected_stream(self.extractor.stream(readings), self.ledger.correction)
+        stream, correction = self.extractor.stream(readings), self.ledger.correction
+        return stream if correction is None else correction.applied(stream)
 
     def predict(
         self,
@@ -249,13 +249,16 @@ class Predictor:
         with self.ledger.lock, enough_memory():
             memory = self.ledger.memory  # first: after an interrupted change this reads the memory again, a new version
             self._note_changes()
-            (fit, self._fit), job = (self._fit, None), self._job  # an interrupted call leaves no model
+            fit, job = self._fit, self._job
             if job is not None and job.model.done():
                 self._job = None
                 if job.model.exception() is None and job.changed is not None:
                     fit = job
             elif fit is None:
                 fit = self._restored()
+            elif fit.changed == set():
+                return fit.model.result()
+            self._fit = None  # an interrupted call leaves no model
             model = None if fit is None else _followed(fit, memory)
             if fit is None or model is None:
                 return self._fit_now(None if fit is None else fit.model.result())

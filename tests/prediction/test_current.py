@@ -245,10 +245,11 @@ def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monk
             require_followed(learner)
         if (job := learner._predictor._job) is not None:
             assert job.model.exception() is error  # it has ended
+    learner.observe("a", stream("a", 95))
     require_followed(learner)
     job = learner._predictor._job
     job.model.result()  # a fit that failed beside is made again
-    assert bits(learner) == expected(later(5))
+    assert bits(learner) == expected(later(6))
 
 
 # With a fit running

@@ -47,23 +47,16 @@ TOGETHER = 128  # materials that are solved for at once
 class Solution(NamedTuple):
     """What of a readout stays as it was solved.
 
-    origin: the mean of all rows, shape (d,), in grid units. triangle: L⁻¹ of K. rows: N. share: ρ. penalty: P.
-    precision: one over the variance of each feature within materials, shape (d,).
+    origin: the mean of all rows, (d,), in grid units. triangle: L⁻¹ of K. gamma: γ. share: ρ. penalty: P. precision:
+    one over the variance of each feature within materials, (d,).
     """
 
     origin: FloatArray
     triangle: InverseTriangle
-    rows: int
+    gamma: float
     share: float
     penalty: float
     precision: FloatArray
-
-
-def about(counts: IntArray, sums: Sums, origin: FloatArray) -> FloatArray:
-    """Means of materials about an origin, (n, d) in grid units, of their counts (n,) and sums (n, d)."""
-    # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
-    near = np.rint(origin)
-    return np.asarray((sums - np.outer(counts, near.astype(np.int64))) / counts[:, None] - (origin - near))
 
 
 class Derived(NamedTuple):
@@ -83,7 +76,8 @@ class Readout:
     """The readout of one scale: solved from a task, or the one that followed such a one. It never changes.
 
     names: the materials; a place is an index into them. reference: the first of them, to which novelty and the ridge
-    refer; given is their number. counts: rows, (C,). sums: of their codes, (C, d). Other attributes: see `Solution`.
+    refer; given is their number. shares: p, (R,). counts: rows, (C,). sums: of their codes, (C, d). For the other
+    attributes see `Solution`.
 
     K⁻¹ m of a material is solved for when it is first asked for: a scene of few materials costs what it holds. Any
     number of threads may use it at once.
@@ -93,31 +87,29 @@ class Readout:
         self, scale: Scale, names: Sequence[str], reference: int, counts: IntArray, sums: Sums, solution: Solution
     ) -> None:
         self.scale, self.names, self.counts, self.sums, self.solution = scale, list(names), counts, sums, solution
-        self.origin, self.triangle, self.rows, self.share, self.penalty, self.precision = solution
+        self.origin, self.triangle, self.gamma, self.share, self.penalty, self.precision = solution
         self.reference = self.names[:reference]
         self.places = {name: place for place, name in enumerate(self.names)}
-        self.gamma = self.rows / (1 - self.share)  # by which K⁻¹ becomes Σ⁻¹
+        self.shares = counts[:reference] / counts[:reference].sum()
         self._near = slice(reference)
         self._solved = np.empty((len(names), len(self.origin)))
         self._sizes = np.full(len(names), np.nan)  # not a number where it is not solved for yet
         self._derived: Derived | None = None
         self._scored: tuple[FloatArray, FloatArray] | None = None  # the last touch, and its scores of all materials
 
-    @property
-    def shares(self) -> FloatArray:
-        """p of the reference materials, shape (R,)."""
-        counts = self.counts[self._near]
-        return np.asarray(counts / counts.sum())
-
     def means(self, places: slice | Sequence[int] | Places = slice(None)) -> FloatArray:
         """m of materials about the origin, (k, d), formed anew each time."""
-        return about(self.counts[places], self.sums[places], self.origin)
+        counts, near = self.counts[places], np.rint(self.origin)
+        # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
+        away = (self.sums[places] - np.outer(counts, near.astype(np.int64))) / counts[:, None]
+        return np.asarray(away - (self.origin - near))
 
     def solved(self, places: slice | Places = slice(None)) -> tuple[FloatArray, FloatArray]:
         """K⁻¹ m of materials, (k, d), and mᵀ K⁻¹ m, (k,)."""
         if np.isnan(self._sizes[places]).any():
             # The same ones are always solved for together: threads that ask at once, each for some, get the same bits.
-            for first in np.unique(np.arange(len(self.names))[places] // TOGETHER) * TOGETHER:
+            wanted = np.arange(len(self.names))[places].tolist()
+            for first in sorted({place // TOGETHER * TOGETHER for place in wanted}):
                 own = first + np.flatnonzero(np.isnan(self._sizes[first : first + TOGETHER]))
                 means = self.means(own)
                 with one_thread():
@@ -135,16 +127,17 @@ class Readout:
         stay = np.array([place for place, name in enumerate(self.names) if counts.get(name, 1)], dtype=np.intp)
         come = sorted(name for name, count in counts.items() if count and name not in self.places)
         reference = int((stay < len(self.reference)).sum())
-        if len(self.reference) == len(self.names):
-            reference += len(come)
+        reference += len(come) if len(self.reference) == len(self.names) else 0
         if not reference:
             return None
         names = [*(self.names[place] for place in stay), *come]
         other = Readout(self.scale, names, reference, *statistics.totals(self.scale, names), self.solution)
+        moved = [other.places[name] for name in counts if name in other.places]
         other._sizes[: len(stay)] = self._sizes[stay]
-        other._sizes[[other.places[name] for name in counts if name in other.places]] = np.nan
-        known = np.flatnonzero(np.isfinite(other._sizes))
-        other._solved[known] = self._solved[stay[known]]
+        other._sizes[moved] = np.nan
+        np.take(self._solved, stay, axis=0, out=other._solved[: len(stay)], mode="clip")  # without a copy between
+        if other.reference == self.reference and min(moved, default=reference) >= reference:
+            other._derived = self._derived
         return other
 
     def derived(self) -> Derived:

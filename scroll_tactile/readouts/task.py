@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Readout, Solution, about
+from scroll_tactile.readouts.readout import Readout, Solution
 from scroll_tactile.readouts.triangle import InverseTriangle
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import SecondMoment, Sums, one_thread, within_scatter
@@ -86,12 +86,12 @@ class Task:
         share = shrinkage(matrix, self.touches, self.times) if trace > 0 else 0.0
         penalty = trace / dimension * share / (1 - share)
         if not penalty > 0:  # single rows have no scatter: the readout then is the nearest mean
-            penalty = max(float(np.square(about(self.counts, self.sums, origin)).mean()), 1.0)
+            penalty = max(float(np.square(self.sums / self.counts[:, None] - origin).mean()), 1.0)
         matrix[np.diag_indices(dimension)] += penalty
         rows = int(self.counts.sum())
         with one_thread():
             triangle = InverseTriangle(matrix)
-        solution = Solution(origin, triangle, rows, share, penalty, rows / np.diagonal(matrix))
+        solution = Solution(origin, triangle, rows / (1 - share), share, penalty, rows / np.diagonal(matrix))
         return Readout(self.scale, self.names, self.reference, self.counts, self.sums, solution)
 
 

@@ -305,10 +305,9 @@ def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
             times = max(1, round(sampled.pairs[rows[0], 2] / len(rows)))
             codes[scale] = np.repeat(sampled.rows[rows], times, axis=0)
     statistics.remove(touch.material, codes, statistics.longest)  # of some length: readouts do not depend on lengths
-    readouts = {
-        scale: Task.of(statistics, scale, readout.reference, model.plan.shrinkage).solve() if scale in codes else readout
-        for scale, readout in model.readouts.items()
-    }
+    readouts = dict(model.readouts)
+    for scale in codes:
+        readouts[scale] = Task.of(statistics, scale, readouts[scale].reference, model.plan.shrinkage).solve()
     other, matcher, conformal = replace(model, readouts=readouts), model.matcher, model.conformal
     if matcher is None or conformal is None or own not in matcher.kept.touches:
         return other

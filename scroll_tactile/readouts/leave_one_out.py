@@ -141,7 +141,8 @@ def held_out_scores(
         for (count, _), group in groups.items():
             for first in range(0, len(group), TOGETHER):
                 vectors, weights, owners, at = map(np.array, zip(*group[first : first + TOGETHER], strict=True))
-                wide[:, at], flat[:, at] = leaving.out(vectors, count, weights, owners)
+                for into, part in zip((*wide, *flat), leaving.out(vectors, count, weights, owners), strict=True):
+                    into[at] = part[:, -at.shape[1] :]
     return HeldOutScores(readout.scale, index, names, *wide, *flat)
 
 
@@ -171,35 +172,30 @@ class _Leaving:
         spread = np.sqrt(self.excess * self.counts)[:, None] * (self.means - self.center)
         self.whole = np.linalg.inv(np.linalg.cholesky(np.eye(spread.shape[1]) + spread.T @ spread)).T
 
-    def out(
-        self, vectors: FloatArray, count: int, weights: FloatArray, own: Places
-    ) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Scores, z and distances without each touch, (M, q, R); its distance if new and the diagonal one, (M, q).
+    def out(self, vectors: FloatArray, count: int, weights: FloatArray, own: Places) -> tuple[FloatArray, ...]:
+        """Scores, z and distances without each touch, (M, n, R); its distance if new and the diagonal one, (M, n).
 
-        vectors: about the origin, (M, n, d): so many rows that each touch added, then the q that are scored, or none
-        where those rows are. weights: the rows of the statistics that it stands for, (M, 1). own: its material, (M,).
+        vectors: about the origin, (M, n, d): so many rows that each touch added, then those that are scored beside.
+        weights: the rows of the statistics that it stands for, (M, 1). own: its material among the reference, (M,).
         """
-        gamma, shares, every = self.readout.gamma, self.readout.shares, np.arange(len(own))
-        counts, beside = self.counts[own, None], vectors.shape[1] > count
+        gamma, every, counts = self.readout.gamma, np.arange(len(own)), self.counts[own, None]
         left, others = counts - weights, self.counts.sum() - counts
         x = self._coordinates(vectors)
         middle, mean = x[:, :count].mean(axis=1), self.means[own]
-        back, away = weights / left * (middle - mean), mean - self.center
+        kept = mean - weights / left * (middle - mean)
         means = np.tile(self.means, (len(own), 1, 1))
-        means[every, own] -= back
+        means[every, own] = kept
         inner = np.sqrt(weights / count)[:, :, None] * (contrasts(count) @ x[:, :count])
-        gone = np.concatenate([inner, (np.sqrt(counts * left / weights) * back)[:, None]], axis=1)
+        gone = np.concatenate([inner, (np.sqrt(counts * left / weights) * (mean - kept))[:, None]], axis=1)
         solved = _without(gone, x)
         z, length = solved @ means.transpose(0, 2, 1), np.vecdot(x, solved)
         lda = gamma * (z - _lengths(gone, means)[:, None] / 2)
 
-        # T loses what the mean of the touch's material adds, and gets what it adds without the touch.
-        past = counts / np.maximum(others, 1) * away  # from the mean of the other materials, if there are any, to μ
-        lost = np.sqrt(counts * (1 + counts / np.maximum(others, 1))) * away
-        stays = np.sqrt(left * others / (left + others)) * (past + away - back)
-        changes = np.concatenate([gone, self.excess**0.5 * np.stack([lost, stays], axis=1)], axis=1) @ self.whole
-        center = self.center - weights / (left + others) * (middle - self.center)
-        of_all, of_others = ((x - part[:, None]) @ self.whole for part in (center, self.center - past))
+        rest = self.center - counts / np.maximum(others, 1) * (mean - self.center)  # the mean of the other materials
+        center = rest + left / (left + others) * (kept - rest)
+        columns = [np.sqrt(n * others / (n + others)) * (m - rest) for n, m in ((counts, mean), (left, kept))]
+        changes = np.concatenate([gone, self.excess**0.5 * np.stack(columns, axis=1)], axis=1) @ self.whole
+        of_all, of_others = ((x - part[:, None]) @ self.whole for part in (center, rest))
         onto = _without(changes, of_all, come=1)
         distances = gamma * (length - np.vecdot(of_all, onto))[:, :, None] - 2 * lda
         rivals = lda.copy()
@@ -207,23 +203,21 @@ class _Leaving:
         if_new = gamma * (length - _lengths(changes[:, :-1], of_others)) - 2 * rivals.max(axis=2)
 
         if self.kind == "ridge":
-            adds = np.tile(self.excess * self.counts, (len(own), 1))
-            adds[every, own] -= self.excess * weights[:, 0]
-            scores = shares + adds[:, None] * ((onto @ self.whole.T) @ (means - center[:, None]).transpose(0, 2, 1))
+            sizes = self.excess * (self.counts - weights * (own[:, None] == np.arange(len(self.counts))))
+            fitted = onto @ self.whole.T @ (means - center[:, None]).transpose(0, 2, 1)
+            scores = self.readout.shares + sizes[:, None] * fitted
         else:
             nearer = np.square(weights / counts) * (gamma * length / 2 - lda[every, :, own])
-            if beside:  # what is scored counts as the complete touch
-                nearer[:, count:] = nearer[:, count - 1 : count]
+            nearer[:, count:] = nearer[:, count - 1 : count]  # what is scored beside counts as the complete touch
             scores = lda
             scores[every, :, own] += nearer
-        z = gamma * (z - (z @ shares)[:, :, None] - (self.means - self.center) @ self.center)
-        scored = slice(count if beside else 0, None)
-        scores, best = scores[:, scored], scores[:, scored].argmax(axis=2)
+        z = gamma * (z - (z @ self.readout.shares)[:, :, None] - (self.means - self.center) @ self.center)
+        best = scores.argmax(axis=2)
         is_own = best == own[:, None]
         moved = weights / left * (vectors[:, :count].mean(axis=1) - self.plain[own])
-        squares = np.square(vectors[:, scored] - self.plain[best] + is_own[:, :, None] * moved[:, None])
+        squares = np.square(vectors - self.plain[best] + is_own[:, :, None] * moved[:, None])
         diagonal = np.where(is_own, 1 - np.square(weights / counts), 1.0) * (squares @ self.readout.precision)
-        return [scores, z[:, scored], distances[:, scored]], [if_new[:, scored], diagonal]
+        return scores, z, distances, if_new, diagonal
 
     def _coordinates(self, vectors: FloatArray) -> FloatArray:
         """The coordinates of each touch's vectors about the origin, (M, n, d) to (M, n, D)."""

@@ -24,6 +24,7 @@ as they were solved. Measured, such a readout is right about as many touches as 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import Sums, one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["Readout", "ReadoutName", "Solution"]
+__all__ = ["Readout", "ReadoutName"]
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -42,21 +43,6 @@ Places = npt.NDArray[np.intp]
 ReadoutName = Literal["lda", "ridge"]
 
 TOGETHER = 128  # materials that are solved for at once
-
-
-class Solution(NamedTuple):
-    """What of a readout stays as it was solved.
-
-    origin: the mean of all rows, (d,), in grid units. triangle: L⁻¹ of K. gamma: γ. share: ρ. penalty: P. precision:
-    one over the variance of each feature within materials, (d,).
-    """
-
-    origin: FloatArray
-    triangle: InverseTriangle
-    gamma: float
-    share: float
-    penalty: float
-    precision: FloatArray
 
 
 class Derived(NamedTuple):
@@ -72,28 +58,37 @@ class Derived(NamedTuple):
     background: FloatArray
 
 
+@dataclass(eq=False)
 class Readout:
     """The readout of one scale: solved from a task, or the one that followed such a one. It never changes.
 
     names: the materials; a place is an index into them. reference: the first of them, to which novelty and the ridge
-    refer; given is their number. shares: p, (R,). counts: rows, (C,). sums: of their codes, (C, d). For the other
-    attributes see `Solution`.
+    refer. counts: rows, (C,). sums: of their codes, (C, d). As it was solved stay origin: the mean of all rows, (d,),
+    in grid units; triangle: L⁻¹ of K; gamma: γ; share: ρ; penalty: P; precision: one over the variance of each feature
+    within materials, (d,). shares: p, (R,).
 
     K⁻¹ m of a material is solved for when it is first asked for: a scene of few materials costs what it holds. Any
     number of threads may use it at once.
     """
 
-    def __init__(
-        self, scale: Scale, names: Sequence[str], reference: int, counts: IntArray, sums: Sums, solution: Solution
-    ) -> None:
-        self.scale, self.names, self.counts, self.sums, self.solution = scale, list(names), counts, sums, solution
-        self.origin, self.triangle, self.gamma, self.share, self.penalty, self.precision = solution
-        self.reference = self.names[:reference]
+    scale: Scale
+    names: list[str]
+    reference: list[str]
+    counts: IntArray
+    sums: Sums
+    origin: FloatArray
+    triangle: InverseTriangle
+    gamma: float
+    share: float
+    penalty: float
+    precision: FloatArray
+
+    def __post_init__(self) -> None:
         self.places = {name: place for place, name in enumerate(self.names)}
-        self.shares = counts[:reference] / counts[:reference].sum()
-        self._near = slice(reference)
-        self._solved = np.empty((len(names), len(self.origin)))
-        self._sizes = np.full(len(names), np.nan)  # not a number where it is not solved for yet
+        self._near = slice(len(self.reference))
+        self.shares = self.counts[self._near] / self.counts[self._near].sum()
+        self._solved = np.empty(self.sums.shape)
+        self._sizes = np.full(len(self.names), np.nan)  # not a number where it is not solved for yet
         self._derived: Derived | None = None
         self._scored: tuple[FloatArray, FloatArray] | None = None  # the last touch, and its scores of all materials
 
@@ -106,37 +101,36 @@ class Readout:
 
     def solved(self, places: slice | Places = slice(None)) -> tuple[FloatArray, FloatArray]:
         """K⁻¹ m of materials, (k, d), and mᵀ K⁻¹ m, (k,)."""
-        if np.isnan(self._sizes[places]).any():
-            # The same ones are always solved for together: threads that ask at once, each for some, get the same bits.
-            wanted = np.arange(len(self.names))[places].tolist()
-            for first in sorted({place // TOGETHER * TOGETHER for place in wanted}):
-                own = first + np.flatnonzero(np.isnan(self._sizes[first : first + TOGETHER]))
-                means = self.means(own)
-                with one_thread():
-                    self._solved[own] = self.triangle.solve(means)
-                self._sizes[own] = np.einsum("nd,nd->n", means, self._solved[own])
+        missing = np.arange(len(self.names))[places][np.isnan(self._sizes[places])]
+        # The same ones are always solved for together: threads that ask at once, each for some, get the same bits.
+        for first in sorted({place // TOGETHER * TOGETHER for place in missing.tolist()}):
+            own = first + np.flatnonzero(np.isnan(self._sizes[first : first + TOGETHER]))
+            means = self.means(own)
+            with one_thread():
+                self._solved[own] = self.triangle.solve(means)
+            self._sizes[own] = np.vecdot(means, self._solved[own])
         return self._solved[places], self._sizes[places]
 
     def followed(self, statistics: Statistics, changed: Collection[str]) -> Readout | None:
-        """The readout of the present statistics, with what `Solution` has as it was solved; None without a reference.
+        """The readout of the present statistics, its scatter as it was solved; None without a reference.
 
         changed: materials of which touches came or went since this one was solved or followed; of others no sum may
         have changed. A new one joins the reference where that is all materials. The caller holds the statistics' lock.
         """
-        counts = dict(zip(changed, statistics.counts(self.scale, list(changed)).tolist(), strict=True))
-        stay = np.array([place for place, name in enumerate(self.names) if counts.get(name, 1)], dtype=np.intp)
-        come = sorted(name for name, count in counts.items() if count and name not in self.places)
-        reference = int((stay < len(self.reference)).sum())
-        reference += len(come) if len(self.reference) == len(self.names) else 0
+        now = dict(zip(changed, statistics.counts(self.scale, list(changed)).tolist(), strict=True))
+        stay = np.array([place for place, name in enumerate(self.names) if now.get(name, 1)], dtype=np.intp)
+        come = sorted(name for name, count in now.items() if count and name not in self.places)
+        names = [*(self.names[place] for place in stay), *come]
+        reference = names[: (stay < len(self.reference)).sum()] if len(self.reference) < len(self.names) else names
         if not reference:
             return None
-        names = [*(self.names[place] for place in stay), *come]
-        other = Readout(self.scale, names, reference, *statistics.totals(self.scale, names), self.solution)
-        moved = [other.places[name] for name in counts if name in other.places]
+        counts, sums = statistics.totals(self.scale, names)
+        other = replace(self, names=names, reference=reference, counts=counts, sums=sums)
+        moved = [other.places[name] for name in now if name in other.places]
         other._sizes[: len(stay)] = self._sizes[stay]
         other._sizes[moved] = np.nan
         np.take(self._solved, stay, axis=0, out=other._solved[: len(stay)], mode="clip")  # without a copy between
-        if other.reference == self.reference and min(moved, default=reference) >= reference:
+        if reference == self.reference and min(moved, default=len(reference)) >= len(reference):
             other._derived = self._derived
         return other
 

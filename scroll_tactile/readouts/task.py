@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.readout import Readout, Solution
+from scroll_tactile.readouts.readout import Readout
 from scroll_tactile.readouts.triangle import InverseTriangle
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import SecondMoment, Sums, one_thread, within_scatter
@@ -46,11 +46,11 @@ class Task:
     """
 
     scale: Scale
-    second: SecondMoment
     names: list[str]
-    reference: int
+    reference: list[str]
     counts: IntArray
     sums: Sums
+    second: SecondMoment
     touches: int
     times: float
 
@@ -60,10 +60,10 @@ class Task:
         names = statistics.names(scale)
         there = set(names)
         # If no sampled touch has rows at this scale, the first materials with rows are the reference.
-        near = dict.fromkeys([name for name in reference if name in there] or names[:FIRST_KNOWN])
-        names = [*near, *(name for name in names if name not in near)]
+        near = [name for name in reference if name in there] or names[:FIRST_KNOWN]
+        names = near + sorted(there.difference(near))
         counts, sums = statistics.totals(scale, names)
-        return cls(scale, statistics.second(scale).copy(), names, len(near), counts, sums, statistics.touches, times)
+        return cls(scale, names, near, counts, sums, statistics.second(scale).copy(), statistics.touches, times)
 
     @property
     def scatter(self) -> FloatArray:
@@ -91,8 +91,8 @@ class Task:
         rows = int(self.counts.sum())
         with one_thread():
             triangle = InverseTriangle(matrix)
-        solution = Solution(origin, triangle, rows / (1 - share), share, penalty, rows / np.diagonal(matrix))
-        return Readout(self.scale, self.names, self.reference, self.counts, self.sums, solution)
+        own, precision = (self.scale, self.names, self.reference, self.counts, self.sums), rows / np.diagonal(matrix)
+        return Readout(*own, origin, triangle, rows / (1 - share), share, penalty, precision)
 
 
 def shrinkage(scatter: FloatArray, touches: int, times: float = 1.0) -> float:

@@ -50,10 +50,10 @@ TOGETHER = 64  # touches: what is made of them and 256 materials takes some 100 
 class HeldOutScores:
     """Scores by one scale of the sampled touches, each held out: N rows, R reference materials.
 
-    rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
-    about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
-    distances_if_new: shape (N,), that of the nearest other material, had its own never been observed.
-    diagonal_distances: shape (N,), see `Readout.diagonal_distance`, from the material of the highest score.
+    rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z, about the mean,
+    and distances, the relative Mahalanobis distance if that material is the nearest: (N, R). distances_if_new: that of
+    the nearest other material, had its own never been observed, (N,). diagonal_distances: from the material of the
+    highest score, (N,).
     """
 
     scale: Scale
@@ -120,8 +120,7 @@ def held_out_scores(
     any number → mean features in grid units, (d,), scored in place of its own rows; the numbers then stand for stages.
     The result lacks touches that are the only one of their material.
     """
-    names = readout.reference
-    own = {name: place for place, name in enumerate(names)}
+    names, own = readout.reference, {name: place for place, name in enumerate(readout.reference)}
     index: dict[tuple[int, int], int] = {}
     groups = defaultdict[tuple[int, int], list[tuple[FloatArray, list[float], int, list[int]]]](list)
     for place, (material, _, touch) in enumerate(sample):
@@ -140,9 +139,9 @@ def held_out_scores(
         leaving = _Leaving(readout, kind, max((len(group[0][0]) for group in groups.values()), default=0))
         for (count, _), group in groups.items():
             for first in range(0, len(group), TOGETHER):
-                vectors, weights, owners, at = map(np.array, zip(*group[first : first + TOGETHER], strict=True))
-                for into, part in zip((*wide, *flat), leaving.out(vectors, count, weights, owners), strict=True):
-                    into[at] = part[:, -at.shape[1] :]
+                several, weights, owners, rows = map(np.array, zip(*group[first : first + TOGETHER], strict=True))
+                for into, part in zip((*wide, *flat), leaving.out(several, count, weights, owners), strict=True):
+                    into[rows] = part[:, -rows.shape[1] :]
     return HeldOutScores(readout.scale, index, names, *wide, *flat)
 
 

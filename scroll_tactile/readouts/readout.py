@@ -63,12 +63,12 @@ class Readout:
     """The readout of one scale: solved from a task, or the one that followed such a one. It never changes.
 
     names: the materials; a place is an index into them. reference: the first of them, to which novelty and the ridge
-    refer. counts: rows, (C,). sums: of their codes, (C, d). As it was solved stay origin: the mean of all rows, (d,),
-    in grid units; triangle: L⁻¹ of K; gamma: γ; share: ρ; penalty: P; precision: one over the variance of each feature
-    within materials, (d,). shares: p, (R,).
+    refer. counts: rows, (C,). sums: of their codes, (C, d). shares: p, (R,). As it was solved stay origin: the mean of
+    all rows, (d,), in grid units; triangle: L⁻¹ of K; gamma: γ; share: ρ; penalty: P; precision: one over the variance
+    of each feature within materials, (d,).
 
-    K⁻¹ m of a material is solved for when it is first asked for: a scene of few materials costs what it holds. Any
-    number of threads may use it at once.
+    A material is solved for when it is first asked for: a scene of few costs what it holds. Any number of threads may
+    use it at once.
     """
 
     scale: Scale
@@ -150,10 +150,9 @@ class Readout:
         """The scores of the materials at some places for features of shape (d,), shape (k,)."""
         chosen = np.asarray(places, dtype=np.intp)
         if kind == "ridge":
-            near, beyond = self._beyond_nearest(features)
-            scores = self.derived().background @ beyond
+            near, _, scores = self._beyond_nearest(features)
             scores[near] += 1.0
-            return np.asarray(scores[chosen])
+            return scores[chosen]
         if 4 * len(chosen) <= len(self.names):
             return self._lda(features, chosen)
         if self._scored is None or self._scored[0] is not features:  # each touch is asked about repeatedly
@@ -165,11 +164,7 @@ class Readout:
         return np.asarray(self.gamma * (solved @ (features - self.origin) - sizes / 2))
 
     def diagonal_distance(self, features: FloatArray, place: int) -> float:
-        """The squared Mahalanobis distance of features (d,) from a material's mean, by diagonal scatter as fitted.
-
-        It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
-        differs in.
-        """
+        """The squared distance of features (d,) from a material by diagonal scatter: unlike `novelty` it is of all."""
         return float(np.square(features - self.origin - self.means([place])[0]) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
@@ -188,15 +183,13 @@ class Readout:
 
     def novelty(self, features: FloatArray, places: Sequence[int] | Places) -> float:
         """Relative Mahalanobis distance of features (d,), the nearest material taken among those at `places`."""
-        near, beyond = self._beyond_nearest(features)
+        near, beyond, weighed = self._beyond_nearest(features)
         ahead = self.scores(features, places, "lda").max() - self.scores(features, [near], "lda")[0]
-        weighed = beyond @ self.derived().background @ beyond
-        return float(weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
+        return float(beyond @ weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
 
-    def _beyond_nearest(self, features: FloatArray) -> tuple[int, FloatArray]:
-        """The nearest of the reference materials, by its place, and v, shape (R,)."""
-        near, shares = int(self._lda(features, self._near).argmax()), self.shares
-        away = features - self.origin - self.means([near])[0]
-        beyond = self.gamma * (self.solved(self._near)[0] @ away)
-        beyond[near] -= 1 / ((1 - self.share) * shares[near])
-        return near, np.asarray(beyond - shares @ beyond)
+    def _beyond_nearest(self, features: FloatArray) -> tuple[int, FloatArray, FloatArray]:
+        """The nearest of the reference materials, by its place, v, and H v, both of shape (R,)."""
+        near, derived = int(self._lda(features, self._near).argmax()), self.derived()
+        beyond = derived.weights @ (features - self.origin - self.means([near])[0]) + 1 / (1 - self.share)
+        beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
+        return near, beyond, derived.background @ beyond

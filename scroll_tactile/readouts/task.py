@@ -1,6 +1,4 @@
-"""How a readout is made: solved from the statistics of one moment.
-
-Shrinkage is in closed form: how far the scatter within materials is drawn to a multiple of the identity.
+"""How a readout is made: solved from the statistics of one moment, its shrinkage in closed form.
 
 With S = S_w / N of n touches, Σ = (1 − ρ) S + ρ (tr S / d) I, and ρ of least expected squared error where features are
 normally distributed (the oracle approximating shrinkage of Chen, Wiesel, Eldar and Hero 2010, IEEE Trans. Signal
@@ -40,9 +38,8 @@ LEAST, LARGEST = 1e-4, 0.99
 class Task:
     """The input of a readout's solution: the statistics at one moment, copied, so that solving needs no lock.
 
-    second: a copy, of which the thread that solves forms the products that wait. names: the materials with rows, first
-    the reference, to which novelty and calibration refer, of so many. counts: their rows, (C,). sums: of their codes,
-    (C, d). touches: n. times: the factor by which the shrinkage of the formula is multiplied.
+    names, reference, counts, sums: see `Readout`. second: a copy, of which the thread that solves forms the products
+    that wait. touches: n. times: the factor by which the shrinkage of the formula is multiplied.
     """
 
     scale: Scale
@@ -77,18 +74,14 @@ class Task:
         return np.asarray((total / self.counts.sum()).astype(np.float64))
 
     def solve(self) -> Readout:
-        """The readout.
-
-        Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
-        """
+        """The readout. Raises numpy.linalg.LinAlgError where K is not positive definite to working precision."""
         origin, matrix = self.origin, self.scatter
-        trace, dimension = float(np.trace(matrix)), len(matrix)
+        trace, dimension, rows = float(np.trace(matrix)), len(matrix), int(self.counts.sum())
         share = shrinkage(matrix, self.touches, self.times) if trace > 0 else 0.0
         penalty = trace / dimension * share / (1 - share)
         if not penalty > 0:  # single rows have no scatter: the readout then is the nearest mean
             penalty = max(float(np.square(self.sums / self.counts[:, None] - origin).mean()), 1.0)
         matrix[np.diag_indices(dimension)] += penalty
-        rows = int(self.counts.sum())
         with one_thread():
             triangle = InverseTriangle(matrix)
         own, precision = (self.scale, self.names, self.reference, self.counts, self.sums), rows / np.diagonal(matrix)

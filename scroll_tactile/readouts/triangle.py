@@ -18,19 +18,15 @@ BLOCKS = 8  # of rows of a triangle: then seven sixteenths of the square are lef
 @lru_cache(maxsize=64)
 def contrasts(count: int) -> FloatArray:
     """Helmert's orthonormal contrasts of so many rows, shape (count − 1, count): their Gram matrix is the centring."""
-    contrasts = np.zeros((count - 1, count))
-    for i in range(1, count):
-        contrasts[i - 1, :i], contrasts[i - 1, i] = 1.0, -float(i)
-        contrasts[i - 1] /= np.sqrt(i * (i + 1.0))
-    return contrasts
+    i = np.arange(1.0, count)[:, None]
+    return np.asarray((np.tril(np.ones((count - 1, count))) - i * np.eye(count - 1, count, 1)) / np.sqrt(i * (i + 1)))
 
 
 class InverseTriangle:
     """L⁻¹ of K = L Lᵀ, shape (d, d), of which the lower triangle is read: in blocks of rows, without what is zero.
 
-    A block stays in the processor's cache for all rows that are multiplied by it; no second (d, d) array is made. By
-    numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import. The caller
-    has set BLAS to one thread.
+    A block stays in the processor's cache for all rows that it is multiplied by; no second (d, d) array is made. Scipy,
+    which could do it too, takes 40 MB and a fifth of a second to import. The caller has set BLAS to one thread.
 
     Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """

@@ -112,7 +112,7 @@ def test_followed_it_has_the_means_of_what_is_there_and_the_scatter_that_it_was_
             changed.add(name)
         there, before = statistics.names(SCALE), readout
         if asked:
-            before.scores(PROBES[0].astype(float), range(len(before.names)), "lda")
+            before.novelty(PROBES[0].astype(float), range(len(before.names)))
         readout = before.followed(statistics, changed)
         if not set(before.reference) & set(there):
             assert readout is None

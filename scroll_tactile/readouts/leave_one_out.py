@@ -1,30 +1,29 @@
 """Leave-one-out scores: each sampled touch is scored by a readout that never observed it.
 
-The touch's rows are taken out of the statistics. A touch of k rows with mean x̄, of a material of n rows with mean m,
-adds to S_w the columns U: its rows about their mean and the scaled shift √(n k / (n − k)) (x̄ − m). Without
-it, by Sherman, Morrison and Woodbury (1950; Bartlett 1951 for a row),
+A touch of k rows with mean x̄, of a material of n rows with mean m, adds to S_w its rows about their mean and the shift
+√(n k / (n − k)) (x̄ − m). K' is K without these columns, and m' = m − k / (n − k) (x̄ − m). The total scatter
+T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ about the mean μ loses them too, and a column along m − μ, which is what the means
+make of the material; without the touch, but not if all of the material were new, it gets one along m' again. P and γ
+stay as they are. All scores then follow by the definitions of `readout`, with
 
-    K'⁻¹ = K⁻¹ − K⁻¹ Uᵀ E U K⁻¹,    E = (U K⁻¹ Uᵀ − I)⁻¹,    m' = m − k / (n − k) (x̄ − m),
+    ridge:     s_y = p_y + N p_y (m_y − μ)ᵀ T⁻¹ (x − μ),
+    distance:  γ (x − m_y)ᵀ K⁻¹ (x − m_y) − γ (x − μ)ᵀ T⁻¹ (x − μ).
 
-so that all of its scores follow from products with K⁻¹ of its rows and of the means: one inverse serves for all. The
-touch leaves the total scatter T = K + N Σ_y p_y (m_y − μ)(m_y − μ)ᵀ in the same way. It leaves the paper's ridge by
-its leverage matrix B: its scores are (I − B)⁻¹ (F − B Y), Y the targets of the rows and F their fitted scores. P and γ
-stay as they are.
+With K = L Lᵀ the vectors L⁻¹ x of the R means and of a touch span few dimensions. Between coordinates there K is the
+identity, and a few columns change its inverse in a small product (Sherman, Morrison and Woodbury 1950; Bartlett 1951
+for a row); so does T between others.
 
-A held-out touch lies further from its own material than a new touch will. The squared distance to the mean of n touches
-is expected to be (1 + 1/n) times the scatter for a new touch, and (1 + 1/(n − 1)) times for a held-out one of the n. So
-it is multiplied by their ratio, 1 − 1/n²: calibration would otherwise expect new touches to look less like their own
-material than they do.
+A held-out touch lies further from its own material than a new touch will: its squared distance to the mean of n − 1
+touches is expected to be (1 + 1/(n − 1)) times the scatter, that of a new one to the mean of n (1 + 1/n) times. So it
+is multiplied by their ratio, 1 − 1/n². And a ridge has the shares of all touches, as for a new one: shrunk heavily it
+returns little but these, and without the touch its material's would be lower.
 
 Where windows are learned one by one, the sample has fewer rows of a touch: these stand for all of them.
-
-With K = L Lᵀ all of these are products between whitened vectors L⁻¹ x, of which the R means and the k rows of a touch
-span R + k dimensions. So they are taken between coordinates there: in the orthonormal basis Q of the whitened means,
-and, for what lies beyond it, in a basis of the touch's own.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -40,20 +39,21 @@ from scroll_tactile.statistics.sample import SampledTouch
 __all__ = ["HeldOutScores", "Sampled", "StageScores", "held_out_scores", "rows_at"]
 
 FloatArray = npt.NDArray[np.float64]
+Places = npt.NDArray[np.intp]
 Sampled = Iterable[tuple[str, bytes, SampledTouch]]
 """Material, key and rows of the touches that readouts are calibrated on: a `TouchSample`, or what was copied of it."""
 
-TOGETHER = 256  # touches: of a row of 1008 features each these take 2 MB
+TOGETHER = 64  # touches: what is made of them and 256 materials takes some 100 MB
 
 
 @dataclass(frozen=True)
 class HeldOutScores:
     """Scores by one scale of the sampled touches, each held out: N rows, R reference materials.
 
-    rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z: shape (N, R), z
-    about the mean. distances: shape (N, R), the relative Mahalanobis distance if that material is the nearest.
-    distances_if_new: shape (N,), that of the nearest other material, had its own never been observed.
-    diagonal_distances: shape (N,), see `Readout.diagonal_distance`, from the material of the highest score.
+    rows: (touch by its place in the sample, stage) → row. names: the reference materials. scores, z, about the mean,
+    and distances, the relative Mahalanobis distance if that material is the nearest: (N, R). distances_if_new: that of
+    the nearest other material, had its own never been observed, (N,). diagonal_distances: from the material of the
+    highest score, (N,).
     """
 
     scale: Scale
@@ -75,42 +75,36 @@ class StageScores:
     """
 
     def __init__(self, stage: int, sample: Sampled, held_out: Sequence[HeldOutScores]) -> None:
-        self._held_out, touches = held_out, list(sample)
+        touches = list(sample)
         self.names = sorted(set.intersection(*(set(one.names) for one in held_out)))
         reached = [{touch for touch, number in one.rows if number == stage} for one in held_out]
         self.places = sorted(set.intersection(*reached)) if len(self.names) > 1 else []
         self.keys = [touches[place][1] for place in self.places]
         self.targets = np.array([self.names.index(touches[place][0]) for place in self.places], dtype=np.intp)
-        self._rows = [np.array([one.rows[place, stage] for place in self.places], dtype=np.intp) for one in held_out]
-        self._columns = [np.array([one.names.index(name) for name in self.names], dtype=np.intp) for one in held_out]
+        rows = [[one.rows[place, stage] for place in self.places] for one in held_out]
+        columns = [[one.names.index(name) for name in self.names] for one in held_out]
+        self._picked = list(zip(held_out, rows, map(np.ix_, rows, columns), strict=True))
+        self._novel = [self._picked[place] for place in measuring([one.scale for one in held_out])]
 
     def scores(self) -> FloatArray:
         """Scores of the materials, (N, S, C)."""
-        return self._picked([one.scores for one in self._held_out])
+        return np.stack([one.scores[table] for one, _, table in self._picked], axis=1)
 
     def z(self) -> FloatArray:
         """z of the materials about their mean, (N, S, C)."""
-        return self._picked([one.z for one in self._held_out])
+        return np.stack([one.z[table] for one, _, table in self._picked], axis=1)
 
     def distances(self) -> FloatArray:
-        """The relative Mahalanobis distance if that material is the nearest, at the scales that measure novelty."""
-        picked = self._picked([one.distances for one in self._held_out])
-        # In one order in memory: the bits of a mean over touches depend on it.
-        return np.ascontiguousarray(picked[:, measuring([one.scale for one in self._held_out])])
+        """The relative distance if that material is the nearest, at the S' scales that measure novelty, (N, S', C)."""
+        return np.stack([one.distances[table] for one, _, table in self._novel], axis=1)
 
     def distances_if_new(self) -> FloatArray:
-        """The relative distance had its own material never been observed; scales as of `distances`, (N, S')."""
-        places = measuring([one.scale for one in self._held_out])
-        return np.stack([self._held_out[i].distances_if_new[self._rows[i]] for i in places], axis=1)
+        """The relative distance had its own material never been observed, at the same scales, (N, S')."""
+        return np.stack([one.distances_if_new[rows] for one, rows, _ in self._novel], axis=1)
 
     def diagonal_distances(self) -> FloatArray:
         """Diagonal distances from the material of the highest score, (N, S)."""
-        found = [one.diagonal_distances[rows] for one, rows in zip(self._held_out, self._rows, strict=True)]
-        return np.stack(found, axis=1)
-
-    def _picked(self, values: Sequence[FloatArray]) -> FloatArray:
-        found = zip(values, self._rows, self._columns, strict=True)
-        return np.stack([own[np.ix_(rows, columns)] for own, rows, columns in found], axis=1)
+        return np.stack([one.diagonal_distances[rows] for one, rows, _ in self._picked], axis=1)
 
 
 def held_out_scores(
@@ -126,35 +120,29 @@ def held_out_scores(
     any number → mean features in grid units, (d,), scored in place of its own rows; the numbers then stand for stages.
     The result lacks touches that are the only one of their material.
     """
-    names = readout.reference
-    own = {name: i for i, name in enumerate(names)}
-    groups: dict[tuple[int, int], list[tuple[int, list[int], FloatArray, float, int, FloatArray]]] = {}
-    for number, (material, _, touch) in enumerate(sample):
+    names, own = readout.reference, {name: place for place, name in enumerate(readout.reference)}
+    index: dict[tuple[int, int], int] = {}
+    groups = defaultdict[tuple[int, int], list[tuple[FloatArray, list[float], int, list[int]]]](list)
+    for place, (material, _, touch) in enumerate(sample):
         judged = rows_at(touch, stages, readout.scale)
-        if not judged or material not in own or (queries is not None and not queries.get(number)):
+        asked = {} if queries is None else queries.get(place, {})
+        numbers = touch.pairs[judged, 0].tolist() if queries is None else sorted(asked)
+        if not judged or not numbers or material not in own:
             continue
         weight = float(max(touch.pairs[judged[0], 2], len(judged)))
         if readout.counts[own[material]] > weight:
-            rows = touch.rows[judged] - readout.origin
-            at, scored = touch.pairs[judged, 0].tolist(), rows
-            if queries is not None:
-                at, scored = sorted(queries[number]), np.stack([queries[number][i] for i in sorted(queries[number])])
-                scored = scored - readout.origin
-            groups.setdefault((len(judged), len(at)), []).append((number, at, rows, weight, own[material], scored))
-    index: dict[tuple[int, int], int] = {}
-    parts = []
-    beyond = max((judged + asked * (queries is not None) for judged, asked in groups), default=0)
-    leaving = _Leaving(readout, kind, beyond) if groups else None
-    for members in (group[i : i + TOGETHER] for group in groups.values() for i in range(0, len(group), TOGETHER)):
-        for number, at, *_ in members:
-            for stage in at:
-                index[number, stage] = len(index)
-        rows, weights, owners, scored = (np.stack([member[i] for member in members]) for i in (2, 3, 4, 5))
-        assert leaving is not None
-        parts.append(leaving.out(rows, weights, owners, None if queries is None else scored))
-    joined = [np.concatenate([np.zeros((0, len(names))), *(part[i] for part in parts)]) for i in range(3)]
-    if_new, diagonal = (np.concatenate([np.zeros(0), *(part[i] for part in parts)]) for i in (3, 4))
-    return HeldOutScores(readout.scale, index, names, joined[0], joined[1], joined[2], if_new, diagonal)
+            vectors = np.stack([*touch.rows[judged], *(asked[number] for number in numbers if asked)])
+            at = [index.setdefault((place, number), len(index)) for number in numbers]
+            groups[len(judged), len(at)].append((vectors - readout.origin, [weight], own[material], at))
+    wide, flat = np.zeros((3, len(index), len(names))), np.zeros((2, len(index)))
+    with one_thread():
+        leaving = _Leaving(readout, kind, max((len(group[0][0]) for group in groups.values()), default=0))
+        for (count, _), group in groups.items():
+            for first in range(0, len(group), TOGETHER):
+                several, weights, owners, rows = map(np.array, zip(*group[first : first + TOGETHER], strict=True))
+                for into, part in zip((*wide, *flat), leaving.out(several, count, weights, owners), strict=True):
+                    into[rows] = part[:, -rows.shape[1] :]
+    return HeldOutScores(readout.scale, index, names, *wide, *flat)
 
 
 def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale) -> list[int]:
@@ -166,201 +154,91 @@ def rows_at(touch: SampledTouch, stages: Sequence[Sequence[Scale]], scale: Scale
 
 
 class _Leaving:
-    """Takes touches out of one readout as it was solved; M touches with k rows each at once.
+    """Takes touches out of one readout as it was solved: M touches at once, in D coordinates.
 
-    All products are taken between whitened vectors, L⁻¹ x with K = L Lᵀ, in the coordinates of the module's docstring:
-    D of them, the first of the means' basis. Products of T follow from them (Woodbury): with B = √(N p_y) (m_y − μ)
-    and A Aᵀ = I + B Bᵀ, xᵀ T⁻¹ y = x·y − (A⁻¹ B x)·(A⁻¹ B y).
-
-    beyond: the most vectors that a touch has, of rows and of queries: so many coordinates are its own.
+    The first are in a basis of the whitened means, the others a touch's own, for so many vectors at most. whole: takes
+    coordinates to those in which T is the identity.
     """
 
-    def __init__(self, readout: Readout, kind: ReadoutName, beyond: int) -> None:
-        self.readout, self.kind = readout, kind
-        self.derived = readout.derived()
-        self.counts = readout.counts[: len(readout.near)]
-        self.total = float(self.counts.sum())
+    def __init__(self, readout: Readout, kind: ReadoutName, vectors: int) -> None:
+        self.readout, self.kind, self.plain = readout, kind, readout.means(slice(len(readout.reference)))
+        self.counts = readout.counts[: len(self.plain)].astype(np.float64)
         # The total scatter is that of the reference materials, scaled to the rows of all materials.
-        self.excess = float(readout.counts.sum()) / self.total
-        with one_thread():
-            self.basis, upper = np.linalg.qr(readout.triangle.times(readout.near.means).T)
-            self.means = np.pad(upper.T, ((0, 0), (0, beyond)))
-            self.center = readout.shares @ self.means
-            spread = (self.means - self.center) * np.sqrt(self.excess * self.counts)[:, None]
-            factor = np.linalg.cholesky(spread @ spread.T + np.eye(len(spread)))
-            self.onto_spread = np.linalg.solve(factor, spread)
+        self.excess = float(readout.counts.sum() / self.counts.sum())
+        self.basis, upper = np.linalg.qr(readout.triangle.times(self.plain).T)
+        self.means = np.pad(upper.T, ((0, 0), (0, vectors)))
+        self.center = readout.shares @ self.means
+        spread = np.sqrt(self.excess * self.counts)[:, None] * (self.means - self.center)
+        self.whole = np.linalg.inv(np.linalg.cholesky(np.eye(spread.shape[1]) + spread.T @ spread)).T
+
+    def out(self, vectors: FloatArray, count: int, weights: FloatArray, own: Places) -> tuple[FloatArray, ...]:
+        """Scores, z and distances without each touch, (M, n, R); its distance if new and the diagonal one, (M, n).
+
+        vectors: about the origin, (M, n, d): so many rows that each touch added, then those that are scored beside.
+        weights: the rows of the statistics that it stands for, (M, 1). own: its material among the reference, (M,).
+        """
+        gamma, every, counts = self.readout.gamma, np.arange(len(own)), self.counts[own, None]
+        left, others = counts - weights, self.counts.sum() - counts
+        x = self._coordinates(vectors)
+        middle, mean = x[:, :count].mean(axis=1), self.means[own]
+        kept = mean - weights / left * (middle - mean)
+        means = np.tile(self.means, (len(own), 1, 1))
+        means[every, own] = kept
+        inner = np.sqrt(weights / count)[:, :, None] * (contrasts(count) @ x[:, :count])
+        gone = np.concatenate([inner, (np.sqrt(counts * left / weights) * (mean - kept))[:, None]], axis=1)
+        solved = _without(gone, x)
+        z, length = solved @ means.transpose(0, 2, 1), np.vecdot(x, solved)
+        lda = gamma * (z - _lengths(gone, means)[:, None] / 2)
+
+        rest = self.center - counts / np.maximum(others, 1) * (mean - self.center)  # the mean of the other materials
+        center = rest + left / (left + others) * (kept - rest)
+        columns = [np.sqrt(n * others / (n + others)) * (m - rest) for n, m in ((counts, mean), (left, kept))]
+        changes = np.concatenate([gone, self.excess**0.5 * np.stack(columns, axis=1)], axis=1) @ self.whole
+        of_all, of_others = ((x - part[:, None]) @ self.whole for part in (center, rest))
+        onto = _without(changes, of_all, come=1)
+        distances = gamma * (length - np.vecdot(of_all, onto))[:, :, None] - 2 * lda
+        rivals = lda.copy()
+        rivals[every, :, own] = -np.inf
+        if_new = gamma * (length - _lengths(changes[:, :-1], of_others)) - 2 * rivals.max(axis=2)
+
+        if self.kind == "ridge":
+            sizes = self.excess * (self.counts - weights * (own[:, None] == np.arange(len(self.counts))))
+            fitted = onto @ self.whole.T @ (means - center[:, None]).transpose(0, 2, 1)
+            scores = self.readout.shares + sizes[:, None] * fitted
+        else:
+            nearer = np.square(weights / counts) * (gamma * length / 2 - lda[every, :, own])
+            nearer[:, count:] = nearer[:, count - 1 : count]  # what is scored beside counts as the complete touch
+            scores = lda
+            scores[every, :, own] += nearer
+        z = gamma * (z - (z @ self.readout.shares)[:, :, None] - (self.means - self.center) @ self.center)
+        best = scores.argmax(axis=2)
+        is_own = best == own[:, None]
+        moved = weights / left * (vectors[:, :count].mean(axis=1) - self.plain[own])
+        squares = np.square(vectors - self.plain[best] + is_own[:, :, None] * moved[:, None])
+        diagonal = np.where(is_own, 1 - np.square(weights / counts), 1.0) * (squares @ self.readout.precision)
+        return scores, z, distances, if_new, diagonal
 
     def _coordinates(self, vectors: FloatArray) -> FloatArray:
-        """The coordinates of each touch's vectors about the origin, (M, k, d) to (M, k, D)."""
+        """The coordinates of each touch's vectors about the origin, (M, n, d) to (M, n, D)."""
         white = self.readout.triangle.times(vectors.reshape(-1, vectors.shape[2]))
         near = white @ self.basis
-        rest = (white - near @ self.basis.T).reshape(vectors.shape)
         # The triangle of a QR, which equal rows do not make singular, as they make their Gram matrix.
-        beyond = np.asarray(np.linalg.qr(rest.transpose(0, 2, 1), mode="r")).transpose(0, 2, 1)
-        found = np.zeros((*vectors.shape[:2], self.means.shape[1]))
-        found[:, :, : near.shape[1]] = near.reshape(*vectors.shape[:2], -1)
-        found[:, :, near.shape[1] : near.shape[1] + beyond.shape[2]] = beyond
-        return found
-
-    def out(
-        self,
-        rows: FloatArray,
-        weights: FloatArray,
-        own: npt.NDArray[np.intp],
-        queries: FloatArray | None = None,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Scores, z and distances, (M·q, R) each, without the rows of each touch; then two distances, (M·q,) each.
-
-        These two: the relative distance without the touch's whole material, and the diagonal distance.
-
-        rows: that each touch added, about the origin, (M, k, d). weights: the rows of the statistics that it stands
-        for, (M,). own: its material among the reference, (M,). queries: what is scored, about the origin, (M, q, d);
-        the rows themselves unless given.
-        """
-        touches, count = rows.shape[:2]
-        with one_thread():
-            if queries is None:
-                queries, white = rows, self._coordinates(rows)
-                scored = white
-            else:
-                both = self._coordinates(np.concatenate([rows, queries], axis=1))
-                white, scored = both[:, :count], both[:, count:]
-            counts = self.counts[own]
-            stretch = np.sqrt(weights * counts / (counts - weights))[:, None]
-            share = np.sqrt(weights / count)[:, None, None]
-            columns = _columns(white, share, stretch * (white.mean(axis=1) - self.means[own]))
-            inner = np.linalg.inv(columns @ columns.transpose(0, 2, 1) - np.eye(count))
-            onto = scored @ columns.transpose(0, 2, 1)  # U K⁻¹ p of what is scored, (M, q, columns)
-            classes = (columns @ self.means.T).transpose(0, 2, 1)  # and of the means, (M, R, columns)
-            onto_inner, classes_inner = onto @ inner, classes @ inner
-            z = scored @ self.means.T - onto_inner @ classes.transpose(0, 2, 1)
-            sizes = np.square(self.means).sum(axis=1) - np.einsum("nri,nri->nr", classes, classes_inner)
-            i = np.arange(touches)
-            change = np.sqrt(weights / (counts * (counts - weights)))
-            z[i, :, own] += change[:, None] * onto_inner[:, :, -1]
-            sizes[i, own] += 2 * change * classes_inner[i, own, -1] - np.square(change) * (1 + inner[:, -1, -1])
-            length = np.square(scored).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto_inner)
-            whole, leverage, across = self._whole(white, scored, columns, weights, share)
-            whole_if_new = self._whole_without_material(scored, columns, own)
-        gamma = self.readout.gamma
-        lda = gamma * (z - sizes[:, None, :] / 2)
-        distances = gamma * (length - whole)[:, :, None] - 2 * lda
-        others = lda.copy()
-        others[i, :, own] = -np.inf
-        if_new = gamma * (length - whole_if_new) - 2 * others.max(axis=2)
-        gain = self._as_new(white, columns, inner, weights, own)
-        lda[i, :, own] += gain if queries is rows else gain[:, -1:]  # a query counts as the complete touch
-        centred = gamma * (z - (z @ self.readout.shares)[:, :, None]) - self.derived.towards
-        scores = lda if self.kind == "lda" else self._ridge(white, scored, own, leverage, across, weights)
-        diagonal = self._diagonal_distances(rows, queries, weights, own, scores.argmax(axis=2))
-        flat = [part.reshape(scored.shape[0] * scored.shape[1], -1) for part in (scores, centred, distances)]
-        return flat[0], flat[1], flat[2], if_new.reshape(-1), diagonal.reshape(-1)
-
-    def _as_new(
-        self,
-        white: FloatArray,
-        leaving: FloatArray,
-        inner: npt.NDArray[np.floating],
-        weights: FloatArray,
-        own: npt.NDArray[np.intp],
-    ) -> FloatArray:
-        """The rise of each row's own LDA score where its distance is brought to that of a new touch, (M, k).
-
-        white: the rows, whitened, (M, k, D). leaving, inner: the columns that leave K, whitened, and E.
-        """
-        counts = self.counts[own]
-        back = (weights / (counts - weights))[:, None] * (white.mean(axis=1) - self.means[own])
-        away = white - (self.means[own] - back)[:, None]
-        onto = away @ leaving.transpose(0, 2, 1)
-        far = np.square(away).sum(axis=2) - np.einsum("nki,nki->nk", onto, onto @ inner)
-        return np.asarray(self.readout.gamma * np.square(weights / counts)[:, None] * far / 2)
-
-    def _diagonal_distances(
-        self,
-        rows: FloatArray,
-        queries: FloatArray,
-        weights: FloatArray,
-        own: npt.NDArray[np.intp],
-        best: npt.NDArray[np.intp],
-    ) -> FloatArray:
-        """Diagonal distances of queries (M, q, d) from the material `best` of each, (M, q), without their touch."""
-        means, counts = self.readout.near.means, self.counts[own]
-        nearest = means[best]
-        back = (weights / (counts - weights))[:, None] * (rows.mean(axis=1) - means[own])
-        nearest -= (best == own[:, None])[:, :, None] * back[:, None]
-        distances: FloatArray = np.square(queries - nearest) @ self.readout.precision
-        as_new = 1 - np.square(weights / counts)[:, None]
-        return np.where(best == own[:, None], as_new * distances, distances)
-
-    def _whole(
-        self, white: FloatArray, scored: FloatArray, leaving: FloatArray, weights: FloatArray, share: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The squared length of each query about the total mean, by T without its touch, (M, q).
-
-        Also B of the touch's rows, (M, k, k), and of its queries with them, (M, q, k). leaving: the columns that
-        leave K, whitened, shape (M, k, D).
-        """
-        count, half, queries = white.shape[1], white - self.center, scored - self.center
-        rest = (self.total - weights)[:, None]
-        middle = half.mean(axis=1)
-        columns = np.sqrt(self.excess) * _columns(half, share, np.sqrt(weights[:, None] * self.total / rest) * middle)
-        signs = -np.ones(count)
-        if self.excess > 1:
-            columns = np.concatenate([columns, np.sqrt(self.excess - 1) * leaving], axis=1)
-            signs = np.repeat([-1.0, 1.0], count)
-        whole = self._length_without(queries + (weights[:, None] / rest * middle)[:, None, :], columns, signs)
-        leverage, across = (np.square(share) * (self._products(of, half) + 1 / self.total) for of in (half, queries))
-        return whole, leverage, across
-
-    def _whole_without_material(self, scored: FloatArray, leaving: FloatArray, own: npt.NDArray[np.intp]) -> FloatArray:
-        """The first result of `_whole`, also without the material's mean, but with its inner scatter, (M, q)."""
-        counts, middle = self.counts[own], self.means[own] - self.center
-        rest = self.total - counts
-        if not rest.all():
-            return np.full(scored.shape[:2], np.nan)
-        shift = np.sqrt(self.excess * counts * self.total / rest)[:, None] * middle
-        columns = np.concatenate([leaving, shift[:, None]], axis=1)
-        moved = scored - self.center + (counts / rest)[:, None, None] * middle[:, None]
-        return self._length_without(moved, columns, -np.ones(columns.shape[1]))
-
-    def _length_without(self, moved: FloatArray, columns: FloatArray, signs: FloatArray) -> FloatArray:
-        """The squared length, (M, q), of whitened vectors (M, q, D) under T changed by signed columns (M, k, D)."""
-        inner = np.linalg.inv(self._products(columns, columns) + np.diag(signs))
-        onto = self._products(moved, columns)
-        length = np.square(moved).sum(axis=2) - np.square(moved @ self.onto_spread.T).sum(axis=2)
-        return np.asarray(length - np.einsum("nki,nki->nk", onto, onto @ inner))
-
-    def _products(self, left: FloatArray, right: FloatArray) -> FloatArray:
-        """xᵀ T⁻¹ y of whitened vectors, shape (M, a, b)."""
-        near = left @ self.onto_spread.T, right @ self.onto_spread.T
-        return np.asarray(left @ right.transpose(0, 2, 1) - near[0] @ near[1].transpose(0, 2, 1))
-
-    def _ridge(
-        self,
-        white: FloatArray,
-        scored: FloatArray,
-        own: npt.NDArray[np.intp],
-        leverage: FloatArray,
-        across: FloatArray,
-        weights: FloatArray,
-    ) -> FloatArray:
-        fitted, queries = (self._fitted(rows) for rows in (white, scored))
-        targets = np.zeros_like(fitted)
-        targets[np.arange(len(own)), :, own] = 1.0
-        scores = queries + across @ np.linalg.solve(np.eye(white.shape[1]) - leverage, fitted - targets)
-        # The shares of all touches, as for a new touch. A heavily shrunk ridge returns little but the shares: without
-        # the held-out touch its material's would be lower, and calibration would give such scores no weight.
-        counts = self.counts - weights[:, None] * np.eye(len(self.counts))[own]
-        shares = counts / (self.total - weights)[:, None]
-        return np.asarray(scores + (self.readout.shares - shares)[:, None, :])
-
-    def _fitted(self, white: FloatArray) -> FloatArray:
-        """The scores of the whole ridge."""
-        z = self.readout.gamma * (white @ self.means.T)
-        z = z - (z @ self.readout.shares)[:, :, None] - self.derived.towards
-        return np.asarray(self.readout.shares + z @ self.derived.background)
+        own = np.linalg.qr((white - near @ self.basis.T).reshape(vectors.shape).transpose(0, 2, 1), mode="r")
+        found = np.concatenate([near.reshape(*vectors.shape[:2], -1), np.asarray(own).transpose(0, 2, 1)], axis=2)
+        return np.pad(found, ((0, 0), (0, 0), (0, self.means.shape[1] - found.shape[2])))
 
 
-def _columns(rows: FloatArray, share: FloatArray, shift: FloatArray) -> FloatArray:
-    """The contrasts of the rows of each touch and its scaled shift, shape (M, k, d)."""
-    return np.concatenate([share * (contrasts(rows.shape[1]) @ rows), shift[:, None]], axis=1)
+def _inner(columns: FloatArray, come: int = 0) -> FloatArray:
+    signs = np.where(np.arange(columns.shape[1]) < columns.shape[1] - come, 1.0, -1.0)
+    return np.asarray(np.linalg.inv(columns @ columns.transpose(0, 2, 1) - np.diag(signs)))
+
+
+def _without(columns: FloatArray, vectors: FloatArray, come: int = 0) -> FloatArray:
+    """Vectors (M, n, D) under the inverse of the identity without columns (M, k, D), of which the last `come` come."""
+    return np.asarray(vectors - vectors @ columns.transpose(0, 2, 1) @ _inner(columns, come) @ columns)
+
+
+def _lengths(columns: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Squared lengths of vectors under the inverse of the identity without columns, (M, n)."""
+    onto = vectors @ columns.transpose(0, 2, 1)
+    return np.asarray(np.vecdot(vectors, vectors) - np.vecdot(onto, onto @ _inner(columns)))

@@ -23,11 +23,9 @@ as they were solved. Measured, such a readout is right about as many touches as 
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
-from itertools import accumulate
-from typing import Any, Literal, NamedTuple
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -37,289 +35,161 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import Sums, one_thread
 from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["BLOCK", "Means", "Readout", "ReadoutName", "Solution"]
+__all__ = ["Readout", "ReadoutName"]
 
 FloatArray = npt.NDArray[np.float64]
-Floats = npt.NDArray[np.floating]
 IntArray = npt.NDArray[np.int64]
 Places = npt.NDArray[np.intp]
 ReadoutName = Literal["lda", "ridge"]
 
-BLOCK = 512  # materials beyond the reference that are held and solved for together: in single precision 2 MB
+TOGETHER = 128  # materials that are solved for at once
 
 
-class Solution(NamedTuple):
-    """What of a readout stays as it was solved.
+class Derived(NamedTuple):
+    """What ridge and novelty need of the R reference materials.
 
-    origin: the mean of all rows, shape (d,), in grid units. triangle: L⁻¹ of K. rows: N. share: ρ. penalty: P.
-    precision: one over the variance of each feature within materials, shape (d,).
+    middle: the mean of their means about the origin, weighed by p, (d,). weights: γ K⁻¹ (m − middle), (R, d). gram: G
+    about their mean, (R, R). background: H.
     """
 
+    middle: FloatArray
+    weights: FloatArray
+    gram: FloatArray
+    background: FloatArray
+
+
+@dataclass(eq=False)
+class Readout:
+    """The readout of one scale: solved from a task, or the one that followed such a one. It never changes.
+
+    names: the materials; a place is an index into them. reference: the first of them, to which novelty and the ridge
+    refer. counts: rows, (C,). sums: of their codes, (C, d). shares: p, (R,). As it was solved stay origin: the mean of
+    all rows, (d,), in grid units; triangle: L⁻¹ of K; gamma: γ; share: ρ; penalty: P; precision: one over the variance
+    of each feature within materials, (d,).
+
+    A material is solved for when it is first asked for: a scene of few costs what it holds. Any number of threads may
+    use it at once.
+    """
+
+    scale: Scale
+    names: list[str]
+    reference: list[str]
+    counts: IntArray
+    sums: Sums
     origin: FloatArray
     triangle: InverseTriangle
-    rows: int
+    gamma: float
     share: float
     penalty: float
     precision: FloatArray
 
-
-class Means:
-    """The means m of n materials, n ≥ 0, about a readout's origin, and what is solved for them: it never changes.
-
-    counts: rows, shape (n,), sums: of their codes, (n, d), both exact. single: whether K⁻¹ m is held in single
-    precision. It is solved for when it is first asked for; of threads that ask at once each solves, to the same bits.
-    """
-
-    def __init__(self, counts: IntArray, sums: Sums, solution: Solution, *, single: bool = False) -> None:
-        self.counts, self.sums, self.single = counts, sums, single
-        self._solution = solution
-        self._solved: tuple[Floats, FloatArray] | None = None
-
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    @property
-    def means(self) -> FloatArray:
-        """m, shape (n, d), formed anew each time."""
-        return self.means_at(slice(None))
-
-    @property
-    def solved(self) -> Floats:
-        """K⁻¹ m, shape (n, d)."""
-        return self._solve()[0]
-
-    @property
-    def sizes(self) -> FloatArray:
-        """mᵀ K⁻¹ m, shape (n,)."""
-        return self._solve()[1]
-
-    def means_at(self, rows: slice | Sequence[int]) -> FloatArray:
-        """m of some of them, shape (k, d)."""
-        return about(self.counts[rows], self.sums[rows], self._solution.origin)
-
-    def scores(self, row: FloatArray, rows: slice | Places = slice(None)) -> FloatArray:
-        """mᵀ K⁻¹ x − mᵀ K⁻¹ m / 2 of some of them, for a row x of shape (d,) about the origin."""
-        solved, sizes = self._solve()
-        return np.asarray(solved[rows] @ row.astype(solved.dtype, copy=False) - sizes[rows] / 2)
-
-    def changed(self, rows: Sequence[int], counts: IntArray, sums: Sums) -> Means:
-        """The same with other counts (k,) and sums (k, d) at some rows.
-
-        Rows past the end are appended; materials without rows any more are taken out.
-        """
-        size, live = max(len(self), *(row + 1 for row in rows)), [row for row, n in zip(rows, counts, strict=True) if n]
-
-        def put(held: npt.NDArray[Any], into: Sequence[int], new: npt.NDArray[Any]) -> npt.NDArray[Any]:
-            found = np.empty((size, *held.shape[1:]), np.result_type(held, new))
-            found[: len(self)] = held
-            found[into] = new
-            return found
-
-        other = Means(put(self.counts, rows, counts), put(self.sums, rows, sums), self._solution, single=self.single)
-        stay = slice(None) if counts.all() else other.counts > 0
-        if self._solved is not None:
-            solved, sizes = other._solve_at(live)
-            other._solved = put(self._solved[0], live, solved)[stay], put(self._solved[1], live, sizes)[stay]
-        other.counts, other.sums = other.counts[stay], other.sums[stay]
-        return other
-
-    def _solve(self) -> tuple[Floats, FloatArray]:
-        if self._solved is None:
-            self._solved = self._solve_at(slice(None))
-        return self._solved
-
-    def _solve_at(self, rows: slice | Sequence[int]) -> tuple[Floats, FloatArray]:
-        with one_thread():
-            means = self.means_at(rows)
-            solved = self._solution.triangle.solve(means)
-            sizes = np.einsum("nd,nd->n", means, solved)
-        return solved.astype(np.float32 if self.single else np.float64, copy=False), sizes
-
-
-def about(counts: IntArray, sums: Sums, origin: FloatArray) -> FloatArray:
-    """Means of materials about an origin, (n, d) in grid units, of their counts (n,) and sums (n, d)."""
-    # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
-    near = np.rint(origin)
-    return np.asarray((sums - np.outer(counts, near.astype(np.int64))) / counts[:, None] - (origin - near))
-
-
-@dataclass(frozen=True)
-class Derived:
-    """The matrices that ridge and novelty need of a readout.
-
-    gram: G of the reference materials about their mean, shape (R, R). background: H. towards: subtracted from z, after
-    its mean, to move its origin to the mean of the reference materials, shape (R,).
-    """
-
-    gram: FloatArray
-    background: FloatArray
-    towards: FloatArray
-
-
-class Readout:
-    """The readout of one scale: solved from a task, or the one that followed such a one. It never changes.
-
-    names: the materials; a place is an index into them. near: the reference materials, which are the first. others:
-    those after them, in blocks. counts: rows, shape (C,). The other attributes are those of `Solution`.
-
-    Any number of threads may use it at once.
-    """
-
-    def __init__(
-        self, scale: Scale, names: Sequence[str], near: Means, others: Sequence[Means], solution: Solution
-    ) -> None:
-        self.scale, self.names, self.near, self.solution = scale, list(names), near, solution
-        self.origin, self.triangle, self.rows, self.share, self.penalty, self.precision = solution
-        self.others = tuple(block for block in others if len(block))
+    def __post_init__(self) -> None:
         self.places = {name: place for place, name in enumerate(self.names)}
-        self.counts = np.concatenate([part.counts for part in self._parts]).astype(np.float64)
-        self._firsts = [0, *accumulate(len(part) for part in self._parts)]
+        self._near = slice(len(self.reference))
+        self.shares = self.counts[self._near] / self.counts[self._near].sum()
+        self._solved = np.empty(self.sums.shape)
+        self._sizes = np.full(len(self.names), np.nan)  # not a number where it is not solved for yet
         self._derived: Derived | None = None
         self._scored: tuple[FloatArray, FloatArray] | None = None  # the last touch, and its scores of all materials
 
-    @property
-    def _parts(self) -> tuple[Means, ...]:
-        return (self.near, *self.others)
+    def means(self, places: slice | Sequence[int] | Places = slice(None)) -> FloatArray:
+        """m of materials about the origin, (k, d), formed anew each time."""
+        counts, near = self.counts[places], np.rint(self.origin)
+        # Sums about the integers nearest to the origin are exact, so a mean close to the origin loses no digits.
+        away = (self.sums[places] - np.outer(counts, near.astype(np.int64))) / counts[:, None]
+        return np.asarray(away - (self.origin - near))
 
-    @property
-    def reference(self) -> list[str]:
-        """The reference materials."""
-        return self.names[: len(self.near)]
-
-    @property
-    def gamma(self) -> float:
-        """γ, by which K⁻¹ becomes Σ⁻¹."""
-        return self.rows / (1 - self.share)
-
-    @property
-    def shares(self) -> FloatArray:
-        """p of the reference materials, shape (R,)."""
-        counts = self.counts[: len(self.near)]
-        return np.asarray(counts / counts.sum())
+    def solved(self, places: slice | Places = slice(None)) -> tuple[FloatArray, FloatArray]:
+        """K⁻¹ m of materials, (k, d), and mᵀ K⁻¹ m, (k,)."""
+        missing = np.arange(len(self.names))[places][np.isnan(self._sizes[places])]
+        # The same ones are always solved for together: threads that ask at once, each for some, get the same bits.
+        for first in sorted({place // TOGETHER * TOGETHER for place in missing.tolist()}):
+            own = first + np.flatnonzero(np.isnan(self._sizes[first : first + TOGETHER]))
+            means = self.means(own)
+            with one_thread():
+                self._solved[own] = self.triangle.solve(means)
+            self._sizes[own] = np.vecdot(means, self._solved[own])
+        return self._solved[places], self._sizes[places]
 
     def followed(self, statistics: Statistics, changed: Collection[str]) -> Readout | None:
-        """The readout of the present statistics, with what `Solution` has as it was solved; None without a reference.
+        """The readout of the present statistics, its scatter as it was solved; None without a reference.
 
         changed: materials of which touches came or went since this one was solved or followed; of others no sum may
         have changed. A new one joins the reference where that is all materials. The caller holds the statistics' lock.
         """
-        names = sorted(set(changed))
-        counts = statistics.counts(self.scale, names)
-        _, there = statistics.totals(self.scale, [name for name, count in zip(names, counts, strict=True) if count])
-        sums = np.zeros((len(names), len(self.origin)), there.dtype)
-        sums[counts > 0] = there
-        moved: list[dict[int, int]] = [{} for _ in self._parts]  # row → place among the names
-        come = []
-        for i, name in enumerate(names):
-            if name in self.places:
-                number, row = self._at(self.places[name])
-                part = self._parts[number]
-                if part.counts[row] != counts[i] or (part.sums[row] != sums[i]).any():
-                    moved[number][row] = i
-            elif counts[i]:
-                come.append(i)
-        room = BLOCK - len(self.others[-1]) if self.others else len(come)
-        moved[-1].update(enumerate(come[:room], len(self._parts[-1])))
-        parts = [
-            part.changed(list(rows), counts[list(rows.values())], sums[list(rows.values())]) if rows else part
-            for part, rows in zip(self._parts, moved, strict=True)
-        ]
-        for own in (come[first : first + BLOCK] for first in range(room, len(come), BLOCK)):
-            parts.append(Means(counts[own], sums[own], self.solution, single=parts[-1].single))
-        if not len(parts[0]):
+        now = dict(zip(changed, statistics.counts(self.scale, list(changed)).tolist(), strict=True))
+        stay = np.array([place for place, name in enumerate(self.names) if now.get(name, 1)], dtype=np.intp)
+        come = sorted(name for name, count in now.items() if count and name not in self.places)
+        names = [*(self.names[place] for place in stay), *come]
+        reference = names[: (stay < len(self.reference)).sum()] if len(self.reference) < len(self.names) else names
+        if not reference:
             return None
-        gone = {name for name, count in zip(names, counts, strict=True) if not count}
-        left = [name for name in self.names if name not in gone]
-        return Readout(self.scale, [*left, *(names[i] for i in come)], parts[0], parts[1:], self.solution)
-
-    def _at(self, place: int) -> tuple[int, int]:
-        """Which part holds a material, and its row there."""
-        number = bisect_right(self._firsts, place) - 1
-        return number, place - self._firsts[number]
-
-    def _among(self, places: Places) -> Iterator[tuple[npt.NDArray[np.bool_], Means, Places]]:
-        """For each part that holds some of the places: which ones, the part, and their rows there."""
-        for part, first in zip(self._parts, self._firsts, strict=False):
-            own = (places >= first) & (places < first + len(part))
-            if own.any():
-                yield own, part, places[own] - first
+        counts, sums = statistics.totals(self.scale, names)
+        other = replace(self, names=names, reference=reference, counts=counts, sums=sums)
+        moved = [other.places[name] for name in now if name in other.places]
+        other._sizes[: len(stay)] = self._sizes[stay]
+        other._sizes[moved] = np.nan
+        np.take(self._solved, stay, axis=0, out=other._solved[: len(stay)], mode="clip")  # without a copy between
+        if reference == self.reference and min(moved, default=len(reference)) >= len(reference):
+            other._derived = self._derived
+        return other
 
     def derived(self) -> Derived:
-        """The matrices that ridge and novelty need, made when they are first asked for."""
+        """What ridge and novelty need of the reference materials, made when it is first asked for."""
         if self._derived is None:
-            shares, means, solved = self.shares, self.near.means, self.near.solved
+            shares, means, (solved, _) = self.shares, self.means(self._near), self.solved(self._near)
             with one_thread():
-                gram = self.gamma * (means @ solved.T)
+                middle, weights = shares @ means, self.gamma * (solved - shares @ solved)
+                gram = (means - middle) @ weights.T
                 gram = (gram + gram.T) / 2
-                onto = gram @ shares
-                size = float(shares @ onto)
-                gram = gram - onto[:, None] - onto + size
                 background = np.linalg.inv(np.diag(1.0 / ((1 - self.share) * shares)) + gram)
-            self._derived = Derived(gram, (background + background.T) / 2, onto - size)
+            self._derived = Derived(middle, weights, gram, (background + background.T) / 2)
         return self._derived
 
     def scores(self, features: FloatArray, places: Sequence[int] | Places, kind: ReadoutName) -> FloatArray:
         """The scores of the materials at some places for features of shape (d,), shape (k,)."""
         chosen = np.asarray(places, dtype=np.intp)
         if kind == "ridge":
-            near, beyond = self._beyond_nearest(features)
-            scores = self.derived().background @ beyond
+            near, _, scores = self._beyond_nearest(features)
             scores[near] += 1.0
-            return np.asarray(scores[chosen])
-        if 4 * len(chosen) > len(self.names):  # picking rows copies them
-            return np.asarray(self.gamma * self._scores_of_all(features)[chosen])
-        row, scores = features - self.origin, np.empty(len(chosen))
-        for own, part, rows in self._among(chosen):
-            scores[own] = part.scores(row, rows)
-        return np.asarray(self.gamma * scores)
+            return scores[chosen]
+        if 4 * len(chosen) <= len(self.names):
+            return self._lda(features, chosen)
+        if self._scored is None or self._scored[0] is not features:  # each touch is asked about repeatedly
+            self._scored = features, self._lda(features, slice(None))
+        return self._scored[1][chosen]
 
-    def _scores_of_all(self, features: FloatArray) -> FloatArray:
-        """The scores "lda" over γ of all materials; the last ones are kept, as each touch is asked about repeatedly."""
-        scored = self._scored
-        if scored is None or scored[0] is not features:
-            row = features - self.origin
-            scored = self._scored = features, np.concatenate([part.scores(row) for part in self._parts])
-        return scored[1]
+    def _lda(self, features: FloatArray, places: slice | Places) -> FloatArray:
+        solved, sizes = self.solved(places)
+        return np.asarray(self.gamma * (solved @ (features - self.origin) - sizes / 2))
 
     def diagonal_distance(self, features: FloatArray, place: int) -> float:
-        """The squared Mahalanobis distance of features (d,) from a material's mean, by diagonal scatter as fitted.
-
-        It grows with whatever was never learned, where the relative distance of `novelty` leaves out what no material
-        differs in.
-        """
-        number, row = self._at(place)
-        away = features - self.origin - self._parts[number].means_at([row])[0]
-        return float(np.square(away) @ self.precision)
+        """The squared distance of features (d,) from a material by diagonal scatter: unlike `novelty` it is of all."""
+        return float(np.square(features - self.origin - self.means([place])[0]) @ self.precision)
 
     def linear(self, names: Sequence[str], kind: ReadoutName) -> tuple[FloatArray, FloatArray]:
         """The scores of materials as weights (d, k) of features about the origin, and offsets (k,); see `scores`."""
-        places = [self.places[name] for name in names]
+        places = np.array([self.places[name] for name in names], dtype=np.intp)
         if kind == "lda":
-            found = [(self._parts[number], row) for number, row in map(self._at, places)]
-            solved = np.array([part.solved[row] for part, row in found], dtype=np.float64)
-            return self.gamma * solved.T, -self.gamma * np.array([part.sizes[row] for part, row in found]) / 2
-        derived, weights = self.derived(), self.gamma * self.near.solved.T
-        background = derived.background[places]
-        mixing = background - np.outer(background.sum(axis=1), self.shares)
-        return weights @ mixing.T, np.asarray(self.shares[places] - background @ derived.towards)
+            solved, sizes = self.solved(places)
+            return self.gamma * solved.T, -self.gamma * sizes / 2
+        derived = self.derived()
+        weights = derived.weights.T @ derived.background[:, places]
+        return weights, np.asarray(self.shares[places] - derived.middle @ weights)
 
     def centred(self, features: FloatArray) -> FloatArray:
         """z of the reference materials about their mean, shape (R,)."""
-        z = self.gamma * (self.near.solved @ (features - self.origin))
-        return np.asarray(z - self.shares @ z - self.derived().towards)
+        return np.asarray(self.derived().weights @ (features - self.origin - self.derived().middle))
 
     def novelty(self, features: FloatArray, places: Sequence[int] | Places) -> float:
         """Relative Mahalanobis distance of features (d,), the nearest material taken among those at `places`."""
-        near, beyond = self._beyond_nearest(features)
-        nearest = float(self.scores(features, places, "lda").max())
-        ahead = nearest - float(self.scores(features, [near], "lda")[0])
-        weighed = beyond @ self.derived().background @ beyond
-        return float(weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
+        near, beyond, weighed = self._beyond_nearest(features)
+        ahead = self.scores(features, places, "lda").max() - self.scores(features, [near], "lda")[0]
+        return float(beyond @ weighed - (1 / self.shares[near] - 1) / (1 - self.share) - 2.0 * ahead)
 
-    def _beyond_nearest(self, features: FloatArray) -> tuple[int, FloatArray]:
-        """The nearest of the reference materials, by its place, and v, shape (R,)."""
-        row = features - self.origin
-        near = int(self.near.scores(row).argmax())
-        beyond = self.gamma * (self.near.solved @ (row - self.near.means_at([near])[0]))
+    def _beyond_nearest(self, features: FloatArray) -> tuple[int, FloatArray, FloatArray]:
+        """The nearest of the reference materials, by its place, v, and H v, both of shape (R,)."""
+        near, derived = int(self._lda(features, self._near).argmax()), self.derived()
+        beyond = derived.weights @ (features - self.origin - self.means([near])[0]) + 1 / (1 - self.share)
         beyond[near] -= 1 / ((1 - self.share) * self.shares[near])
-        return near, np.asarray(beyond - self.shares @ beyond)
+        return near, beyond, derived.background @ beyond

@@ -13,25 +13,20 @@ __all__ = ["InverseTriangle", "contrasts"]
 FloatArray = npt.NDArray[np.float64]
 
 BLOCKS = 8  # of rows of a triangle: then seven sixteenths of the square are left out
-FEW = 8  # rows that are solved for one by one: a fifth of the time of a product of matrices
 
 
 @lru_cache(maxsize=64)
 def contrasts(count: int) -> FloatArray:
     """Helmert's orthonormal contrasts of so many rows, shape (count − 1, count): their Gram matrix is the centring."""
-    contrasts = np.zeros((count - 1, count))
-    for i in range(1, count):
-        contrasts[i - 1, :i], contrasts[i - 1, i] = 1.0, -float(i)
-        contrasts[i - 1] /= np.sqrt(i * (i + 1.0))
-    return contrasts
+    i = np.arange(1.0, count)[:, None]
+    return np.asarray((np.tril(np.ones((count - 1, count))) - i * np.eye(count - 1, count, 1)) / np.sqrt(i * (i + 1)))
 
 
 class InverseTriangle:
     """L⁻¹ of K = L Lᵀ, shape (d, d), of which the lower triangle is read: in blocks of rows, without what is zero.
 
-    A block stays in the processor's cache for all rows that are multiplied by it; no second (d, d) array is made. By
-    numpy alone: scipy's LAPACK, a second time beside numpy's, is 40 MB and a fifth of a second to import. The caller
-    has set BLAS to one thread.
+    A block stays in the processor's cache for all rows that it is multiplied by; no second (d, d) array is made. Scipy,
+    which could do it too, takes 40 MB and a fifth of a second to import. The caller has set BLAS to one thread.
 
     Raises numpy.linalg.LinAlgError where K is not positive definite to working precision.
     """
@@ -49,22 +44,14 @@ class InverseTriangle:
         """L⁻¹ times each of the rows, shape (k, d)."""
         product = np.empty_like(rows)
         for first, last, block in self._blocks:
-            if len(rows) > FEW:
-                product[:, first:last] = rows[:, :last] @ block.T
-                continue
-            for row, into in zip(rows, product, strict=True):
-                into[first:last] = block @ row[:last]
+            product[:, first:last] = rows[:, :last] @ block.T
         return product
 
     def transposed_times(self, rows: FloatArray) -> FloatArray:
         """L⁻ᵀ times each of the rows, shape (k, d)."""
         product = np.zeros_like(rows)
         for first, last, block in self._blocks:
-            if len(rows) > FEW:
-                product[:, :last] += rows[:, first:last] @ block
-                continue
-            for row, into in zip(rows, product, strict=True):
-                into[:last] += row[first:last] @ block
+            product[:, :last] += rows[:, first:last] @ block
         return product
 
     def solve(self, rows: FloatArray) -> FloatArray:

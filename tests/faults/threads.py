@@ -114,8 +114,7 @@ def learned_by(model: Any) -> Learned:
     """What the readouts of a model are of."""
     found = {}
     for scale, readout in model.readouts.items():
-        sums = np.concatenate([part.sums for part in (readout.near, *readout.others)])
-        found[int(scale)] = learned_of(readout.names, readout.counts, sums)
+        found[int(scale)] = learned_of(readout.names, readout.counts, readout.sums)
     return found
 
 

@@ -86,8 +86,7 @@ def require_followed(learner):
         assert sorted(readout.names) == names
         counts, (_, sums) = statistics.counts(scale, readout.names), statistics.totals(scale, readout.names)
         assert readout.counts.tolist() == counts.tolist()
-        parts = np.concatenate([part.means for part in (readout.near, *readout.others)])
-        np.testing.assert_allclose(parts + readout.origin, sums / counts[:, None], rtol=1e-12, atol=1e-6)
+        np.testing.assert_allclose(readout.means() + readout.origin, sums / counts[:, None], rtol=1e-12, atol=1e-6)
     kept = {(material, key) for material, key, _ in learner.memory.kept}
     assert set(model.matcher.kept.touches) == kept
 

@@ -112,7 +112,7 @@ def test_where_every_material_has_one_touch_its_own_mean_is_ahead_by_a_little(un
         ahead = np.zeros((6, 6))
         for weight, scale in zip(stage.weights, scales, strict=True):
             readout = Task.of(statistics, scale, statistics.names(scale)).solve()
-            own = [readout.scores(mean, range(6), "lda") for mean in readout.near.means + readout.origin]
+            own = [readout.scores(mean, range(6), "lda") for mean in readout.means() + readout.origin]
             ahead += weight * (np.diagonal(own)[:, None] - own)
         np.fill_diagonal(ahead, np.inf)
         assert np.median(ahead.min(axis=1)) == pytest.approx(AHEAD, rel=1e-6)

@@ -112,7 +112,7 @@ def test_followed_it_has_the_means_of_what_is_there_and_the_scatter_that_it_was_
             changed.add(name)
         there, before = statistics.names(SCALE), readout
         if asked:
-            before.scores(PROBES[0].astype(float), range(len(before.names)), "lda")
+            before.novelty(PROBES[0].astype(float), range(len(before.names)))
         readout = before.followed(statistics, changed)
         if not set(before.reference) & set(there):
             assert readout is None
@@ -124,34 +124,32 @@ def test_followed_it_has_the_means_of_what_is_there_and_the_scatter_that_it_was_
     require_textbook(readout, touches, PROBES[:2], solved=first)
 
 
-def test_it_never_changes_and_what_did_not_change_is_shared(monkeypatch):
-    """A scene reads only the blocks that its materials lie in, and a touch has one of them made anew."""
-    monkeypatch.setattr("scroll_tactile.readouts.task.BLOCK", 2)
-    monkeypatch.setattr("scroll_tactile.readouts.readout.BLOCK", 2)
+def test_it_never_changes_and_only_what_changed_or_is_asked_for_is_solved(monkeypatch):
+    """A scene of few materials costs what it holds; one that changed is solved for again, when it is asked for."""
+    monkeypatch.setattr("scroll_tactile.readouts.readout.TOGETHER", 2)
     touches = [touch("abcdefg"[i % 7], i) for i in range(21)]
     statistics = statistics_of(touches)
     readout, probe = readout_of(statistics, ["a", "b"]), PROBES[0].astype(float)
-    assert [len(block) for block in readout.others] == [2, 2, 1]
-    solved = []
-    solve = InverseTriangle.solve
+    solve, solved = InverseTriangle.solve, []
     monkeypatch.setattr(InverseTriangle, "solve", lambda self, rows: solved.append(len(rows)) or solve(self, rows))
-    before = readout.scores(probe, [6], "lda"), readout.scores(probe, [6], "lda")
-    assert solved == [1]
+
+    def solved_for(of, names):
+        """How many are solved for at a time where the materials of a scene are asked for."""
+        solved.clear()
+        of.scores(probe, [of.places[name] for name in names], "lda")
+        of.novelty(probe, [of.places[name] for name in names])
+        return [*solved]
+
+    assert solved_for(readout, "g") == [1, 2]  # the last of an odd number, and the reference
+    said = readout.scores(probe, [6], "lda").tobytes()
     for name in "eh":
         statistics.add(name, {SCALE: touch(name, 99)[1]})
     after = readout.followed(statistics, ["a", "e", "h", "never"])
-    assert readout.scores(probe, [6], "lda").tobytes() == before[0].tobytes()
-    assert after.near is readout.near and after.triangle is readout.triangle
-    assert [one is other for one, other in zip(after.others, readout.others, strict=True)] == [True, False, False]
+    assert after.triangle is readout.triangle
+    assert [solved_for(after, names) for names in ("g", "h", "de", "f")] == [[1], [1], [2, 2], []]  # first a
+    assert after.scores(probe, [6], "lda").tobytes() == said == readout.scores(probe, [6], "lda").tobytes()
+    assert solved_for(readout, "g") == []
     assert (readout.names, after.names) == ([*"abcdefg"], [*"abcdefgh"])
-    assert solved == [1, 1]  # of a block that was never asked for nothing is solved
-    for name in "ij":
-        statistics.add(name, {SCALE: touch(name, 99)[1]})
-    assert [len(block) for block in after.followed(statistics, "ij").others] == [2, 2, 2, 2]
-    for name, rows in [*touches, ("e", touch("e", 99)[1]), ("h", touch("h", 99)[1])]:
-        if name in "eh":
-            statistics.remove(name, {SCALE: rows})
-    assert [len(block) for block in after.followed(statistics, "eh").others] == [2, 1, 1]
 
 
 def test_a_material_that_is_new_joins_the_reference_where_that_is_all_materials():
@@ -178,21 +176,6 @@ def test_of_more_than_a_thousand_materials_of_one_row_each_the_nearest_mean_is_f
         assert np.isfinite(readout.novelty(rows[i] + 5.0, range(1030)))
 
 
-@pytest.mark.parametrize("gone", [0, 3, 12], ids=["one of several", "of the reference", "the only one of its material"])
-def test_a_task_without_a_touch_is_that_of_a_memory_that_never_had_it(gone):
-    touches = [*(touch("abc"[i % 3], i) for i in range(12)), touch("d", 0)]
-    statistics = statistics_of(touches)
-    task = Task.of(statistics, SCALE, ["a", "d"])
-    less = task.without(*touches[gone])
-    statistics.remove(touches[gone][0], {SCALE: touches[gone][1]})
-    found, expected = less.solve(), Task.of(statistics, SCALE, ["a", "d"]).solve()
-    assert (found.names, found.reference) == (expected.names, expected.reference)
-    probe, every = PROBES[1].astype(float), range(len(found.names))
-    assert found.scores(probe, every, "lda").tobytes() == expected.scores(probe, every, "lda").tobytes()
-    assert found.novelty(probe, every) == expected.novelty(probe, every)
-    assert len(task.solve().names) == 4  # it is as it was
-
-
 def test_a_task_that_is_solved_later_is_of_the_moment_it_was_made():
     touches = [touch("abc"[i % 3], i) for i in range(12)]
     statistics = statistics_of(touches)
@@ -201,34 +184,3 @@ def test_a_task_that_is_solved_later_is_of_the_moment_it_was_made():
         statistics.add(name, {SCALE: rows})
     statistics.remove(touches[0][0], {SCALE: touches[0][1]})
     require_textbook(tasks[0].solve(), touches, PROBES[:2])
-
-
-@pytest.mark.parametrize("offset", [0, 0.9 * EDGE])
-def test_of_many_materials_scores_in_single_precision_are_near_enough(monkeypatch, offset):
-    rng = np.random.default_rng(0)
-    names = [f"{i:03d}" for i in range(300)]
-    statistics = Statistics(64, [SCALE])
-    means, mixing = rng.normal(size=(301, 64)) * 30_000, rng.normal(size=(64, 64))
-
-    def rows_of(place):
-        found = offset + means[place] + rng.normal(size=(2, 64)) @ mixing * 2_000
-        return {SCALE: np.clip(np.rint(found), -EDGE, EDGE).astype(np.int32)}
-
-    for place, name in enumerate(names * 2):
-        statistics.add(name, rows_of(place % 300))
-    double = readout_of(statistics, names[:20])
-    monkeypatch.setattr("scroll_tactile.readouts.task.IN_DOUBLE", 299)
-    single = readout_of(statistics, names[:20])
-    assert (single.near.solved.dtype, single.others[0].solved.dtype) == (np.float64, np.float32)
-    for followed in range(12):
-        probe = rows_of(followed * 25)[SCALE][0].astype(float)
-        for places in (range(300), [7, 150, 299]):
-            expected = double.scores(probe, places, "lda")
-            require_near(single.scores(probe, places, "lda"), expected, 1e-6)
-            distance = double.novelty(probe, places)
-            assert single.novelty(probe, places) == pytest.approx(distance, abs=1e-6 * np.abs(expected).max())
-        own = followed * 25
-        assert single.diagonal_distance(probe, own) == pytest.approx(double.diagonal_distance(probe, own), rel=1e-4)
-        name = ["new", *names][own]
-        statistics.add(name, rows_of(own))
-        double, single = (readout.followed(statistics, [name]) for readout in (double, single))

@@ -97,7 +97,7 @@ def measure_learned(memory: Memory) -> list[Record]:
     truth = truth_of(memory, memory.codes, readout)
     true = truth.answers(evaluated)
     free = truth_of(memory, memory.units, readout)
-    solution = readout.gamma * readout.near.solved.T
+    solution = readout.gamma * readout.solved()[0].T
     weights = solution - solution.mean(axis=1, keepdims=True)
     share = truth.share(len(memory.places), LEAST, LARGEST)
     base = {"case": memory.name, "family": memory.family, "penalty": readout.penalty}

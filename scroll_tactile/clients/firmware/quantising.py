@@ -119,10 +119,10 @@ class _Quantised:
 
     def __init__(self, readout: Readout) -> None:
         self._readout = readout
-        solved, shares = readout.near.solved, readout.shares
+        derived = readout.derived()
         # z about the mean of the scene's materials, for features in 0 … 1.
-        self._weights = readout.gamma * (solved - shares @ solved) * 2.0**BITS
-        self._offsets = -(self._weights @ readout.origin) / 2.0**BITS - readout.derived().towards
+        self._weights = derived.weights * 2.0**BITS
+        self._offsets = -(derived.weights @ (readout.origin + derived.middle))
         largest = float(np.abs(self._weights).max())
         self._unit = 30 if largest == 0 else min(30, math.floor(math.log2((ONE - 1) / largest)))
         self.bits = min(SCORE_BITS, self._unit + 15)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Container, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -297,13 +298,16 @@ def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
     """The model as if it had never observed a touch, nor kept it, but for how it is weighed."""
     own = touch.material, touch.key
     sampled = next(item for *which, item in model.held_out.sample if tuple(which) == own)
-    readouts = dict(model.readouts)
-    for scale, readout in model.readouts.items():
+    statistics, codes = deepcopy(memory.statistics), {}
+    for scale in model.readouts:
         if rows := rows_at(sampled, model.held_out.stages, scale):
             # As many rows as it added: of windows that are learned one by one the sample has the mean.
             times = max(1, round(sampled.pairs[rows[0], 2] / len(rows)))
-            task = Task.of(memory.statistics, scale, readout.reference, model.plan.shrinkage)
-            readouts[scale] = task.without(touch.material, np.repeat(sampled.rows[rows], times, axis=0)).solve()
+            codes[scale] = np.repeat(sampled.rows[rows], times, axis=0)
+    statistics.remove(touch.material, codes, statistics.longest)  # of some length: readouts do not depend on lengths
+    readouts = dict(model.readouts)
+    for scale in codes:
+        readouts[scale] = Task.of(statistics, scale, readouts[scale].reference, model.plan.shrinkage).solve()
     other, matcher, conformal = replace(model, readouts=readouts), model.matcher, model.conformal
     if matcher is None or conformal is None or own not in matcher.kept.touches:
         return other

@@ -6,20 +6,20 @@ leaves the range is clipped to it:
 
     L[y, x] = log((1 − ε) P(clip(x + v + u) = y) + ε / 255),    u uniform in ± a, or normal with a's energy.
 
-Rounded to 2⁻¹⁰ the logarithms are integers: sums of them are the same bytes in any order.
+Rounded to 2⁻¹⁰ the logarithms are integers: sums of them are the same bytes in any order, by C or by numpy.
 """
 
 from __future__ import annotations
 
 import math
-import threading
-from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile import native
 from scroll_tactile.sensors import Sensor
 
 __all__ = ["CLEAN", "LEVELS", "MISSING", "UNIT", "Likelihood", "Noise", "Table", "levels_of", "noise_at"]
@@ -39,7 +39,6 @@ FloatArray = npt.NDArray[np.float64]
 
 _LEVELS = np.arange(float(LEVELS))
 _DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of level y from x, [x, y]
-_BEFORE, _AFTER = np.maximum(np.arange(LEVELS) - 1, 0), np.minimum(np.arange(LEVELS) + 1, LEVELS - 1)
 
 
 def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
@@ -81,6 +80,7 @@ class Table:
     how touches differ.
     """
 
+    noise: Noise
     logs: npt.NDArray[np.int16]
     offset: float
     slope: float
@@ -88,58 +88,34 @@ class Table:
     expected: FloatArray
     information: float
 
+    def log_sums(self, own: LevelArray, others: LevelArray) -> FloatArray:
+        """Sums of L, (others,), over the levels of a touch (C, T) beside each of others (others, C, T)."""
+        own, others = own.ravel(), others.reshape(len(others), own.size)
+        if not native.available:
+            return np.asarray(self.logs.take((own.astype(np.intp) << 8) | others).sum(axis=1, dtype=np.int64) / UNIT)
+        sums = np.empty(len(others), np.int64)
+        native.sum_logs(np.ascontiguousarray(own), np.ascontiguousarray(others), self.logs, sums)
+        return sums / UNIT
+
+    def log_likelihoods(self, own: LevelArray, others: LevelArray) -> FloatArray:
+        """The same, scaled up where some of the others lack values that the touch has."""
+        sums, seen, read = self.log_sums(own, others), own != MISSING, others != MISSING
+        if read.all():
+            return sums
+        both = np.count_nonzero((read & seen).reshape(len(others), own.size), axis=1)
+        return np.asarray(sums * (np.count_nonzero(seen) / np.maximum(both, 1)))
+
 
 class Likelihood:
     """The tables of one set of touches, for any number of threads.
 
     spread: standard deviation of a reading among touches of one material, in levels, for each level; shape (255,).
-    weights: the share of readings at each level, shape (255,).
+    weights: the share of readings at each level, shape (255,). table: of a kind of noise; the latest are kept.
     """
 
     def __init__(self, spread: FloatArray, weights: FloatArray) -> None:
-        self.spread = np.maximum(spread, NARROWEST)
-        self.weights = weights
-        self._tables: OrderedDict[Noise, Table] = OrderedDict()
-        self._lock = threading.Lock()  # of the order of the tables; never held while one is made
-
-    def table(self, noise: Noise) -> Table:
-        """The table of a kind of noise; the latest are kept."""
-        with self._lock:
-            if (found := self._tables.get(noise)) is not None:
-                self._tables.move_to_end(noise)
-                return found
-        found = self._made(noise)
-        with self._lock:
-            self._tables[noise] = found
-            if len(self._tables) > MOST_TABLES:
-                self._tables.popitem(last=False)
-        return found
-
-    def _made(self, noise: Noise) -> Table:
-        reach = noise.amplitude * (LEVELS - 1)
-        below = (_below_normal if noise.normal else _below_uniform)(_DISTANCE, reach, self.spread[:, None])
-        below[:, -1] = 1.0  # what lies beyond an end of the range is read as that end
-        chances = np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)  # P(y | x), [x, y]
-        logs = _logs(chances)
-        whole = np.zeros((256, 256), dtype=np.int16)
-        whole[:LEVELS, :LEVELS] = np.rint(logs * UNIT).T
-        mean = chances @ _LEVELS
-        middle, typical = self.weights @ _LEVELS, self.weights @ mean
-        scatter = float(self.weights @ (_LEVELS - middle) ** 2)
-        slope = float(self.weights @ ((_LEVELS - middle) * (mean - typical))) / scatter if scatter > 0 else 1.0
-        slope = max(slope, 1e-3)
-        # Fisher's 4 Σ (d√P / dx)²: between the levels beside x the sum of squares is 2 − 2 Σ √(P P').
-        roots = np.sqrt(chances)
-        overlap = np.einsum("xy,xy->x", roots[_BEFORE], roots[_AFTER])
-        information = 8 * (1 - overlap) / (_AFTER - _BEFORE) ** 2 * self.spread**2
-        return Table(
-            logs=whole.ravel(),
-            offset=float(typical - slope * middle),
-            slope=slope,
-            mean=mean,
-            expected=np.einsum("xy,xy->x", chances, logs),
-            information=float(self.weights @ information),
-        )
+        self.spread, self.weights = np.maximum(spread, NARROWEST), weights
+        self.table: Callable[[Noise], Table] = lru_cache(MOST_TABLES)(partial(_table, self.spread, weights))
 
     @cached_property
     def by_amplitude(self) -> npt.NDArray[np.float32]:
@@ -157,6 +133,33 @@ class Likelihood:
         found[0, :LEVELS] = _logs(np.maximum(np.diff(below, axis=0), 0.0))
         found[1, :LEVELS] = _logs(np.maximum(1 - below[:LEVELS], 0.0))
         return found.reshape(512, -1)
+
+
+def _table(spread: FloatArray, weights: FloatArray, noise: Noise) -> Table:
+    below = (_below_normal if noise.normal else _below_uniform)(
+        _DISTANCE, noise.amplitude * (LEVELS - 1), spread[:, None]
+    )
+    below[:, -1] = 1.0  # what lies beyond an end of the range is read as that end
+    chances = np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)  # P(y | x), [x, y]
+    logs = _logs(chances)
+    whole = np.zeros((256, 256), dtype=np.int16)
+    whole[:LEVELS, :LEVELS] = np.rint(logs * UNIT).T
+    mean = chances @ _LEVELS
+    middle, typical = weights @ _LEVELS, weights @ mean
+    scatter = float(weights @ (_LEVELS - middle) ** 2)
+    slope = float(weights @ ((_LEVELS - middle) * (mean - typical))) / scatter if scatter > 0 else 1.0
+    slope = max(slope, 1e-3)
+    slopes = np.gradient(np.sqrt(chances), axis=0)
+    information = 4 * np.einsum("xy,xy->x", slopes, slopes) * spread**2  # Fisher's 4 Σ (d√P / dx)²
+    return Table(
+        noise=noise,
+        logs=whole.ravel(),
+        offset=float(typical - slope * middle),
+        slope=slope,
+        mean=mean,
+        expected=np.einsum("xy,xy->x", chances, logs),
+        information=float(weights @ information),
+    )
 
 
 def noise_at(column: int) -> Noise:

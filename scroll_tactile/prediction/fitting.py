@@ -16,11 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import KeptArrays, at_places
+from scroll_tactile.matching.kept_arrays import KeptTouch, at_places
 from scroll_tactile.matching.likelihood import CLEAN
-from scroll_tactile.matching.match import KeptTouch, Match, independent
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import Match, TouchMatcher, independent
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
@@ -31,9 +29,7 @@ from scroll_tactile.prediction.model import (
     Row,
     Trajectories,
     Weighing,
-    followed_to,
     held_out_of,
-    match_scores,
     neighbours_of,
     tempered,
 )
@@ -136,7 +132,9 @@ class Draft:
         with one_thread():
             # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
-            matcher, conformal = self._matched()
+            # What an earlier model made of kept touches is not made again.
+            before = None if self.before is None else self.before.matcher
+            matcher = TouchMatcher.of(self.kept, before) if self.kept else None
         give_back_scratch()
         return Model(
             kind=self.kind,
@@ -147,20 +145,8 @@ class Draft:
             readouts=readouts,
             weighing=None,
             matcher=matcher,
-            conformal=conformal,
             longest=self.longest,
         )
-
-    def _matched(self) -> tuple[TouchMatcher | None, Conformal | None]:
-        """What touches are matched by, where any are kept; what an earlier model made of them is not made again."""
-        if not self.kept:
-            return None, None
-        before = self.before
-        if before is None or before.matcher is None or before.conformal is None:
-            return TouchMatcher.of(KeptArrays.of(self.kept)), Conformal.of(self.kept)
-        followed = followed_to(before.matcher.kept, before.conformal, self.kept)
-        assert followed is not None  # some are kept
-        return TouchMatcher.of(followed[0]), followed[1]
 
 
 def _weighed(draft: Draft, model: Model) -> Weighing | None:
@@ -250,7 +236,7 @@ def _by_kept_touches(weighing: Weighing, matcher: TouchMatcher) -> tuple[Weighin
     losses = np.full((len(found), len(early)), np.nan)
     for of, each in zip(losses, found, strict=True):
         reached = [steps for steps in early if steps < each.query.columns]
-        of[: len(reached)] = matcher.excess_at(each, reached)
+        of[: len(reached)] = each.excess_at(reached)
     whole = np.array([match.excess_loss for match in matches])
 
     def weighed(row: Row, loss: FloatArray) -> Row:
@@ -320,7 +306,7 @@ def rehearse(model: Model) -> None:
                 elif place in chosen:
                     kept = chosen[place]
                     match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept, noise=CLEAN)
-                    fused = weighing.fused("prefix", own, match, match_scores(matcher, names, match), 0.0)
+                    fused = weighing.fused("prefix", own, match, matcher.scores_of(names, match), 0.0)
                     answered = tempered(fused, row.outliers)
                 else:
                     continue
@@ -397,7 +383,7 @@ def _measured_paces(
         high = float(novelties[rank]) / max(row.calibration.thresholds.above("", 1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
         for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
-            scores = match_scores(matcher, held.names, match)
+            scores = matcher.scores_of(held.names, match)
             logs.append(np.log(weighing.fused("paced", chances, match, scores, distance) + TINY))
         targets += held.targets.tolist()
     natural = np.vstack([row.calibration.scale_novelty, row.excess])

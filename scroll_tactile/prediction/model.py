@@ -17,10 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
-from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import KeptArrays
-from scroll_tactile.matching.match import KeptTouch, Match
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import Match, TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.readouts.calibration import TINY, Calibration, Neighbours
 from scroll_tactile.readouts.dependence import Dependence
@@ -41,9 +38,7 @@ __all__ = [
     "Trajectories",
     "Weighing",
     "enough_memory",
-    "followed_to",
     "held_out_of",
-    "match_scores",
     "neighbours_of",
     "softmax",
     "tempered",
@@ -226,8 +221,8 @@ class Model:
 
     names: the materials, in alphabetical order; known: the same names, as a set; sampled: those with a sampled touch.
     stages: for each, the windows that judge there. views: the views that judge beside them. readouts: scale → its
-    readout. weighing: None where nothing was learned. matcher, conformal: of the kept touches. longest: the longest
-    learned touch, in steps. since: the touches that were sampled since the fit.
+    readout. weighing: None where nothing was learned. matcher: of the kept touches. longest: the longest learned touch,
+    in steps. since: the touches that were sampled since the fit.
     """
 
     kind: ReadoutName
@@ -238,7 +233,6 @@ class Model:
     readouts: dict[Scale, Readout]
     weighing: Weighing | None
     matcher: TouchMatcher | None
-    conformal: Conformal | None
     longest: int
     since: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
     known: frozenset[str] = field(init=False)
@@ -286,18 +280,17 @@ class Model:
             if (own := readout.followed(memory.statistics, changed)) is None:
                 return None
             readouts[scale] = own
-        matcher, conformal = self.matcher, self.conformal
-        if matcher is not None and conformal is not None and memory.kept is not None:
-            if (kept := followed_to(matcher.kept, conformal, memory.kept.touches())) is None:
+        matcher = self.matcher
+        if matcher is not None and memory.kept is not None:
+            if not (kept := memory.kept.touches()):
                 return None
-            matcher, conformal = matcher.followed(kept[0]), kept[1]
+            matcher = matcher.followed(kept)
         statistics, there = memory.statistics, {(material, key) for material, key, _ in self.fitted.sample}
         return replace(
             self,
             names=list(statistics.materials),
             readouts=readouts,
             matcher=matcher,
-            conformal=conformal,
             longest=statistics.longest,
             since=[(material, key, touch) for material, key, touch in memory.sample if (material, key) not in there],
         )
@@ -418,21 +411,6 @@ class Model:
         return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
 
 
-def followed_to(
-    arrays: KeptArrays, conformal: Conformal, kept: Sequence[KeptTouch]
-) -> tuple[KeptArrays, Conformal] | None:
-    """What is made of kept touches, for those that are kept now; None where there are none."""
-    there, now = set(arrays.touches), {(touch.material, touch.key) for touch in kept}
-    if there == now:
-        return arrays, conformal
-    added, removed = [touch for touch in kept if (touch.material, touch.key) not in there], there - now
-    if (followed := arrays.followed(added, removed)) is None:
-        return None
-    if followed.longest != arrays.longest:
-        return followed, Conformal.of(kept)
-    return followed, conformal.followed(added, removed)
-
-
 def held_out_of(model: Model, sample: Sampled) -> dict[Scale, HeldOutScores]:
     """Each scale's scores of sampled touches, each held out of its readout."""
     return {scale: held_out_scores(own, sample, model.viewed, model.kind) for scale, own in model.readouts.items()}
@@ -450,12 +428,6 @@ def neighbours_of(
         if (stage, scale) not in made:
             made[stage, scale] = Neighbours(model.readouts[scale], sample, model.viewed, stage)
     return [made[stage, scale] for scale in windows]
-
-
-def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:
-    """The kept touches' scores of some materials, (C,); the least of all for materials of which none is kept."""
-    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(match.scores.min())
-    return np.array([match.scores[places[name]] if name in places else least for name in names])
 
 
 def tempered(chances: FloatArray, outliers: float) -> FloatArray:

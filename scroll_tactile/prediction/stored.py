@@ -16,8 +16,7 @@ import numpy as np
 
 from scroll_tactile import __version__
 from scroll_tactile.matching.likelihood import LEVELS, Likelihood
-from scroll_tactile.matching.match import NaturalDeviation
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import NaturalDeviation
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.model import Model, Row, Weighing
 from scroll_tactile.signals.windows import Scale, measuring
@@ -64,7 +63,7 @@ def read_weighing(text: str, model: Model, memory: Memory) -> Model:
             tables = Likelihood(_numbers(spread, (LEVELS,)), _numbers(weights, (LEVELS,)))
             coherence, energy, most = _numbers(natural, (3,)).tolist()
             _require(min(*spread, *weights, *natural) > 0, "numbers above 0")
-            matcher = TouchMatcher(matcher.kept, NaturalDeviation(tables, coherence, energy, most))
+            matcher = replace(matcher, deviation=NaturalDeviation(tables, coherence, energy, most))
     except (KeyError, TypeError, IndexError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(f"it is no weighing ({type(error).__name__}: {error})") from error
     return replace(model, weighing=weighing, matcher=matcher)

@@ -12,6 +12,7 @@ from scroll_tactile.matching.likelihood import (
     UNIT,
     Likelihood,
     Noise,
+    _table,
     levels_of,
     noise_at,
 )
@@ -61,9 +62,10 @@ def test_noise_hides_how_touches_differ(likelihood):
     assert information[-1] < 0.01
 
 
-def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):
-    make, made = Likelihood._made, []
-    monkeypatch.setattr(Likelihood, "_made", lambda self, noise: made.append(noise) or make(self, noise))
+def test_only_the_latest_tables_are_kept(monkeypatch):
+    make, made = _table, []
+    monkeypatch.setattr("scroll_tactile.matching.likelihood._table", lambda *of: made.append(of[-1]) or make(*of))
+    likelihood = Likelihood(np.full(LEVELS, 3.0), np.full(LEVELS, 1 / LEVELS))
     first = likelihood.table(Noise(0)).logs
     for step in range(1, MOST_TABLES + 2):
         likelihood.table(Noise(step))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,13 +113,13 @@ class KeptArrays:
         made, parts = dict[tuple[str, bytes], int](), list[_Parts]()
         if before is not None and before.longest == self.longest:
             made, parts = dict(before.touches), [before.parts]
-        new = dict[int, list[int]]()  # length → rows
-        for row, name in enumerate(names):
-            if name not in made:
-                new.setdefault(self._levels[row].shape[1], []).append(row)
-        for rows in new.values():
-            parts.append(_Parts.of(np.stack([self._levels[row] for row in rows]), *edges))
-            made |= {names[row]: len(made) + i for i, row in enumerate(rows)}
+
+        def length(row: int) -> int:
+            return self._levels[row].shape[1]
+
+        new = sorted((row for row, name in enumerate(names) if name not in made), key=length)
+        parts += [_Parts.of(np.stack([self._levels[row] for row in rows]), *edges) for _, rows in groupby(new, length)]
+        made |= {names[row]: len(made) + i for i, row in enumerate(new)}
         order = [made[name] for name in names]
         self.parts = _Parts(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
         self.columns = self.parts.columns
@@ -153,12 +154,11 @@ class KeptArrays:
         wide = [Blocks(*_block_means(levels, self._wide), self.parts.wide)] if len(near.means) >= ENOUGH else []
         return [*wide, near]
 
-    def beginnings(self, rows: Iterable[int], columns: int) -> LevelArray:
+    def beginnings(self, rows: Sequence[int] | Rows, columns: int) -> LevelArray:
         """The levels of some touches up to a column one below the other, (rows, C, columns)."""
-        kept = [self._levels[row][:, :columns] for row in rows]
-        found = np.full((len(kept), self.channels, columns), MISSING, dtype=np.uint8)
-        for levels, into in zip(kept, found, strict=True):
-            into[:, : levels.shape[1]] = levels
+        found = np.full((len(rows), self.channels, columns), MISSING, dtype=np.uint8)
+        for row, into in zip(rows, found, strict=True):
+            into[:, : self.columns[row]] = self._levels[row][:, :columns]
         return found
 
     def at_shares(self, rows: Rows, shares: FloatArray) -> LevelArray:
@@ -169,16 +169,14 @@ class KeptArrays:
             found[same] = at_places(self.beginnings(rows[same], length), shares * (length - 1))
         return found
 
-    def nearest_alike(self, row: int) -> tuple[LevelArray, LevelArray] | None:
-        """The levels of a touch and of the nearest other one of its material; None where there is no other."""
+    def nearest_alike(self, row: int) -> int | None:
+        """The row of the nearest other touch of the material of one; None where there is no other."""
         others = np.flatnonzero((self.labels == self.labels[row]) & (np.arange(len(self)) != row))
         if not len(others):
             return None
         blocks = self.parts.fine.reshape(len(self), -1)
         guess = QUARTERS * blocks[row][None].astype(np.int16)
-        far = mean_distances(blocks[others], guess, blocks[row] != MISSING)[:, 0]
-        own, other = self.beginnings([row, int(others[np.argmin(far)])], self.longest)
-        return own, other
+        return int(others[mean_distances(blocks[others], guess, blocks[row] != MISSING).argmin()])
 
 
 def _edges(longest: int, channels: int) -> tuple[Rows, Rows, Rows]:
@@ -206,9 +204,9 @@ def mean_distances(rows: LevelArray, guesses: npt.NDArray[np.int16], known: Know
 
 
 def log_steps(levels: LevelArray, edges: Rows) -> tuple[Steps, Steps]:
-    """Means of the blocks of touches (n, C, T) between edges, log(1 + level) in whole STEPS, (n, B, C); NaN where
+    """Block means of touches (n, C, T) in STEPS of log(1 + level), (n, B, C), and the sums of squares so far, (n, B).
 
-    nothing was read. And the sums of their squares up to each block, (n, B).
+    NaN where nothing was read.
     """
     coded = _coded(levels, edges, lambda means: np.rint(np.log1p(means) * (STEPS / np.log(LEVELS))))
     steps = np.where(coded == MISSING, np.nan, coded).astype(np.float32)

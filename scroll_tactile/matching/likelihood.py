@@ -44,11 +44,9 @@ _DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of lev
 def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
     """Readings in the sensor's unit, shape (T, C), as levels, shape (C, T); NaN is MISSING, the rest is clipped."""
     low, high = (limit.astype(np.float64) for limit in sensor.limits)
-    share = (np.asarray(readings, dtype=np.float64) - low) / (high - low)
-    unread = np.isnan(share)
-    levels = np.rint(np.clip(np.where(unread, 0.0, share), 0.0, 1.0) * (LEVELS - 1)).astype(np.uint8)
-    levels[unread] = MISSING
-    return np.ascontiguousarray(levels.T)
+    share = np.clip((np.asarray(readings, dtype=np.float64) - low) / (high - low), 0.0, 1.0)
+    levels = np.where(np.isnan(share), MISSING, np.rint(share * (LEVELS - 1)))
+    return np.ascontiguousarray(levels.T.astype(np.uint8))
 
 
 @dataclass(frozen=True)
@@ -129,37 +127,24 @@ class Likelihood:
         reach = np.array([Noise(step).amplitude for step in range(AMPLITUDES)]) * (LEVELS - 1)
         spread = float(self.weights @ self.spread)
         below = np.hstack([_below_uniform(lower, reach, spread), _below_normal(lower, reach, spread)])
-        found = np.zeros((2, 256, 2 * AMPLITUDES), np.float32)
-        found[0, :LEVELS] = _logs(np.maximum(np.diff(below, axis=0), 0.0))
-        found[1, :LEVELS] = _logs(np.maximum(1 - below[:LEVELS], 0.0))
-        return found.reshape(512, -1)
+        logs = _logs(np.stack([np.diff(below, axis=0), 1 - below[:LEVELS]]))
+        return np.pad(logs.astype(np.float32), ((0, 0), (0, 1), (0, 0))).reshape(512, -1)
 
 
 def _table(spread: FloatArray, weights: FloatArray, noise: Noise) -> Table:
-    below = (_below_normal if noise.normal else _below_uniform)(
-        _DISTANCE, noise.amplitude * (LEVELS - 1), spread[:, None]
-    )
+    below_of, reach = _below_normal if noise.normal else _below_uniform, noise.amplitude * (LEVELS - 1)
+    below = below_of(_DISTANCE, reach, spread[:, None])
     below[:, -1] = 1.0  # what lies beyond an end of the range is read as that end
     chances = np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)  # P(y | x), [x, y]
-    logs = _logs(chances)
-    whole = np.zeros((256, 256), dtype=np.int16)
-    whole[:LEVELS, :LEVELS] = np.rint(logs * UNIT).T
-    mean = chances @ _LEVELS
+    logs, mean = _logs(chances), chances @ _LEVELS
+    whole = np.pad(np.rint(logs.T * UNIT).astype(np.int16), (0, 1))
     middle, typical = weights @ _LEVELS, weights @ mean
-    scatter = float(weights @ (_LEVELS - middle) ** 2)
-    slope = float(weights @ ((_LEVELS - middle) * (mean - typical))) / scatter if scatter > 0 else 1.0
-    slope = max(slope, 1e-3)
+    together, scatter = weights @ ((_LEVELS - middle) * (mean - typical)), weights @ (_LEVELS - middle) ** 2
+    slope = max(float(together) / float(scatter), 1e-3)
     slopes = np.gradient(np.sqrt(chances), axis=0)
     information = 4 * np.einsum("xy,xy->x", slopes, slopes) * spread**2  # Fisher's 4 Σ (d√P / dx)²
-    return Table(
-        noise=noise,
-        logs=whole.ravel(),
-        offset=float(typical - slope * middle),
-        slope=slope,
-        mean=mean,
-        expected=np.einsum("xy,xy->x", chances, logs),
-        information=float(weights @ information),
-    )
+    offset, expected = float(typical - slope * middle), np.einsum("xy,xy->x", chances, logs)
+    return Table(noise, whole.ravel(), offset, slope, mean, expected, float(weights @ information))
 
 
 def noise_at(column: int) -> Noise:
@@ -168,8 +153,8 @@ def noise_at(column: int) -> Noise:
 
 
 def _logs(chances: FloatArray) -> FloatArray:
-    """L of P(y | x); see above."""
-    return np.asarray(np.log((1 - FLOOR) * chances + FLOOR / LEVELS))
+    """L of P(y | x), or of what rounding left below 0; see above."""
+    return np.asarray(np.log((1 - FLOOR) * np.maximum(chances, 0.0) + FLOOR / LEVELS))
 
 
 def _below_normal(away: FloatArray, reach: FloatArray | float, spread: FloatArray | float) -> FloatArray:
@@ -183,11 +168,9 @@ def _below_uniform(away: FloatArray, reach: FloatArray | float, spread: FloatArr
         return _below_normal(away, 0.0, spread)
     blurred = np.hypot(spread, BLUR * np.asarray(reach))
 
-    def integral(z: FloatArray) -> FloatArray:  # of Φ, up to z
-        below, density = _normal(z)
-        return z * below + density
-
-    return np.asarray((integral((away + reach) / blurred) - integral((away - reach) / blurred)) * blurred / (2 * reach))
+    least, most = (away - reach) / blurred, (away + reach) / blurred
+    (low, at_least), (high, at_most) = _normal(least), _normal(most)  # Φ and φ: the integral of Φ up to z is z Φ + φ
+    return np.asarray(((most * high + at_most) - (least * low + at_least)) * blurred / (2 * reach))
 
 
 def _normal(z: FloatArray) -> tuple[FloatArray, FloatArray]:

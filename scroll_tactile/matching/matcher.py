@@ -8,8 +8,6 @@ The sum is over all values that were read. A channel that never changes, where h
 long, is stuck: it says nothing and is left out, as are values that are missing. Beside the kept touches of a material
 stand blends of those that are likely: what is felt lies between them. A touch is compared with the prefixes of kept
 ones, in their own time, or with the whole of each brought to its length: made at another speed, it has another length.
-
-All is a function of the set of kept touches, in any order.
 """
 
 from __future__ import annotations
@@ -51,10 +49,9 @@ PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardl
 class NaturalDeviation:
     """How touches of one material deviate from each other in a set of kept touches.
 
-    likelihood: its tables. coherence: how much larger the deviation of a channel's mean from a kept touch's
-    is, squared and times T, than that of a value; 1 for independent noise. energy: of independent
-    noise that is even odds to be natural, in squared levels. most: the energy of a deviation that 19 of 20 stay below,
-    in squared levels; infinite where too few touches are kept to say.
+    likelihood: its tables. coherence: how much larger the deviation of a channel's mean is, squared and times T, than
+    that of a value; 1 for independent noise. energy: of independent noise that is even odds to be natural, in squared
+    levels. most: the energy of a deviation that 19 of 20 stay below; infinite where too few touches are kept to say.
     """
 
     likelihood: Likelihood
@@ -129,15 +126,12 @@ class Beside:
 class Match:
     """A touch beside kept touches.
 
-    scores: log-likelihood of each material, in the order of `KeptArrays.materials`, shape (M,).
-    information: Fisher's information on the values that were read, through the noise, in units of the natural spread;
-    about 1 of a clean touch as long as the longest kept one.
-    noise: what most likely came over it. stuck: the channels that never change, shape (C,).
-    expected: levels of all values by the kept touches, shape (C, T); NaN where none of them reaches.
-    energy, coherence: of the touch's deviation from the likeliest kept one; see `NaturalDeviation`.
-    noise_share: in [0, 1], how much of that deviation is independent noise beyond the natural.
-    moved: whether the touch deviates more than touches do, and at least half of that is its channels' zeros, which
-    may drift.
+    scores: log-likelihood of each material, in the order of `KeptArrays.materials`, (M,). information: Fisher's on the
+    values that were read, in units of the natural spread; about 1 of a clean touch as long as the longest kept one.
+    noise: what most likely came over it. stuck: the channels that never change, (C,). expected: levels of all values by
+    the kept touches, (C, T); NaN where none of them reaches. energy, coherence: of the touch's deviation from the
+    likeliest kept one. noise_share: in [0, 1], how much of that is independent noise beyond the natural. moved: whether
+    it deviates more than touches do, and at least half of that is its channels' zeros, which may drift.
     log_likelihood_gain: the log-likelihood per value less the negative entropy of the touch's own values; not above 0
     where nothing that is kept explains the touch. excess_loss: the negative log-likelihood per value less the expected
     one of a touch of the set.
@@ -181,11 +175,9 @@ class TouchMatcher:
         before: a matcher of other touches; what it has of these is not made again. Raises InputError for no touch, and
         for touches of different channels.
         """
-        if before is not None:
-            followed = before.followed(touches)
-            return replace(followed, deviation=NaturalDeviation(_likelihood(followed.kept), *ASSUMED))
-        kept = KeptArrays(touches)
-        return cls(kept, Conformal(kept), NaturalDeviation(_likelihood(kept), *ASSUMED))
+        kept = KeptArrays(touches, before and before.kept)
+        conformal = Conformal(kept, before and before.conformal)
+        return cls(kept, conformal, NaturalDeviation(_likelihood(kept), *ASSUMED))
 
     def followed(self, touches: Sequence[KeptTouch]) -> TouchMatcher:
         """Another, of other touches, with the same deviation. Raises InputError as `of`."""
@@ -244,11 +236,9 @@ class TouchMatcher:
         """What the nearest kept touches say of a touch."""
         query, table, natural = beside.query, beside.table, self.deviation
         scores, expected = self._scores(beside)
-        deviation, seen = np.zeros(query.levels.shape), np.zeros_like(query.seen)
-        if len(beside.rows):
-            best = beside.others[beside.logs.argmax()]
-            seen = query.seen & (best != MISSING)
-            deviation[seen] = query.levels[seen] - table.mean[best[seen]]
+        best = beside.others[beside.logs.argmax()] if len(beside.rows) else np.full_like(query.levels, MISSING)
+        seen = query.seen & (best != MISSING)
+        deviation = np.where(seen, query.levels - table.mean.take(best, mode="clip"), 0.0)
         energy, coherence, of_zeros = _shape(deviation, seen)
         noise = independent(energy, coherence, natural.coherence) if np.isfinite(natural.most) else 0.0
         return Match(
@@ -287,23 +277,19 @@ class TouchMatcher:
 
     def _likeliest_noise(self, query: Query, rows: Rows) -> Noise:
         """The noise under which one of some kept touches is likeliest, by a histogram of how far its values lie."""
-        own, likelihood = query.levels[query.seen], self.deviation.likelihood
-        if not len(rows) or not len(own):
+        own, others, likelihood = query.levels, self._others(rows, query), self.deviation.likelihood
+        if not len(rows) or not query.values:
             return CLEAN
-        others = self._others(rows, query)[:, query.seen]
-        places = np.where(others == MISSING, LEVELS, np.abs(own.astype(np.int16) - others))
-        places += (256 * ((own == 0) | (own == LEVELS - 1))).astype(np.int16)
-        counts = np.stack([np.bincount(row, minlength=512) for row in places])
-        both = len(own) - counts[:, [LEVELS, 256 + LEVELS]].sum(axis=1, keepdims=True)
-        logs = (counts * (len(own) / np.maximum(both, 1))).astype(np.float32) @ likelihood.by_amplitude
+        away = np.where(query.seen & (others != MISSING), np.abs(own.astype(np.int16) - others), LEVELS)
+        places = away + 256 * ((own == 0) | (own == LEVELS - 1))
+        counts = np.stack([np.bincount(each.ravel(), minlength=512) for each in places])
+        both = own.size - counts[:, [LEVELS, 256 + LEVELS]].sum(axis=1, keepdims=True)
+        logs = (counts * (query.values / np.maximum(both, 1))).astype(np.float32) @ likelihood.by_amplitude
         best, clean = int(logs.max(axis=0).argmax()), likelihood.table(CLEAN).log_likelihoods(own, others).max()
         return noise_at(best) if logs[:, best].max() > clean else CLEAN
 
     def _scores(self, beside: Beside) -> tuple[FloatArray, npt.NDArray[np.float32]]:
-        """The best log-likelihood of each material, by its kept touches or blends, the least where it has none; and
-
-        what is expected of all values, (C, T).
-        """
+        """`scores`, by kept touches and blends, the least where a material has none; and `expected`; see `Match`."""
         query, logs, materials = beside.query, beside.logs, len(self.kept.materials)
         expected = np.full((len(query.levels), query.columns), np.nan, np.float32)
         if not len(logs):
@@ -368,9 +354,9 @@ def _likelihood(kept: KeptArrays) -> Likelihood:
     """
     counts, deviations = np.zeros(LEVELS), np.zeros(LEVELS)
     for row in range(0, len(kept), -(-len(kept) // PAIRS)):  # the rows are in the order of keys: at random
-        if (pair := kept.nearest_alike(row)) is not None:
-            both = (pair[0] != MISSING) & (pair[1] != MISSING)
-            mine, near = (levels[both].astype(np.int64) for levels in pair)
+        if (other := kept.nearest_alike(row)) is not None:
+            pair = kept.beginnings([row, other], kept.longest)
+            mine, near = pair[:, (pair != MISSING).all(axis=0)].astype(np.int64)
             counts += np.bincount(near, minlength=LEVELS)
             deviations += np.bincount(near, np.abs(mine - near), minlength=LEVELS)
     levels = np.arange(LEVELS)

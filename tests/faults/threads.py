@@ -485,9 +485,7 @@ def short_fits() -> Iterator[None]:
     of_one = Likelihood(np.full(LEVELS, 4.0), np.full(LEVELS, 1 / LEVELS))
     with ExitStack() as patched:
         patched.enter_context(patch.object(scroll_tactile.prediction.fitting, "MOST_HELD_OUT", TAKEN_OUT))
-        patched.enter_context(
-            patch("scroll_tactile.matching.likelihood._table", lambda *of: of_one.table(of[-1]))
-        )
+        patched.enter_context(patch("scroll_tactile.matching.likelihood._table", lambda *of: of_one.table(of[-1])))
         yield
 
 

@@ -18,6 +18,7 @@ are whole numbers, and sums of their squares are exact: any order gives the same
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +29,6 @@ from scroll_tactile.matching.likelihood import LevelArray
 __all__ = ["Conformal"]
 
 FloatArray = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.intp]
 Steps = npt.NDArray[np.float32]
 
 AT_ONCE = 128  # touches: of their distances from a thousand a step takes 1 MB
@@ -72,10 +72,7 @@ class Conformal:
         (own, other), far, labels = self._near[reach][:, as_long], far[as_long], kept.labels[as_long]
         as_own = _nonconformity(np.minimum(own, far), other)  # α of each, if x is of its material
         as_other = _nonconformity(own, np.minimum(other, far))  # and if x is of another
-
-        def of_each(rows: Rows) -> Rows:
-            return np.bincount(rows, minlength=count)
-
+        of_each = partial(np.bincount, minlength=count)
         at_least, of = of_each(labels[as_own >= asked[labels]]) + 1, of_each(labels) + 1
         others = len(labels) - np.searchsorted(np.sort(as_other), asked) - of_each(labels[as_other >= asked[labels]])
         every = len(labels) + 1

@@ -64,7 +64,7 @@ class _Parts(NamedTuple):
     def of(cls, levels: LevelArray, fine: Rows, wide: Rows, early: Rows) -> _Parts:
         """Those of touches of one length, (touches, C, T): together they take a third of the time of one by one."""
         columns = levels.shape[2]
-        blocks = [_coded(levels, edges) for edges in (fine, wide, wide * columns // wide[-1])]
+        blocks = _coded(levels, fine), _coded(levels, wide), _coded(levels, wide * columns // wide[-1])
         return cls(*blocks, *log_steps(levels, early), np.full(len(levels), columns), first_changes(levels))
 
 
@@ -80,10 +80,7 @@ class Blocks:
     kept: LevelArray
 
     def distances(self, tables: Sequence[Table], rows: Rows) -> FloatArray:
-        """Mean squared distances of kept touches from the touch before each noise, (rows, tables), over what both have.
-
-        In whole numbers of quarters of a level, divided once: the same on every machine.
-        """
+        """Mean squared distances of kept touches from the touch before each noise, (rows, tables)."""
         guesses = np.stack([(self.means - table.offset) / table.slope for table in tables]).reshape(len(tables), -1)
         steps = np.rint(np.clip(guesses, *GUESSED) * QUARTERS).astype(np.int16)
         kept = self.kept[rows, : len(self.means)].reshape(len(rows), self.means.size)
@@ -108,20 +105,18 @@ class KeptArrays:
             raise InputError("expected kept touches, one or more, all of the same number of channels")
         names, self._levels = [(touch.material, touch.key) for touch in kept], [touch.levels for touch in kept]
         self.touches = {name: row for row, name in enumerate(names)}
-        self.channels, self.longest = len(self._levels[0]), max(levels.shape[1] for levels in self._levels)
+        lengths = [levels.shape[1] for levels in self._levels]
+        self.channels, self.longest = len(self._levels[0]), max(lengths)
         self._fine, self._wide, self.early = edges = _edges(self.longest, self.channels)
         made, parts = dict[tuple[str, bytes], int](), list[_Parts]()
         if before is not None and before.longest == self.longest:
             made, parts = dict(before.touches), [before.parts]
-
-        def length(row: int) -> int:
-            return self._levels[row].shape[1]
-
-        new = sorted((row for row, name in enumerate(names) if name not in made), key=length)
-        parts += [_Parts.of(np.stack([self._levels[row] for row in rows]), *edges) for _, rows in groupby(new, length)]
+        new = sorted((row for row, name in enumerate(names) if name not in made), key=lengths.__getitem__)
+        for _, rows in groupby(new, lengths.__getitem__):
+            parts.append(_Parts.of(np.stack([self._levels[row] for row in rows]), *edges))
         made |= {names[row]: len(made) + i for i, row in enumerate(new)}
         order = [made[name] for name in names]
-        self.parts = _Parts(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
+        self.parts: _Parts = _Parts(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
         self.columns = self.parts.columns
         self.materials = sorted({material for material, _ in names})
         self._places = {name: i for i, name in enumerate(self.materials)}
@@ -143,10 +138,7 @@ class KeptArrays:
         return np.concatenate([values, [other]])[[self._places.get(name, -1) for name in names]]
 
     def blocks(self, levels: LevelArray, whole: bool) -> list[Blocks]:
-        """A touch's blocks beside those of the kept ones, the wider ones first.
-
-        whole: beside the whole of each, and not beside prefixes; then there are wide blocks only.
-        """
+        """A touch's blocks beside those of kept prefixes, the wider first; or wide ones beside those of whole ones."""
         if whole:
             edges = self._wide * levels.shape[1] // self.longest
             return [Blocks(*_block_means(levels, edges), self.parts.relative)]
@@ -204,10 +196,7 @@ def mean_distances(rows: LevelArray, guesses: npt.NDArray[np.int16], known: Know
 
 
 def log_steps(levels: LevelArray, edges: Rows) -> tuple[Steps, Steps]:
-    """Block means of touches (n, C, T) in STEPS of log(1 + level), (n, B, C), and the sums of squares so far, (n, B).
-
-    NaN where nothing was read.
-    """
+    """Block means (n, B, C) in STEPS of log(1 + level), NaN where nothing was read; sums of squares so far, (n, B)."""
     coded = _coded(levels, edges, lambda means: np.rint(np.log1p(means) * (STEPS / np.log(LEVELS))))
     steps = np.where(coded == MISSING, np.nan, coded).astype(np.float32)
     return steps, np.square(steps).sum(axis=2).cumsum(axis=1)
@@ -222,10 +211,7 @@ def _coded(levels: LevelArray, edges: Rows, code: Callable[[FloatArray], FloatAr
 
 
 def _block_means(levels: LevelArray, edges: Rows) -> tuple[FloatArray, Known]:
-    """Means of the blocks of touches (…, C, T) between edges, (…, B, C), 0 where nothing was read; and what was.
-
-    Of the blocks that begin before the touches end.
-    """
+    """Means of the blocks that begin before touches (…, C, T) end, (…, B, C), 0 where nothing was read; what was."""
     seen, first = levels != MISSING, edges[:-1][edges[:-1] < levels.shape[-1]]
     if seen.all():
         sums = np.add.reduceat(levels, first, axis=-1, dtype=np.int32)

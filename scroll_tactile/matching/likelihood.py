@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scroll_tactile import native
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["CLEAN", "LEVELS", "MISSING", "UNIT", "Likelihood", "Noise", "Table", "levels_of", "noise_at"]
+__all__ = ["CLEAN", "LEVELS", "MISSING", "NOISES", "UNIT", "Likelihood", "Noise", "Table", "levels_of"]
 
 LEVELS = 255
 MISSING = 255  # the level of a value that was not read; it has a likelihood of 1 beside any other
@@ -51,10 +51,7 @@ def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
 
 @dataclass(frozen=True)
 class Noise:
-    """What came over a touch: independent noise on every value.
-
-    step: of the amplitude, below AMPLITUDES; −1 is no noise. normal: whether it is normal, and not uniform.
-    """
+    """Independent noise on every value. step: of its amplitude; −1 is no noise. normal: and not uniform."""
 
     step: int = -1
     normal: bool = False
@@ -66,6 +63,7 @@ class Noise:
 
 
 CLEAN = Noise()
+NOISES = [Noise(step, normal) for normal in (False, True) for step in range(AMPLITUDES)]
 
 
 @dataclass(frozen=True)
@@ -117,14 +115,13 @@ class Likelihood:
 
     @cached_property
     def by_amplitude(self) -> npt.NDArray[np.float32]:
-        """L by how far a value lies from what was kept, under each noise; of the mean spread, (512, 2 · AMPLITUDES).
+        """L by how far a value lies from what was kept, under each of NOISES; of the mean spread, (512, noises).
 
         Row d: of a value within the range that is d levels away. Row 256 + d: of one at an end of the range, where what
-        was kept is d levels within. Columns: uniform noise by amplitude, then normal noise; see `noise_at`. Rows 255
-        and 511 are 0: one of the two was not read.
+        was kept is d levels within. Rows 255 and 511 are 0: one of the two was not read.
         """
         lower = np.arange(LEVELS + 1, dtype=np.float64)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
-        reach = np.array([Noise(step).amplitude for step in range(AMPLITUDES)]) * (LEVELS - 1)
+        reach = np.array([noise.amplitude for noise in NOISES[:AMPLITUDES]]) * (LEVELS - 1)
         spread = float(self.weights @ self.spread)
         below = np.hstack([_below_uniform(lower, reach, spread), _below_normal(lower, reach, spread)])
         logs = _logs(np.stack([np.diff(below, axis=0), 1 - below[:LEVELS]]))
@@ -145,11 +142,6 @@ def _table(spread: FloatArray, weights: FloatArray, noise: Noise) -> Table:
     information = 4 * np.einsum("xy,xy->x", slopes, slopes) * spread**2  # Fisher's 4 Σ (d√P / dx)²
     offset, expected = float(typical - slope * middle), np.einsum("xy,xy->x", chances, logs)
     return Table(noise, whole.ravel(), offset, slope, mean, expected, float(weights @ information))
-
-
-def noise_at(column: int) -> Noise:
-    """The noise of a column of `Likelihood.by_amplitude`."""
-    return Noise(column % AMPLITUDES, column >= AMPLITUDES)
 
 
 def _logs(chances: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.kept_arrays import Blocks, KeptArrays, KeptTouch, first_changes
-from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, LevelArray, Likelihood, Noise, Table, noise_at
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, NOISES, LevelArray, Likelihood, Noise, Table
 from scroll_tactile.sensors import Sensor
 
 __all__ = ["Beside", "Match", "NaturalDeviation", "Query", "TouchMatcher", "independent"]
@@ -112,7 +112,7 @@ class Beside:
             own, others = self.query.levels[:, first:until], self.others[:, :, first:until]
             sums += self.table.log_sums(own, others)
             had += np.count_nonzero((others != MISSING) & (own != MISSING), axis=(1, 2))
-            seen += np.count_nonzero(own != MISSING)
+            seen += int(np.count_nonzero(own != MISSING))
             found.append(self._excess(sums * (seen / np.maximum(had, 1)), seen, until))
         return np.array(found)
 
@@ -159,10 +159,7 @@ class Match:
 
 @dataclass(frozen=True)
 class TouchMatcher:
-    """Compares a touch with kept touches. deviation: of these kept touches from each other, or of most of them.
-
-    Any number of threads may use it at once; nothing of it changes.
-    """
+    """Compares a touch with kept touches; for any number of threads. deviation: of most of these from each other."""
 
     kept: KeptArrays
     conformal: Conformal
@@ -175,8 +172,8 @@ class TouchMatcher:
         before: a matcher of other touches; what it has of these is not made again. Raises InputError for no touch, and
         for touches of different channels.
         """
-        kept = KeptArrays(touches, before and before.kept)
-        conformal = Conformal(kept, before and before.conformal)
+        kept = KeptArrays(touches, None if before is None else before.kept)
+        conformal = Conformal(kept, None if before is None else before.conformal)
         return cls(kept, conformal, NaturalDeviation(_likelihood(kept), *ASSUMED))
 
     def followed(self, touches: Sequence[KeptTouch]) -> TouchMatcher:
@@ -224,11 +221,15 @@ class TouchMatcher:
 
     def beside(self, query: Query, noise: Noise | None) -> Beside:
         """The touch beside the nearest kept ones under a noise; None: under the likeliest."""
-        first = self._likeliest_noise(query, self._roughly_near(query)) if noise is None else noise
-        nearest = self._nearest(query, first)
+        sought, tables = noise is None, self.deviation.likelihood.table
         if noise is None:
-            noise = self._likeliest_noise(query, nearest[:FINER]) if first != CLEAN else CLEAN
-        table, rows = self.deviation.likelihood.table(noise), np.sort(nearest)
+            far = query.blocks[0].distances(list(map(tables, ROUGH)), query.rows)
+            roughly = np.unique(np.argsort(far, axis=0, kind="stable")[:1])
+            noise = self._likeliest_noise(query, query.rows[roughly])
+        nearest = self._nearest(query, tables(noise))
+        if sought and noise != CLEAN:
+            noise = self._likeliest_noise(query, nearest[:FINER])
+        table, rows = tables(noise), np.sort(nearest)
         others = self._others(rows, query)
         return Beside(query, table, rows, others, table.log_likelihoods(query.levels, others))
 
@@ -260,20 +261,17 @@ class TouchMatcher:
         columns = query.levels.shape[1]
         if not query.whole:
             return self.kept.beginnings(rows, columns)
-        return self.kept.at_shares(rows, np.arange(columns) * (query.step / max(query.columns - 1, 1)))
+        return self.kept.at_shares(
+            rows, np.arange(columns, dtype=np.float64) * (query.step / max(query.columns - 1, 1))
+        )
 
-    def _nearest(self, query: Query, noise: Noise) -> Rows:
+    def _nearest(self, query: Query, table: Table) -> Rows:
         """The rows of the kept touches nearest to the touch as it was before a noise, the nearest first."""
-        table, rows = self.deviation.likelihood.table(noise), query.rows
+        rows = query.rows
         for count, blocks in zip((NEAR, SHORTLIST)[-len(query.blocks) :], query.blocks, strict=True):
             far = blocks.distances([table], rows)[:, 0]
             rows = rows[np.argsort(far, kind="stable")[:count]]
         return rows
-
-    def _roughly_near(self, query: Query) -> Rows:
-        """The rows of the kept touches nearest under each of ROUGH."""
-        far = query.blocks[0].distances(list(map(self.deviation.likelihood.table, ROUGH)), query.rows)
-        return query.rows[np.unique(far.argmin(axis=0))] if len(far) else query.rows
 
     def _likeliest_noise(self, query: Query, rows: Rows) -> Noise:
         """The noise under which one of some kept touches is likeliest, by a histogram of how far its values lie."""
@@ -286,7 +284,7 @@ class TouchMatcher:
         both = own.size - counts[:, [LEVELS, 256 + LEVELS]].sum(axis=1, keepdims=True)
         logs = (counts * (query.values / np.maximum(both, 1))).astype(np.float32) @ likelihood.by_amplitude
         best, clean = int(logs.max(axis=0).argmax()), likelihood.table(CLEAN).log_likelihoods(own, others).max()
-        return noise_at(best) if logs[:, best].max() > clean else CLEAN
+        return NOISES[best] if logs[:, best].max() > clean else CLEAN
 
     def _scores(self, beside: Beside) -> tuple[FloatArray, npt.NDArray[np.float32]]:
         """`scores`, by kept touches and blends, the least where a material has none; and `expected`; see `Match`."""
@@ -320,10 +318,7 @@ def independent(energy: float, coherence: float, natural: float) -> float:
 
 
 def _shape(deviation: FloatArray, seen: Known) -> tuple[float, float, float]:
-    """Energy and coherence (see NaturalDeviation) of a deviation, (C, T) in levels, 0 where a value is not seen.
-
-    And the energy of each channel's mean, and of its straight way up or down.
-    """
+    """Energy and coherence of a deviation (C, T), 0 where not seen; the energy of its channels' means and slopes."""
     counts, time = seen.sum(axis=1), np.arange(seen.shape[1])
     values, among = max(int(counts.sum()), 1), np.maximum(counts, 1)
     away = (time - (seen @ time / among)[:, None]) * seen
@@ -342,15 +337,13 @@ def _weighted_means(levels: LevelArray, weights: FloatArray) -> npt.NDArray[np.f
     if known.all():
         return np.asarray((single / single.sum(axis=1, keepdims=True)) @ levels.astype(np.float32))
     total = single @ known.astype(np.float32)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.where(total > 0, single @ (levels * known).astype(np.float32) / total, np.nan))
+    return np.asarray(single @ (levels * known).astype(np.float32) / np.where(total > 0, total, np.float32(np.nan)))
 
 
 def _likelihood(kept: KeptArrays) -> Likelihood:
     """The tables of the spread by level: the mean deviation from the nearest touch, over levels half to twice as high.
 
-    The mean deviation, and not the standard deviation, which is a quarter more: kept touches that are likelier come
-    nearer than the nearest by all values does.
+    Not the standard deviation, a quarter more: likelier kept touches come nearer than the nearest by all values does.
     """
     counts, deviations = np.zeros(LEVELS), np.zeros(LEVELS)
     for row in range(0, len(kept), -(-len(kept) // PAIRS)):  # the rows are in the order of keys: at random

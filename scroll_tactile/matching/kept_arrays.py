@@ -115,7 +115,7 @@ class KeptArrays:
         for _, rows in groupby(new, lengths.__getitem__):
             parts.append(_Parts.of(np.stack([self._levels[row] for row in rows]), *edges))
         made |= {names[row]: len(made) + i for i, row in enumerate(new)}
-        order = [made[name] for name in names]
+        order = np.array([made[name] for name in names])
         self.parts: _Parts = _Parts(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
         self.columns = self.parts.columns
         self.materials = sorted({material for material, _ in names})
@@ -206,7 +206,7 @@ def _coded(levels: LevelArray, edges: Rows, code: Callable[[FloatArray], FloatAr
     """Means of the blocks of touches (n, C, T) as whole numbers, (n, B, C); MISSING where nothing was read."""
     means, known = _block_means(levels, edges)
     found = np.full((len(levels), len(edges) - 1, levels.shape[1]), MISSING, np.uint8)
-    found[:, : means.shape[1]][known] = code(means[known])
+    found[:, : means.shape[1]] = np.where(known, code(means), MISSING)
     return found
 
 

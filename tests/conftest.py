@@ -14,7 +14,7 @@ import pytest
 from quick_checkpoints import write_zarr
 from real_sets import CACHE
 
-from scroll_tactile.matching.likelihood import Likelihood, Noise, Table
+from scroll_tactile.matching import likelihood
 
 # The tests sync files tens of thousands of times: where there is room in memory, they do not wait for a disk.
 IN_MEMORY = Path("/dev/shm")
@@ -52,18 +52,14 @@ def shared_tables() -> Iterator[None]:
 
     Half of the time of a first prediction goes into tables, and most tests have memories of the same few touches.
     """
-    made = Likelihood._made
+    made = likelihood._table
 
     @lru_cache(maxsize=512)
-    def table(noise: Noise, spread: bytes, weights: bytes) -> Table:
-        likelihood = object.__new__(Likelihood)
-        likelihood.spread, likelihood.weights = np.frombuffer(spread), np.frombuffer(weights)
-        return made(likelihood, noise)
+    def table(spread: bytes, weights: bytes, noise: likelihood.Noise) -> likelihood.Table:
+        return made(np.frombuffer(spread), np.frombuffer(weights), noise)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            Likelihood, "_made", lambda self, noise: table(noise, self.spread.tobytes(), self.weights.tobytes())
-        )
+        patch.setattr(likelihood, "_table", lambda *of: table(of[0].tobytes(), of[1].tobytes(), of[2]))
         yield
 
 

@@ -1,76 +1,71 @@
-"""Kept touches in rows, with the arrays that a matcher compares a touch with.
+"""Kept touches in rows, with the arrays that a matcher compares a touch with, made once for each touch.
 
-And levels between those that were read: between the steps of a touch, over blocks of it, and among several touches.
+And levels between those that were read: between the steps of a touch, and over blocks of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import groupby
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile import native
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.comparing import QUARTERS, mean_distances
-from scroll_tactile.matching.likelihood import MISSING, LevelArray
-from scroll_tactile.matching.match import KeptTouch
+from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray, Table
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 
-__all__ = ["Blocks", "KeptArrays", "at_places", "first_changes", "weighted_means"]
+__all__ = ["Blocks", "KeptArrays", "KeptTouch", "at_places", "first_changes", "mean_distances"]
 
 FloatArray = npt.NDArray[np.float64]
+Known = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
+Steps = npt.NDArray[np.float32]
 
 BLOCK_VALUES = 2400  # means of a kept touch that the shortlist is made by; 1200 lose 3 in 100 through noise
 COARSER = 8  # times wider blocks, that say which touches are near at all; and of touches of another speed no more
 ENOUGH = 32  # blocks that a touch reaches: with fewer there are no wider ones
 GUESSED = (-256.0, 510.0)  # levels: a guess of what was before noise may lie beyond the range
-NEGLIGIBLE = 1e-6  # of the largest weight in a mean
+QUARTERS = 4  # steps of a guess in one level
+BLOCKS, EARLIER = 25, 1.5  # of a touch, in time: their edges grow with this power, for touches differ early
+MOST_VALUES = 1024  # of a touch: sums of the squares of so many steps are below 2²⁴, and exact in single precision
+STEPS = 63  # of a block's mean, log(1 + level) over all levels
+
+
+@dataclass(frozen=True)
+class KeptTouch:
+    """A kept touch: its material, its content hash, its levels, uint8 of shape (C, T), and how it was annotated."""
+
+    material: str
+    key: bytes
+    levels: LevelArray
+    annotation: Annotation = NO_ANNOTATION
 
 
 class _Parts(NamedTuple):
-    """What is made of each kept touch, once; row by row.
+    """What is made of each kept touch, row by row.
 
-    blocks: means, rounded to levels, MISSING where nothing was read, (touches, B, C). coarse: the same of wider ones,
-    (touches, B', C). relative: of wider ones in each touch's own length. columns: the length of each. gapless: whether
-    it has a value everywhere, up to the longest. first: the column of each channel's first change, the touch's length
-    where it never changes, (touches, C).
+    fine, wide: means of its blocks as levels, (touches, B, C). relative: of wide blocks of its own length. steps,
+    squares: see `log_steps`. columns: its length. first: see `first_changes`.
     """
 
-    blocks: LevelArray
-    coarse: LevelArray
+    fine: LevelArray
+    wide: LevelArray
     relative: LevelArray
+    steps: Steps
+    squares: Steps
     columns: Rows
-    gapless: npt.NDArray[np.bool_]
     first: Rows
 
     @classmethod
-    def of(cls, touches: Sequence[LevelArray], longest: int) -> _Parts:
-        """Those of some touches; of one length together, which is three times as fast as one by one."""
-        fine, wide = _edges(longest, len(touches[0]))
-        rows: dict[int, list[int]] = {}
-        for row, levels in enumerate(touches):
-            rows.setdefault(levels.shape[1], []).append(row)
-        parts = []
-        for columns, among in rows.items():
-            levels = np.stack([touches[row] for row in among])
-            parts.append(
-                cls(
-                    _block_levels(levels, fine),
-                    _block_levels(levels, wide),
-                    _block_levels(levels, wide * columns // longest),
-                    np.full(len(among), columns),
-                    (columns == longest) & (levels != MISSING).all(axis=(1, 2)),
-                    first_changes(levels),
-                )
-            )
-        return cls.joined(parts, np.argsort([row for among in rows.values() for row in among]))
-
-    @classmethod
-    def joined(cls, parts: Sequence[_Parts], rows: Sequence[int] | Rows) -> _Parts:
-        """Some rows of all parts one below the other."""
-        return cls(*(np.concatenate(of)[rows] for of in zip(*parts, strict=True)))
+    def of(cls, levels: LevelArray, fine: Rows, wide: Rows, early: Rows) -> _Parts:
+        """Those of touches of one length, (touches, C, T): together they take a third of the time of one by one."""
+        columns = levels.shape[2]
+        blocks = _coded(levels, fine), _coded(levels, wide), _coded(levels, wide * columns // wide[-1])
+        return cls(*blocks, *log_steps(levels, early), np.full(len(levels), columns), first_changes(levels))
 
 
 @dataclass(frozen=True)
@@ -81,74 +76,51 @@ class Blocks:
     """
 
     means: FloatArray
-    known: npt.NDArray[np.bool_]
+    known: Known
     kept: LevelArray
 
-    def distances(self, lines: Iterable[tuple[float, float]], rows: Rows) -> FloatArray:
-        """Mean squared distances of kept touches from the touch before noise, (rows, lines), over what both have.
-
-        lines: offset and slope of a noise, each; see `Table`. Whole numbers of quarters of a level, divided once: the
-        same on every machine. The largest float where both have no block.
-        """
-        guesses = np.stack([(self.means - offset) / slope for offset, slope in lines]).reshape(-1, self.means.size)
+    def distances(self, tables: Sequence[Table], rows: Rows) -> FloatArray:
+        """Mean squared distances of kept touches from the touch before each noise, (rows, tables)."""
+        guesses = np.stack([(self.means - table.offset) / table.slope for table in tables]).reshape(len(tables), -1)
         steps = np.rint(np.clip(guesses, *GUESSED) * QUARTERS).astype(np.int16)
         kept = self.kept[rows, : len(self.means)].reshape(len(rows), self.means.size)
         return mean_distances(kept, steps, self.known.ravel())
 
 
 class KeptArrays:
-    """Kept touches of one number of channels, in rows in the order of their keys; lengths may differ.
+    """Kept touches of one number of channels, in the order of their keys; lengths may differ.
 
-    touches: material and key of each row. longest: columns of the longest. materials: in alphabetical order; labels:
-    the place of each row's material among them. columns, first: as in `_Parts`. gapless: whether all touches have
-    values everywhere.
-
-    Nothing of it changes, and it is a function of the set of touches, to the bit.
+    touches: material and key of each → its row. longest: columns of the longest. materials: in alphabetical order;
+    labels: the place of each row's material among them. parts: what was made of each; columns: its length. early:
+    edges of the blocks of its steps. Nothing changes, and all is a function of the set of touches, to the bit.
     """
 
-    def __init__(self, touches: Sequence[tuple[str, bytes]], levels: Sequence[LevelArray], parts: _Parts) -> None:
-        """levels, parts: of the touches, which are in order."""
-        self.touches = list(touches)
-        self._levels = list(levels)  # the memory's own: of 800 touches of a BioTac a copy is 6 MB
-        self._parts = parts
-        self.columns, self.first = parts.columns, parts.first
-        self.channels, self.longest = len(levels[0]), int(parts.columns.max())
-        self.gapless = bool(parts.gapless.all())
-        self.materials = sorted({material for material, _ in touches})
-        place = {name: i for i, name in enumerate(self.materials)}
-        self.labels = np.array([place[material] for material, _ in touches], dtype=np.intp)
-
-    @classmethod
-    def of(cls, touches: Iterable[KeptTouch]) -> KeptArrays:
-        """The arrays of some touches.
+    def __init__(self, touches: Iterable[KeptTouch], before: KeptArrays | None = None) -> None:
+        """before: others, of which those rows are taken that are still kept, unless the longest has another length.
 
         Raises InputError for touches of different channels, and for none.
         """
         kept = sorted(touches, key=lambda touch: (touch.key, touch.material))
         if len({len(touch.levels) for touch in kept}) != 1:
             raise InputError("expected kept touches, one or more, all of the same number of channels")
-        levels = [touch.levels for touch in kept]
-        parts = _Parts.of(levels, max(each.shape[1] for each in levels))
-        return cls([(touch.material, touch.key) for touch in kept], levels, parts)
-
-    def followed(self, added: Iterable[KeptTouch], removed: Collection[tuple[str, bytes]] = ()) -> KeptArrays | None:
-        """Those of these touches with others added, and without those removed; None where none is left.
-
-        All is made anew where the longest touch has another length than before.
-        """
-        gone, came = set(removed), list(added)
-        stays = [row for row, touch in enumerate(self.touches) if touch not in gone]
-        if not stays and not came:
-            return None
-        touches = [*(self.touches[row] for row in stays), *((touch.material, touch.key) for touch in came)]
-        levels = [*(self._levels[row] for row in stays), *(touch.levels for touch in came)]
-        order = sorted(range(len(touches)), key=lambda i: touches[i][::-1])
-        touches, levels = [touches[i] for i in order], [levels[i] for i in order]
-        if max(each.shape[1] for each in levels) != self.longest:
-            return KeptArrays(touches, levels, _Parts.of(levels, max(each.shape[1] for each in levels)))
-        new = [_Parts.of([touch.levels for touch in came], self.longest)] if came else []
-        rows = np.array([*stays, *range(len(self), len(self) + len(came))], dtype=np.intp)[order]
-        return KeptArrays(touches, levels, _Parts.joined([self._parts, *new], rows))
+        names, self._levels = [(touch.material, touch.key) for touch in kept], [touch.levels for touch in kept]
+        self.touches = {name: row for row, name in enumerate(names)}
+        lengths = [levels.shape[1] for levels in self._levels]
+        self.channels, self.longest = len(self._levels[0]), max(lengths)
+        self._fine, self._wide, self.early = edges = _edges(self.longest, self.channels)
+        made, parts = dict[tuple[str, bytes], int](), list[_Parts]()
+        if before is not None and before.longest == self.longest:
+            made, parts = dict(before.touches), [before.parts]
+        new = sorted((row for row, name in enumerate(names) if name not in made), key=lengths.__getitem__)
+        for _, rows in groupby(new, lengths.__getitem__):
+            parts.append(_Parts.of(np.stack([self._levels[row] for row in rows]), *edges))
+        made |= {names[row]: len(made) + i for i, row in enumerate(new)}
+        order = np.array([made[name] for name in names])
+        self.parts: _Parts = _Parts(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
+        self.columns = self.parts.columns
+        self.materials = sorted({material for material, _ in names})
+        self._places = {name: i for i, name in enumerate(self.materials)}
+        self.labels = np.array([self._places[material] for material, _ in names], dtype=np.intp)
 
     def __len__(self) -> int:
         return len(self.touches)
@@ -159,70 +131,87 @@ class KeptArrays:
 
     def rows(self) -> dict[bytes, int]:
         """Key → row of what is kept."""
-        return {key: row for row, (_, key) in enumerate(self.touches)}
+        return {key: row for (_, key), row in self.touches.items()}
+
+    def by_name(self, values: FloatArray, names: Sequence[str], other: Any) -> FloatArray:
+        """Values of the materials, (M, …), as those of some names, (C, …); `other` where nothing of a name is kept."""
+        return np.concatenate([values, [other]])[[self._places.get(name, -1) for name in names]]
 
     def blocks(self, levels: LevelArray, whole: bool) -> list[Blocks]:
-        """A touch's blocks beside those of the kept ones, the wider ones first.
-
-        whole: beside the whole of each, and not beside prefixes; then there are wide blocks only.
-        """
-        (fine, wide), columns, parts = _edges(self.longest, self.channels), levels.shape[1], self._parts
+        """A touch's blocks beside those of kept prefixes, the wider first; or wide ones beside those of whole ones."""
         if whole:
-            return [Blocks(*_block_means(levels, wide * columns // self.longest), parts.relative)]
-        near = Blocks(*_block_means(levels, fine), parts.blocks)
-        if len(near.means) < ENOUGH:
-            return [near]
-        return [Blocks(*_block_means(levels, wide), parts.coarse), near]
+            edges = self._wide * levels.shape[1] // self.longest
+            return [Blocks(*_block_means(levels, edges), self.parts.relative)]
+        near = Blocks(*_block_means(levels, self._fine), self.parts.fine)
+        wide = [Blocks(*_block_means(levels, self._wide), self.parts.wide)] if len(near.means) >= ENOUGH else []
+        return [*wide, near]
 
-    def beginnings(self, rows: Iterable[int], columns: int) -> LevelArray:
+    def beginnings(self, rows: Sequence[int] | Rows, columns: int) -> LevelArray:
         """The levels of some touches up to a column one below the other, (rows, C, columns)."""
-        kept = [self._levels[row][:, :columns] for row in rows]
-        found = np.full((len(kept), self.channels, columns), MISSING, dtype=np.uint8)
-        for levels, into in zip(kept, found, strict=True):
-            into[:, : levels.shape[1]] = levels
+        found = np.full((len(rows), self.channels, columns), MISSING, dtype=np.uint8)
+        for row, into in zip(rows, found, strict=True):
+            into[:, : self.columns[row]] = self._levels[row][:, :columns]
         return found
 
     def at_shares(self, rows: Rows, shares: FloatArray) -> LevelArray:
         """The levels of some touches at these shares of each one's length, (rows, C, shares)."""
         found = np.empty((len(rows), self.channels, len(shares)), np.uint8)
-        lengths = self.columns[rows]
-        for length in sorted(set(lengths.tolist())):  # touches of one length are brought alike
-            same = np.flatnonzero(lengths == length)
+        for length in np.unique(self.columns[rows]).tolist():  # touches of one length are brought alike
+            same = np.flatnonzero(self.columns[rows] == length)
             found[same] = at_places(self.beginnings(rows[same], length), shares * (length - 1))
         return found
 
-    def nearest_alike(self, row: int) -> tuple[LevelArray, LevelArray] | None:
-        """The levels of a touch and of the nearest other one of its material; None where there is no other."""
+    def nearest_alike(self, row: int) -> int | None:
+        """The row of the nearest other touch of the material of one; None where there is no other."""
         others = np.flatnonzero((self.labels == self.labels[row]) & (np.arange(len(self)) != row))
         if not len(others):
             return None
-        blocks = self._parts.blocks.reshape(len(self), -1)
+        blocks = self.parts.fine.reshape(len(self), -1)
         guess = QUARTERS * blocks[row][None].astype(np.int16)
-        far = mean_distances(blocks[others], guess, blocks[row] != MISSING)[:, 0]
-        own, other = self.beginnings([row, int(others[np.argmin(far)])], self.longest)
-        return own, other
+        return int(others[mean_distances(blocks[others], guess, blocks[row] != MISSING).argmin()])
 
 
-def _edges(longest: int, channels: int) -> tuple[Rows, Rows]:
-    """The edges of the blocks, and of the wider ones, of touches of so many columns at most."""
-    blocks = max(1, min(longest, BLOCK_VALUES // channels))
+def _edges(longest: int, channels: int) -> tuple[Rows, Rows, Rows]:
+    """The edges of a touch's blocks, of wider ones, and of those that conformal sets compare."""
+    blocks, few = max(1, min(longest, BLOCK_VALUES // channels)), max(1, min(BLOCKS, MOST_VALUES // channels))
     fine, wide = (np.linspace(0, longest, count + 1).astype(np.intp) for count in (blocks, -(-blocks // COARSER)))
-    return fine, wide
+    return fine, wide, np.unique(np.rint(longest * (np.arange(few + 1) / few) ** EARLIER).astype(np.intp))
 
 
-def _block_levels(levels: LevelArray, edges: Rows) -> LevelArray:
-    """Means of the blocks of touches (n, C, T), rounded to levels, (n, B, C); MISSING where nothing was read."""
+def mean_distances(rows: LevelArray, guesses: npt.NDArray[np.int16], known: Known) -> FloatArray:
+    """Mean squared distances of rows of levels (rows, blocks) from guesses in quarters, (rows, guesses).
+
+    Over the blocks that a row has and that are known, (blocks,); the largest float where there is none. By C where that
+    was built, else by numpy, to the same bits; C takes guesses of ± 2048.
+    """
+    if native.available and len(rows):
+        sums, seen = np.empty((len(rows), len(guesses)), np.int64), np.empty(len(rows), np.int64)
+        native.distances(np.ascontiguousarray(rows), np.ascontiguousarray(guesses), known, sums, seen)
+    else:
+        both, exact = (rows != MISSING) & known, guesses.astype(np.float64)
+        quarters = np.where(both, QUARTERS * rows.astype(np.float64), 0.0)
+        squares = np.square(quarters).sum(axis=1)[:, None] + both @ np.square(exact).T
+        sums, seen = (squares - 2 * (quarters @ exact.T)).astype(np.int64), both.sum(axis=1)
+    return np.where(seen[:, None] > 0, sums / np.maximum(seen, 1)[:, None], np.finfo(np.float64).max)
+
+
+def log_steps(levels: LevelArray, edges: Rows) -> tuple[Steps, Steps]:
+    """Block means (n, B, C) in STEPS of log(1 + level), NaN where nothing was read; sums of squares so far, (n, B)."""
+    coded = _coded(levels, edges, lambda means: np.rint(np.log1p(means) * (STEPS / np.log(LEVELS))))
+    steps = np.where(coded == MISSING, np.nan, coded).astype(np.float32)
+    return steps, np.square(steps).sum(axis=2).cumsum(axis=1)
+
+
+def _coded(levels: LevelArray, edges: Rows, code: Callable[[FloatArray], FloatArray] = np.rint) -> LevelArray:
+    """Means of the blocks of touches (n, C, T) as whole numbers, (n, B, C); MISSING where nothing was read."""
     means, known = _block_means(levels, edges)
     found = np.full((len(levels), len(edges) - 1, levels.shape[1]), MISSING, np.uint8)
-    found[:, : means.shape[1]][known] = np.rint(means[known])
+    found[:, : means.shape[1]] = np.where(known, code(means), MISSING)
     return found
 
 
-def _block_means(levels: LevelArray, edges: Rows) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Means of the blocks of touches (…, C, T) between edges, (…, B, C), 0 where nothing was read; and what was.
-
-    Of the blocks that begin before the touches end.
-    """
+def _block_means(levels: LevelArray, edges: Rows) -> tuple[FloatArray, Known]:
+    """Means of the blocks that begin before touches (…, C, T) end, (…, B, C), 0 where nothing was read; what was."""
     seen, first = levels != MISSING, edges[:-1][edges[:-1] < levels.shape[-1]]
     if seen.all():
         sums = np.add.reduceat(levels, first, axis=-1, dtype=np.int32)
@@ -252,15 +241,3 @@ def first_changes(levels: LevelArray) -> Rows:
     first = np.take_along_axis(levels, read.argmax(axis=-1)[..., None], axis=-1)
     changed = read & (levels != first)
     return np.asarray(np.where(changed.any(axis=-1), changed.argmax(axis=-1), levels.shape[-1]), dtype=np.intp)
-
-
-def weighted_means(levels: LevelArray, weights: FloatArray) -> npt.NDArray[np.float32]:
-    """Means of touches (n, C · T) by weights (means, n), of which the largest are 1; NaN where no touch has a value."""
-    keep = weights.max(axis=0) > NEGLIGIBLE
-    single, levels = weights[:, keep].astype(np.float32), levels[keep]
-    known = levels != MISSING
-    if known.all():
-        return np.asarray((single / single.sum(axis=1, keepdims=True)) @ levels.astype(np.float32))
-    total = single @ known.astype(np.float32)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.where(total > 0, single @ (levels * known).astype(np.float32) / total, np.nan))

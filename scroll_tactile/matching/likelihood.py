@@ -6,23 +6,23 @@ leaves the range is clipped to it:
 
     L[y, x] = log((1 − ε) P(clip(x + v + u) = y) + ε / 255),    u uniform in ± a, or normal with a's energy.
 
-Rounded to 2⁻¹⁰ the logarithms are integers: sums of them are the same bytes in any order.
+Rounded to 2⁻¹⁰ the logarithms are integers: sums of them are the same bytes in any order, by C or by numpy.
 """
 
 from __future__ import annotations
 
 import math
-import threading
-from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
 
+from scroll_tactile import native
 from scroll_tactile.sensors import Sensor
 
-__all__ = ["CLEAN", "LEVELS", "MISSING", "UNIT", "Likelihood", "Noise", "Table", "levels_of", "noise_at"]
+__all__ = ["CLEAN", "LEVELS", "MISSING", "NOISES", "UNIT", "Likelihood", "Noise", "Table", "levels_of"]
 
 LEVELS = 255
 MISSING = 255  # the level of a value that was not read; it has a likelihood of 1 beside any other
@@ -39,25 +39,19 @@ FloatArray = npt.NDArray[np.float64]
 
 _LEVELS = np.arange(float(LEVELS))
 _DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of level y from x, [x, y]
-_BEFORE, _AFTER = np.maximum(np.arange(LEVELS) - 1, 0), np.minimum(np.arange(LEVELS) + 1, LEVELS - 1)
 
 
 def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
     """Readings in the sensor's unit, shape (T, C), as levels, shape (C, T); NaN is MISSING, the rest is clipped."""
     low, high = (limit.astype(np.float64) for limit in sensor.limits)
-    share = (np.asarray(readings, dtype=np.float64) - low) / (high - low)
-    unread = np.isnan(share)
-    levels = np.rint(np.clip(np.where(unread, 0.0, share), 0.0, 1.0) * (LEVELS - 1)).astype(np.uint8)
-    levels[unread] = MISSING
-    return np.ascontiguousarray(levels.T)
+    share = np.clip((np.asarray(readings, dtype=np.float64) - low) / (high - low), 0.0, 1.0)
+    levels = np.where(np.isnan(share), MISSING, np.rint(share * (LEVELS - 1)))
+    return np.ascontiguousarray(levels.T.astype(np.uint8))
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What came over a touch: independent noise on every value.
-
-    step: of the amplitude, below AMPLITUDES; −1 is no noise. normal: whether it is normal, and not uniform.
-    """
+    """Independent noise on every value. step: of its amplitude; −1 is no noise. normal: and not uniform."""
 
     step: int = -1
     normal: bool = False
@@ -69,6 +63,7 @@ class Noise:
 
 
 CLEAN = Noise()
+NOISES = [Noise(step, normal) for normal in (False, True) for step in range(AMPLITUDES)]
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,7 @@ class Table:
     how touches differ.
     """
 
+    noise: Noise
     logs: npt.NDArray[np.int16]
     offset: float
     slope: float
@@ -88,85 +84,69 @@ class Table:
     expected: FloatArray
     information: float
 
+    def log_sums(self, own: LevelArray, others: LevelArray) -> FloatArray:
+        """Sums of L, (others,), over the levels of a touch (C, T) beside each of others (others, C, T)."""
+        own, others = own.ravel(), others.reshape(len(others), own.size)
+        if not native.available:
+            return np.asarray(self.logs.take((own.astype(np.intp) << 8) | others).sum(axis=1, dtype=np.int64) / UNIT)
+        sums = np.empty(len(others), np.int64)
+        native.sum_logs(np.ascontiguousarray(own), np.ascontiguousarray(others), self.logs, sums)
+        return sums / UNIT
+
+    def log_likelihoods(self, own: LevelArray, others: LevelArray) -> FloatArray:
+        """The same, scaled up where some of the others lack values that the touch has."""
+        sums, seen, read = self.log_sums(own, others), own != MISSING, others != MISSING
+        if read.all():
+            return sums
+        both = np.count_nonzero((read & seen).reshape(len(others), own.size), axis=1)
+        return np.asarray(sums * (np.count_nonzero(seen) / np.maximum(both, 1)))
+
 
 class Likelihood:
     """The tables of one set of touches, for any number of threads.
 
     spread: standard deviation of a reading among touches of one material, in levels, for each level; shape (255,).
-    weights: the share of readings at each level, shape (255,).
+    weights: the share of readings at each level, shape (255,). table: of a kind of noise; the latest are kept.
     """
 
     def __init__(self, spread: FloatArray, weights: FloatArray) -> None:
-        self.spread = np.maximum(spread, NARROWEST)
-        self.weights = weights
-        self._tables: OrderedDict[Noise, Table] = OrderedDict()
-        self._lock = threading.Lock()  # of the order of the tables; never held while one is made
-
-    def table(self, noise: Noise) -> Table:
-        """The table of a kind of noise; the latest are kept."""
-        with self._lock:
-            if (found := self._tables.get(noise)) is not None:
-                self._tables.move_to_end(noise)
-                return found
-        found = self._made(noise)
-        with self._lock:
-            self._tables[noise] = found
-            if len(self._tables) > MOST_TABLES:
-                self._tables.popitem(last=False)
-        return found
-
-    def _made(self, noise: Noise) -> Table:
-        reach = noise.amplitude * (LEVELS - 1)
-        below = (_below_normal if noise.normal else _below_uniform)(_DISTANCE, reach, self.spread[:, None])
-        below[:, -1] = 1.0  # what lies beyond an end of the range is read as that end
-        chances = np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)  # P(y | x), [x, y]
-        logs = _logs(chances)
-        whole = np.zeros((256, 256), dtype=np.int16)
-        whole[:LEVELS, :LEVELS] = np.rint(logs * UNIT).T
-        mean = chances @ _LEVELS
-        middle, typical = self.weights @ _LEVELS, self.weights @ mean
-        scatter = float(self.weights @ (_LEVELS - middle) ** 2)
-        slope = float(self.weights @ ((_LEVELS - middle) * (mean - typical))) / scatter if scatter > 0 else 1.0
-        slope = max(slope, 1e-3)
-        # Fisher's 4 Σ (d√P / dx)²: between the levels beside x the sum of squares is 2 − 2 Σ √(P P').
-        roots = np.sqrt(chances)
-        overlap = np.einsum("xy,xy->x", roots[_BEFORE], roots[_AFTER])
-        information = 8 * (1 - overlap) / (_AFTER - _BEFORE) ** 2 * self.spread**2
-        return Table(
-            logs=whole.ravel(),
-            offset=float(typical - slope * middle),
-            slope=slope,
-            mean=mean,
-            expected=np.einsum("xy,xy->x", chances, logs),
-            information=float(self.weights @ information),
-        )
+        self.spread, self.weights = np.maximum(spread, NARROWEST), weights
+        self.table: Callable[[Noise], Table] = lru_cache(MOST_TABLES)(partial(_table, self.spread, weights))
 
     @cached_property
     def by_amplitude(self) -> npt.NDArray[np.float32]:
-        """L by how far a value lies from what was kept, under each noise; of the mean spread, (512, 2 · AMPLITUDES).
+        """L by how far a value lies from what was kept, under each of NOISES; of the mean spread, (512, noises).
 
         Row d: of a value within the range that is d levels away. Row 256 + d: of one at an end of the range, where what
-        was kept is d levels within. Columns: uniform noise by amplitude, then normal noise; see `noise_at`. Rows 255
-        and 511 are 0: one of the two was not read.
+        was kept is d levels within. Rows 255 and 511 are 0: one of the two was not read.
         """
         lower = np.arange(LEVELS + 1, dtype=np.float64)[:, None] - 0.5  # ends of the levels that lie 0, 1, … away
-        reach = np.array([Noise(step).amplitude for step in range(AMPLITUDES)]) * (LEVELS - 1)
+        reach = np.array([noise.amplitude for noise in NOISES[:AMPLITUDES]]) * (LEVELS - 1)
         spread = float(self.weights @ self.spread)
         below = np.hstack([_below_uniform(lower, reach, spread), _below_normal(lower, reach, spread)])
-        found = np.zeros((2, 256, 2 * AMPLITUDES), np.float32)
-        found[0, :LEVELS] = _logs(np.maximum(np.diff(below, axis=0), 0.0))
-        found[1, :LEVELS] = _logs(np.maximum(1 - below[:LEVELS], 0.0))
-        return found.reshape(512, -1)
+        logs = _logs(np.stack([np.diff(below, axis=0), 1 - below[:LEVELS]]))
+        return np.pad(logs.astype(np.float32), ((0, 0), (0, 1), (0, 0))).reshape(512, -1)
 
 
-def noise_at(column: int) -> Noise:
-    """The noise of a column of `Likelihood.by_amplitude`."""
-    return Noise(column % AMPLITUDES, column >= AMPLITUDES)
+def _table(spread: FloatArray, weights: FloatArray, noise: Noise) -> Table:
+    below_of, reach = _below_normal if noise.normal else _below_uniform, noise.amplitude * (LEVELS - 1)
+    below = below_of(_DISTANCE, reach, spread[:, None])
+    below[:, -1] = 1.0  # what lies beyond an end of the range is read as that end
+    chances = np.maximum(np.diff(below, axis=1, prepend=0.0), 0.0)  # P(y | x), [x, y]
+    logs, mean = _logs(chances), chances @ _LEVELS
+    whole = np.pad(np.rint(logs.T * UNIT).astype(np.int16), (0, 1))
+    middle, typical = weights @ _LEVELS, weights @ mean
+    together, scatter = weights @ ((_LEVELS - middle) * (mean - typical)), weights @ (_LEVELS - middle) ** 2
+    slope = max(float(together) / float(scatter), 1e-3)
+    slopes = np.gradient(np.sqrt(chances), axis=0)
+    information = 4 * np.einsum("xy,xy->x", slopes, slopes) * spread**2  # Fisher's 4 Σ (d√P / dx)²
+    offset, expected = float(typical - slope * middle), np.einsum("xy,xy->x", chances, logs)
+    return Table(noise, whole.ravel(), offset, slope, mean, expected, float(weights @ information))
 
 
 def _logs(chances: FloatArray) -> FloatArray:
-    """L of P(y | x); see above."""
-    return np.asarray(np.log((1 - FLOOR) * chances + FLOOR / LEVELS))
+    """L of P(y | x), or of what rounding left below 0; see above."""
+    return np.asarray(np.log((1 - FLOOR) * np.maximum(chances, 0.0) + FLOOR / LEVELS))
 
 
 def _below_normal(away: FloatArray, reach: FloatArray | float, spread: FloatArray | float) -> FloatArray:
@@ -180,11 +160,9 @@ def _below_uniform(away: FloatArray, reach: FloatArray | float, spread: FloatArr
         return _below_normal(away, 0.0, spread)
     blurred = np.hypot(spread, BLUR * np.asarray(reach))
 
-    def integral(z: FloatArray) -> FloatArray:  # of Φ, up to z
-        below, density = _normal(z)
-        return z * below + density
-
-    return np.asarray((integral((away + reach) / blurred) - integral((away - reach) / blurred)) * blurred / (2 * reach))
+    least, most = (away - reach) / blurred, (away + reach) / blurred
+    (low, at_least), (high, at_most) = _normal(least), _normal(most)  # Φ and φ: the integral of Φ up to z is z Φ + φ
+    return np.asarray(((most * high + at_most) - (least * low + at_least)) * blurred / (2 * reach))
 
 
 def _normal(z: FloatArray) -> tuple[FloatArray, FloatArray]:

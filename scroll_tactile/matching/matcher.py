@@ -8,44 +8,27 @@ The sum is over all values that were read. A channel that never changes, where h
 long, is stuck: it says nothing and is left out, as are values that are missing. Beside the kept touches of a material
 stand blends of those that are likely: what is felt lies between them. A touch is compared with the prefixes of kept
 ones, in their own time, or with the whole of each brought to its length: made at another speed, it has another length.
-
-All is a function of the set of kept touches, in any order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.comparing import log_sums
-from scroll_tactile.matching.kept_arrays import Blocks, KeptArrays, first_changes, weighted_means
-from scroll_tactile.matching.likelihood import (
-    CLEAN,
-    LEVELS,
-    MISSING,
-    UNIT,
-    LevelArray,
-    Likelihood,
-    Noise,
-    Table,
-    noise_at,
-)
-from scroll_tactile.matching.match import (
-    Match,
-    NaturalDeviation,
-    negative_entropy,
-    noise_share,
-    shape_of,
-    without_zero,
-)
+from scroll_tactile.matching.conformal import Conformal
+from scroll_tactile.matching.kept_arrays import Blocks, KeptArrays, KeptTouch, first_changes
+from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, NOISES, LevelArray, Likelihood, Noise, Table
+from scroll_tactile.sensors import Sensor
 
-__all__ = ["Beside", "Query", "TouchMatcher"]
+__all__ = ["Beside", "Match", "NaturalDeviation", "Query", "TouchMatcher", "independent"]
 
 FloatArray = npt.NDArray[np.float64]
+Known = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 
 SHORTLIST = 64  # kept touches that are compared value by value; with 32 six in 100 more are wrong through noise
@@ -55,10 +38,26 @@ FINER = 5  # kept touches nearest under that noise, by which it is sought again:
 WARMTHS = (0.03, 0.1, 0.3)  # of blends: how steeply the weight of a kept touch falls with its log-likelihood
 EXPECTED = 0.1  # the same, of what is expected where channels are stuck
 BLENDED = 3  # materials, the likeliest, that have blends
+NEGLIGIBLE = 1e-6  # of the largest weight in a mean
 RARELY = 20  # kept touches, of which fewer than one is still for as long: then a channel that is so is stuck
 PAIRS = 64  # kept touches by which the spread is measured
 ASSUMED = (10.0, 10.0)  # coherence and energy, unless measured: about what RoboSkin's and BioTac's touches have
 PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardly any value was read
+
+
+@dataclass(frozen=True)
+class NaturalDeviation:
+    """How touches of one material deviate from each other in a set of kept touches.
+
+    likelihood: its tables. coherence: how much larger the deviation of a channel's mean is, squared and times T, than
+    that of a value; 1 for independent noise. energy: of independent noise that is even odds to be natural, in squared
+    levels. most: the energy of a deviation that 19 of 20 stay below; infinite where too few touches are kept to say.
+    """
+
+    likelihood: Likelihood
+    coherence: float
+    energy: float
+    most: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -67,24 +66,20 @@ class Query:
 
     levels: (C, T'), MISSING where a channel is stuck; of a touch longer than the kept ones their beginning, or every
     `step`-th column where it is `whole`. columns: T, of the touch that came. stuck: the channels that are, (C,). seen:
-    the values that count, (C, T'). blocks: see `KeptArrays.blocks`. rows: of the kept touches that it may be like.
-    entropy: of its own values.
+    the values that count, (C, T'), and values: how many. entropy: of their own frequencies. blocks: see
+    `KeptArrays.blocks`. rows: of the kept touches that it may be like.
     """
 
     levels: LevelArray
     columns: int
     step: int
     whole: bool
-    stuck: npt.NDArray[np.bool_]
-    seen: npt.NDArray[np.bool_]
+    stuck: Known
+    seen: Known
+    values: int
+    entropy: float
     blocks: list[Blocks]
     rows: Rows
-    entropy: float
-
-    @property
-    def values(self) -> int:
-        """How many values count."""
-        return int(np.count_nonzero(self.seen))
 
 
 @dataclass(frozen=True)
@@ -92,47 +87,109 @@ class Beside:
     """A touch beside the nearest kept touches, under one noise.
 
     rows: of them, ascending. others: their levels, (rows, C, T'). logs: log-likelihoods of the touch by each, (rows,).
-    both: the values that the touch and the likeliest have, (C, T'). gain, excess: see `log_likelihood_gain` and
-    `excess_loss` of a Match.
     """
 
     query: Query
-    noise: Noise
     table: Table
     rows: Rows
     others: LevelArray
     logs: FloatArray
-    both: npt.NDArray[np.bool_]
-    gain: float
-    excess: float
 
     @property
-    def best(self) -> LevelArray:
-        """The levels of the likeliest, (C, T')."""
-        return np.asarray(self.others[int(self.logs.argmax())])
+    def gain(self) -> float:
+        """`log_likelihood_gain` of its match."""
+        return float(self.logs.max()) / max(self.query.values, 1) + self.query.entropy if len(self.rows) else 0.0
+
+    @property
+    def excess(self) -> float:
+        """`excess_loss` of its match."""
+        return self._excess(self.logs, self.query.values) if len(self.rows) else 0.0
+
+    def excess_at(self, steps: Sequence[int]) -> FloatArray:
+        """The excess loss of beginnings of so many columns, ascending, by the same kept touches, (steps,)."""
+        sums, had, seen, found = np.zeros(len(self.rows)), np.zeros(len(self.rows)), 0, []
+        for first, until in pairwise((0, *steps)):
+            own, others = self.query.levels[:, first:until], self.others[:, :, first:until]
+            sums += self.table.log_sums(own, others)
+            had += np.count_nonzero((others != MISSING) & (own != MISSING), axis=(1, 2))
+            seen += int(np.count_nonzero(own != MISSING))
+            found.append(self._excess(sums * (seen / np.maximum(had, 1)), seen, until))
+        return np.array(found)
+
+    def _excess(self, logs: FloatArray, values: int, until: int | None = None) -> float:
+        best = self.others[logs.argmax(), :, :until]
+        expected = self.table.expected[best[self.query.seen[:, :until] & (best != MISSING)]]
+        return float(expected.sum() / max(len(expected), 1) - logs.max() / max(values, 1))
 
 
-class TouchMatcher:
-    """Compares a touch with kept touches. deviation: of these kept touches from each other, or of most of them.
+@dataclass(frozen=True)
+class Match:
+    """A touch beside kept touches.
 
-    Any number of threads may use it at once; nothing of it changes.
+    scores: log-likelihood of each material, in the order of `KeptArrays.materials`, (M,). information: Fisher's on the
+    values that were read, in units of the natural spread; about 1 of a clean touch as long as the longest kept one.
+    noise: what most likely came over it. stuck: the channels that never change, (C,). expected: levels of all values by
+    the kept touches, (C, T); NaN where none of them reaches. energy, coherence: of the touch's deviation from the
+    likeliest kept one. noise_share: in [0, 1], how much of that is independent noise beyond the natural. moved: whether
+    it deviates more than touches do, and at least half of that is its channels' zeros, which may drift.
+    log_likelihood_gain: the log-likelihood per value less the negative entropy of the touch's own values; not above 0
+    where nothing that is kept explains the touch. excess_loss: the negative log-likelihood per value less the expected
+    one of a touch of the set.
     """
 
-    def __init__(self, kept: KeptArrays, deviation: NaturalDeviation) -> None:
-        self.kept, self.deviation = kept, deviation
+    scores: FloatArray
+    information: float
+    noise: Noise
+    stuck: Known
+    expected: npt.NDArray[np.float32]
+    energy: float
+    coherence: float
+    noise_share: float
+    moved: bool
+    log_likelihood_gain: float
+    excess_loss: float
+
+    def filled(self, readings: npt.NDArray[np.floating], sensor: Sensor) -> npt.NDArray[np.float32]:
+        """The readings, shape (T, C) in the sensor's unit, with what is missing or stuck as kept touches have it."""
+        low, high = sensor.limits
+        expected = low + (high - low) * (self.expected.T / np.float32(LEVELS - 1))
+        lacking = (np.isnan(readings) | self.stuck) & np.isfinite(expected)
+        return np.where(lacking, expected, readings).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class TouchMatcher:
+    """Compares a touch with kept touches; for any number of threads. deviation: of most of these from each other."""
+
+    kept: KeptArrays
+    conformal: Conformal
+    deviation: NaturalDeviation
 
     @classmethod
-    def of(cls, kept: KeptArrays) -> TouchMatcher:
-        """With tables of the kept touches' own spread, and coherence and energy as most sets have them."""
-        return cls(kept, NaturalDeviation(_likelihood(kept), *ASSUMED))
+    def of(cls, touches: Sequence[KeptTouch], before: TouchMatcher | None = None) -> TouchMatcher:
+        """With tables of the touches' own spread, and coherence and energy as most sets have them.
 
-    def followed(self, kept: KeptArrays) -> TouchMatcher:
-        """Another, of other kept touches, with the same deviation."""
-        return TouchMatcher(kept, self.deviation)
+        before: a matcher of other touches; what it has of these is not made again. Raises InputError for no touch, and
+        for touches of different channels.
+        """
+        kept = KeptArrays(touches, None if before is None else before.kept)
+        conformal = Conformal(kept, None if before is None else before.conformal)
+        return cls(kept, conformal, NaturalDeviation(_likelihood(kept), *ASSUMED))
+
+    def followed(self, touches: Sequence[KeptTouch]) -> TouchMatcher:
+        """Another, of other touches, with the same deviation. Raises InputError as `of`."""
+        if {(touch.material, touch.key) for touch in touches} == self.kept.touches.keys():
+            return self
+        kept = KeptArrays(touches, self.kept)
+        return TouchMatcher(kept, Conformal(kept, self.conformal), self.deviation)
 
     def measured(self, coherence: float, energy: float, most: float) -> TouchMatcher:
         """Another, with the same tables and a deviation that was measured; see `NaturalDeviation`."""
-        return TouchMatcher(self.kept, replace(self.deviation, coherence=coherence, energy=energy, most=most))
+        return replace(self, deviation=NaturalDeviation(self.deviation.likelihood, coherence, energy, most))
+
+    def scores_of(self, names: Sequence[str], match: Match) -> FloatArray:
+        """The scores of some materials, (names,); the least of all for those of which nothing is kept."""
+        return self.kept.by_name(match.scores, names, match.scores.min())
 
     def match(
         self, levels: LevelArray, *, whole: bool = False, held_out: int | None = None, noise: Noise | None = None
@@ -149,87 +206,55 @@ class TouchMatcher:
         kept = self.kept
         if levels.ndim != 2 or len(levels) != kept.channels:
             raise InputError(f"expected levels of shape ({kept.channels}, T); came {levels.shape}")
-        full = levels.shape[1]
-        step = max(1, -(-full // kept.longest)) if whole else 1
-        own = levels[:, ::step].copy() if whole else levels[:, : kept.longest].copy()
-        rows = np.arange(len(kept))
-        if held_out is not None:
-            rows = np.delete(rows, held_out)
+        step = max(1, -(-levels.shape[1] // kept.longest)) if whole else 1
+        own = levels[:, ::step][:, : kept.longest].copy()
+        rows = np.delete(np.arange(len(kept)), [] if held_out is None else held_out)
         until = kept.columns[rows] if whole else np.minimum(own.shape[1], kept.columns[rows])
-        still = np.count_nonzero(kept.first[rows] >= until[:, None], axis=0)
+        still = np.count_nonzero(kept.parts.first[rows] >= until[:, None], axis=0)
         stuck = (first_changes(own) == own.shape[1]) & (RARELY * still < max(len(rows), 1))
         own[stuck] = MISSING
-        seen = own != MISSING
-        return Query(own, full, step, whole, stuck, seen, kept.blocks(own, whole), rows, -negative_entropy(own[seen]))
+        counts = np.bincount(own.ravel(), minlength=LEVELS + 1)[:LEVELS]
+        values, shares = int(counts.sum()), counts[counts > 0] / max(counts.sum(), 1)
+        entropy = -float((shares * np.log(shares)).sum())
+        blocks = kept.blocks(own, whole)
+        return Query(own, levels.shape[1], step, whole, stuck, own != MISSING, values, entropy, blocks, rows)
 
     def beside(self, query: Query, noise: Noise | None) -> Beside:
         """The touch beside the nearest kept ones under a noise; None: under the likeliest."""
-        first = self._likeliest_noise(query, self._roughly_near(query)) if noise is None else noise
-        nearest = self._nearest(query, first)
+        sought, tables = noise is None, self.deviation.likelihood.table
         if noise is None:
-            noise = self._likeliest_noise(query, nearest[:FINER]) if first != CLEAN else CLEAN
-        table, rows = self.deviation.likelihood.table(noise), np.sort(nearest)
+            far = query.blocks[0].distances(list(map(tables, ROUGH)), query.rows)
+            roughly = np.unique(np.argsort(far, axis=0, kind="stable")[:1])
+            noise = self._likeliest_noise(query, query.rows[roughly])
+        nearest = self._nearest(query, tables(noise))
+        if sought and noise != CLEAN:
+            noise = self._likeliest_noise(query, nearest[:FINER])
+        table, rows = tables(noise), np.sort(nearest)
         others = self._others(rows, query)
-        logs = self._logs(query.levels, others, table)
-        if not len(rows):
-            return Beside(query, noise, table, rows, others, logs, np.zeros_like(query.seen), 0.0, 0.0)
-        best = others[int(logs.argmax())]
-        both = query.seen & (best != MISSING)
-        gain = float(logs.max()) / max(query.values, 1)
-        return Beside(
-            query,
-            noise,
-            table,
-            rows,
-            others,
-            logs,
-            both,
-            gain + query.entropy,
-            _mean(table.expected[best[both]]) - gain,
-        )
+        return Beside(query, table, rows, others, table.log_likelihoods(query.levels, others))
 
     def result(self, beside: Beside) -> Match:
         """What the nearest kept touches say of a touch."""
         query, table, natural = beside.query, beside.table, self.deviation
         scores, expected = self._scores(beside)
-        deviation = np.zeros(query.levels.shape)
-        if beside.both.any():
-            read = beside.both
-            deviation[read] = query.levels[read] - table.mean[beside.best[read]]
-        energy, coherence = shape_of(deviation, beside.both)
+        best = beside.others[beside.logs.argmax()] if len(beside.rows) else np.full_like(query.levels, MISSING)
+        seen = query.seen & (best != MISSING)
+        deviation = np.where(seen, query.levels - table.mean.take(best, mode="clip"), 0.0)
+        energy, coherence, of_zeros = _shape(deviation, seen)
+        noise = independent(energy, coherence, natural.coherence) if np.isfinite(natural.most) else 0.0
         return Match(
             scores=scores,
             information=table.information * query.values / (len(query.levels) * self.kept.longest),
-            noise=beside.noise,
+            noise=table.noise,
             stuck=query.stuck,
             expected=expected,
             energy=energy,
             coherence=coherence,
-            noise_share=noise_share(energy, coherence, natural),
-            moved=energy > natural.most and energy > 2 * without_zero(deviation, beside.both),
+            noise_share=noise**2 / (noise**2 + natural.energy**2) if noise else 0.0,
+            moved=energy > natural.most and of_zeros > energy / 2,
             log_likelihood_gain=beside.gain,
             excess_loss=beside.excess,
         )
-
-    def excess_at(self, beside: Beside, steps: Sequence[int]) -> FloatArray:
-        """The excess loss of a touch's beginnings of so many columns, ascending, by the same kept touches, (steps,)."""
-        query, table = beside.query, beside.table
-        sums, had = np.zeros((2, len(steps), len(beside.rows)))
-        seen = np.zeros(len(steps))
-        for i, part in enumerate(map(slice, (0, *steps[:-1]), steps)):
-            own, others = query.levels[:, part], beside.others[:, :, part].reshape(len(beside.rows), -1)
-            sums[i] = log_sums(own.ravel(), others, table.logs) / UNIT
-            had[i] = np.count_nonzero((others != MISSING) & query.seen[:, part].ravel(), axis=1)
-            seen[i] = np.count_nonzero(query.seen[:, part])
-        sums, had, seen = (values.cumsum(axis=0) for values in (sums, had, seen))
-        found = np.zeros(len(steps))
-        if len(beside.rows):
-            logs = sums * (seen[:, None] / np.maximum(had, 1))
-            for i, (best, until) in enumerate(zip(logs.argmax(axis=1), steps, strict=True)):
-                near = beside.others[best, :, :until]
-                both = query.seen[:, :until] & (near != MISSING)
-                found[i] = _mean(table.expected[near[both]]) - logs[i, best] / max(seen[i], 1)
-        return found
 
     def _others(self, rows: Rows, query: Query) -> LevelArray:
         """The levels that a touch is compared with, of some kept ones, (rows, C, T')."""
@@ -240,103 +265,96 @@ class TouchMatcher:
             rows, np.arange(columns, dtype=np.float64) * (query.step / max(query.columns - 1, 1))
         )
 
-    def _logs(self, own: LevelArray, others: LevelArray, table: Table) -> FloatArray:
-        """Log-likelihoods of levels (C, T') by each of others, (others, C, T'); scaled up where some lack values."""
-        mine, others = own.ravel(), others.reshape(len(others), own.size)
-        return np.asarray(log_sums(mine, others, table.logs) / UNIT * self._weights(mine, others))
-
-    def _weights(self, own: LevelArray, others: LevelArray) -> FloatArray | float:
-        """Over how many values a touch has, (values,), for one that others have as well, (others,)."""
-        if self.kept.gapless:
-            return 1.0
-        seen = own != MISSING
-        both = np.count_nonzero((others != MISSING) & seen, axis=1)
-        return np.asarray(np.count_nonzero(seen) / np.maximum(both, 1))
-
-    def _nearest(self, query: Query, noise: Noise) -> Rows:
+    def _nearest(self, query: Query, table: Table) -> Rows:
         """The rows of the kept touches nearest to the touch as it was before a noise, the nearest first."""
-        table, rows = self.deviation.likelihood.table(noise), query.rows
+        rows = query.rows
         for count, blocks in zip((NEAR, SHORTLIST)[-len(query.blocks) :], query.blocks, strict=True):
-            far = blocks.distances([(table.offset, table.slope)], rows)[:, 0]
+            far = blocks.distances([table], rows)[:, 0]
             rows = rows[np.argsort(far, kind="stable")[:count]]
         return rows
 
-    def _roughly_near(self, query: Query) -> Rows:
-        """The rows of the kept touches nearest under each of ROUGH."""
-        tables = [self.deviation.likelihood.table(noise) for noise in ROUGH]
-        far = query.blocks[0].distances([(table.offset, table.slope) for table in tables], query.rows)
-        return query.rows[sorted(set(far.argmin(axis=0).tolist()))] if len(far) else query.rows
-
     def _likeliest_noise(self, query: Query, rows: Rows) -> Noise:
         """The noise under which one of some kept touches is likeliest, by a histogram of how far its values lie."""
-        own, likelihood = query.levels[query.seen], self.deviation.likelihood
-        if not len(rows) or not len(own):
+        own, others, likelihood = query.levels, self._others(rows, query), self.deviation.likelihood
+        if not len(rows) or not query.values:
             return CLEAN
-        others = self._others(rows, query)[:, query.seen]
-        places = np.where(others == MISSING, LEVELS, np.abs(own.astype(np.int16) - others))
-        places += (256 * ((own == 0) | (own == LEVELS - 1))).astype(np.int16)
-        counts = np.stack([np.bincount(row, minlength=512) for row in places])
-        weights = np.broadcast_to(self._weights(own, others), len(rows))
-        logs = (counts * weights[:, None]).astype(np.float32) @ likelihood.by_amplitude
-        best = int(logs.max(axis=0).argmax())
-        clean = (log_sums(own, others, likelihood.table(CLEAN).logs) / UNIT * weights).max()
-        return noise_at(best) if logs[:, best].max() > clean else CLEAN
+        away = np.where(query.seen & (others != MISSING), np.abs(own.astype(np.int16) - others), LEVELS)
+        places = away + 256 * ((own == 0) | (own == LEVELS - 1))
+        counts = np.stack([np.bincount(each.ravel(), minlength=512) for each in places])
+        both = own.size - counts[:, [LEVELS, 256 + LEVELS]].sum(axis=1, keepdims=True)
+        logs = (counts * (query.values / np.maximum(both, 1))).astype(np.float32) @ likelihood.by_amplitude
+        best, clean = int(logs.max(axis=0).argmax()), likelihood.table(CLEAN).log_likelihoods(own, others).max()
+        return NOISES[best] if logs[:, best].max() > clean else CLEAN
 
-    def _scores(self, beside: Beside) -> tuple[FloatArray, npt.NDArray[np.floating]]:
-        """The best log-likelihood of each material, by its kept touches or blends, the least where it has none; and
-
-        what is expected of all values, (C, T).
-        """
+    def _scores(self, beside: Beside) -> tuple[FloatArray, npt.NDArray[np.float32]]:
+        """`scores`, by kept touches and blends, the least where a material has none; and `expected`; see `Match`."""
         query, logs, materials = beside.query, beside.logs, len(self.kept.materials)
         expected = np.full((len(query.levels), query.columns), np.nan, np.float32)
         if not len(logs):
             return np.zeros(materials), expected
-        labels = self.kept.labels[beside.rows]
-        best = np.full(materials, -np.inf)
+        labels, best = self.kept.labels[beside.rows], np.full(materials, -np.inf)
         np.maximum.at(best, labels, logs)
         ahead = [place for place in np.argsort(-best, kind="stable")[:BLENDED] if np.count_nonzero(labels == place) > 1]
         weights = [np.exp(EXPECTED * (logs - logs.max()))]
         for place in ahead:
             nearness = np.where(labels == place, logs - best[place], -np.inf)
             weights += [np.exp(warmth * nearness) for warmth in WARMTHS]
-        means = weighted_means(beside.others.reshape(len(logs), -1), np.array(weights))
-        mean = means[0].reshape(query.levels.shape).repeat(query.step, axis=1)[:, : query.columns]
+        means = _weighted_means(beside.others.reshape(len(logs), -1), np.array(weights))
+        means = means.reshape(len(weights), *query.levels.shape)
+        mean = means[0].repeat(query.step, axis=1)[:, : query.columns]
         expected[:, : mean.shape[1]] = mean
         blends = np.where(np.isnan(means[1:]), MISSING, np.rint(means[1:])).astype(np.uint8)
-        found = self._logs(query.levels, blends, beside.table).reshape(len(ahead), len(WARMTHS)).max(axis=1)
+        found = beside.table.log_likelihoods(query.levels, blends).reshape(len(ahead), len(WARMTHS)).max(axis=1)
         best[ahead] = np.maximum(best[ahead], found)
         return np.where(np.isfinite(best), best, best[np.isfinite(best)].min()), expected
 
 
-def _mean(values: FloatArray) -> float:
-    return float(values.sum()) / max(len(values), 1)
+def independent(energy: float, coherence: float, natural: float) -> float:
+    """The energy σ² of independent noise in a deviation of some energy v and coherence w.
+
+    natural: the coherence of natural deviations, of which the rest is made: w v = σ² + natural · (v − σ²).
+    """
+    return energy * min(max((natural - coherence) / (natural - 1), 0.0), 1.0) if natural > 1 else energy
+
+
+def _shape(deviation: FloatArray, seen: Known) -> tuple[float, float, float]:
+    """Energy and coherence of a deviation (C, T), 0 where not seen; the energy of its channels' means and slopes."""
+    counts, time = seen.sum(axis=1), np.arange(seen.shape[1])
+    values, among = max(int(counts.sum()), 1), np.maximum(counts, 1)
+    away = (time - (seen @ time / among)[:, None]) * seen
+    means = np.square(deviation.sum(axis=1)) / among
+    slopes = np.square((deviation * away).sum(axis=1)) / np.maximum(np.square(away).sum(axis=1), 1)
+    energy, together = float(np.square(deviation).sum()) / values, float(means.sum())
+    coherence = together / np.count_nonzero(counts) / energy if energy else 1.0
+    return energy, coherence, (together + float(slopes.sum())) / values
+
+
+def _weighted_means(levels: LevelArray, weights: FloatArray) -> npt.NDArray[np.float32]:
+    """Means of touches (n, C · T) by weights (means, n), of which the largest are 1; NaN where no touch has a value."""
+    keep = weights.max(axis=0) > NEGLIGIBLE
+    single, levels = weights[:, keep].astype(np.float32), levels[keep]
+    known = levels != MISSING
+    if known.all():
+        return np.asarray((single / single.sum(axis=1, keepdims=True)) @ levels.astype(np.float32))
+    total = single @ known.astype(np.float32)
+    return np.asarray(single @ (levels * known).astype(np.float32) / np.where(total > 0, total, np.float32(np.nan)))
 
 
 def _likelihood(kept: KeptArrays) -> Likelihood:
     """The tables of the spread by level: the mean deviation from the nearest touch, over levels half to twice as high.
 
-    The mean deviation, and not the standard deviation, which is a quarter more: kept touches that are likelier come
-    nearer than the nearest by all values does.
+    Not the standard deviation, a quarter more: likelier kept touches come nearer than the nearest by all values does.
     """
     counts, deviations = np.zeros(LEVELS), np.zeros(LEVELS)
     for row in range(0, len(kept), -(-len(kept) // PAIRS)):  # the rows are in the order of keys: at random
-        pair = kept.nearest_alike(row)
-        if pair is None:
-            continue
-        both = (pair[0] != MISSING) & (pair[1] != MISSING)
-        mine, near = (levels[both].astype(np.int64) for levels in pair)
-        counts += np.bincount(near, minlength=LEVELS)
-        deviations += np.bincount(near, np.abs(mine - near), minlength=LEVELS)
+        if (other := kept.nearest_alike(row)) is not None:
+            pair = kept.beginnings([row, other], kept.longest)
+            mine, near = pair[:, (pair != MISSING).all(axis=0)].astype(np.int64)
+            counts += np.bincount(near, minlength=LEVELS)
+            deviations += np.bincount(near, np.abs(mine - near), minlength=LEVELS)
     levels = np.arange(LEVELS)
-    least, most = np.floor(levels / 1.5 - 1).clip(0).astype(int), np.ceil(levels * 1.5 + 2).clip(0, LEVELS).astype(int)
+    alike = (levels >= np.floor(levels / 1.5 - 1)[:, None]) & (levels < np.ceil(levels * 1.5 + 2)[:, None])
     typical = (deviations.sum() + PRIOR_SPREAD) / (counts.sum() + 1)
-    spread = (_between(deviations, least, most) + PRIOR_VALUES * typical) / (
-        _between(counts, least, most) + PRIOR_VALUES
-    )
+    spread = (alike @ deviations + PRIOR_VALUES * typical) / (alike @ counts + PRIOR_VALUES)
     weights = counts + 1 / LEVELS
     return Likelihood(spread, weights / weights.sum())
-
-
-def _between(values: FloatArray, least: npt.NDArray[np.int_], most: npt.NDArray[np.int_]) -> FloatArray:
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    return np.asarray(sums[most] - sums[least])

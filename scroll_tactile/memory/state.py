@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scroll_tactile_store import Head, Record
 from scroll_tactile_store.records import LateArray
 
+from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.matching.likelihood import LevelArray, levels_of
-from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.touch_rows import (

@@ -16,11 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import KeptArrays, at_places
+from scroll_tactile.matching.kept_arrays import KeptTouch, at_places
 from scroll_tactile.matching.likelihood import CLEAN
-from scroll_tactile.matching.match import KeptTouch, Match, independent
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import Match, TouchMatcher, independent
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor, stream_of
@@ -32,8 +30,6 @@ from scroll_tactile.prediction.model import (
     Row,
     Trajectories,
     Weighing,
-    followed_to,
-    match_scores,
     softmax,
     tempered,
 )
@@ -126,18 +122,16 @@ class Draft:
 
     def solved(self) -> Model:
         """A model without a weighing. Can be called once: it frees the tasks."""
-        bare, before, kept = self.bare, self.before, None
+        bare = self.bare
         with one_thread():
             # One after the other, each task freed: all at once would take twice the memory of a model.
             readouts = {scale: self.tasks.pop(scale).solve() for scale in sorted(self.tasks)}
-            if self.kept and before is not None and before.matcher is not None and before.conformal is not None:
-                kept = followed_to(before.matcher.kept, before.conformal, self.kept)
-            elif self.kept:
-                kept = KeptArrays.of(self.kept), Conformal.of(self.kept)
-            matcher, conformal = (None, None) if kept is None else (TouchMatcher.of(kept[0]), kept[1])
+            # What an earlier model made of kept touches is not made again.
+            before = None if self.before is None else self.before.matcher
+            matcher = TouchMatcher.of(self.kept, before) if self.kept else None
         give_back_scratch()
         held_out = HeldOut(bare.kind, self.sample, readouts, [[*stage, *bare.views] for stage in bare.stages])
-        return replace(bare, readouts=readouts, held_out=held_out, matcher=matcher, conformal=conformal)
+        return replace(bare, readouts=readouts, held_out=held_out, matcher=matcher)
 
 
 def _weighed(model: Model, least: int, counts: Sequence[int]) -> Weighing | None:
@@ -208,7 +202,7 @@ def _by_kept_touches(model: Model, matcher: TouchMatcher) -> Model:
     losses = np.full((len(found), len(early)), np.nan)
     for of, each in zip(losses, found, strict=True):
         reached = [steps for steps in early if steps < each.query.columns]
-        of[: len(reached)] = matcher.excess_at(each, reached)
+        of[: len(reached)] = each.excess_at(reached)
     whole = np.array([match.excess_loss for match in matches])
 
     def weighed(row: Row, loss: FloatArray) -> Row:
@@ -277,7 +271,7 @@ def rehearse(model: Model) -> None:
                 elif place in chosen:
                     kept = chosen[place]
                     match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept, noise=CLEAN)
-                    logits = weighing.logits("prefix", own, match, match_scores(matcher, names, match), 0.0)
+                    logits = weighing.logits("prefix", own, match, matcher.scores_of(names, match), 0.0)
                     answered = tempered(softmax(logits), row.outliers)
                 else:
                     continue
@@ -354,7 +348,7 @@ def _measured_paces(
         high = float(novelties[rank]) / max(row.calibration.thresholds.above("", 1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
         for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
-            scored = match_scores(matcher, held.names, match)
+            scored = matcher.scores_of(held.names, match)
             logits.append(weighing.logits("paced", chances, match, scored, distance))
         targets += held.targets.tolist()
     natural = np.vstack([row.calibration.scale_novelty, row.excess])

@@ -27,12 +27,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.matching.conformal import Typicality
 from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
-from scroll_tactile.matching.match import Match
+from scroll_tactile.matching.matcher import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import noisy_excess_of, paces_of
-from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, softmax, tempered
+from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, softmax, tempered
 from scroll_tactile.readouts.calibration import NoveltyThresholds
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.results import Estimate, Prediction, Unusual
@@ -195,16 +194,13 @@ def _paced(
 
 
 def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> FloatArray:
-    """How typical touches are of each candidate, shape (C, 4); see `Typicality`."""
-    shares = np.ones((len(touches), len(candidates), len(Typicality._fields)))
-    if model.conformal is None:
-        return np.asarray(shares[0])
-    for own, touch in zip(shares, touches, strict=True):
-        rows, among = model.conformal.places(candidates)
-        own[among] = model.conformal.p_rows(_levels_of(touch.stream))[rows]
+    """How typical touches are of each candidate, shape (C, 4); see `Conformal.p_rows`."""
+    if model.matcher is None:
+        return np.ones((len(candidates), 4))
+    shares = [model.matcher.conformal.p_rows(_levels_of(touch.stream), candidates) for touch in touches]
     if len(shares) == 1:
-        return np.asarray(shares[0])
-    sums = [[math.fsum(column) for column in of.T] for of in shares.transpose(1, 0, 2)]
+        return shares[0]
+    sums = [[math.fsum(column) for column in of.T] for of in np.stack(shares, axis=1)]
     return np.minimum(1.0, 2 * np.array(sums) / len(shares))
 
 
@@ -221,7 +217,7 @@ def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: M
     """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts."""
     assert model.matcher is not None
     match = matched.match
-    scores = match_scores(model.matcher, candidates, match)
+    scores = model.matcher.scores_of(candidates, match)
     logits = model.fitted.logits(matched.hypothesis, alone.probability, match, scores, alone.distance)
     share = match.noise_share
     mean, spread = alone.row.excess if match.noise == CLEAN else noisy_excess_of(model)

@@ -18,10 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import CapacityError, ScrollTactileError
-from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.kept_arrays import KeptArrays
-from scroll_tactile.matching.match import KeptTouch, Match
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import Match, TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.readouts.calibration import (
     TINY,
@@ -49,8 +46,6 @@ __all__ = [
     "Trajectories",
     "Weighing",
     "enough_memory",
-    "followed_to",
-    "match_scores",
     "softmax",
     "tempered",
 ]
@@ -268,9 +263,9 @@ class Model:
     """Everything that predictions need of one state of a memory; it never changes.
 
     names: the materials, in alphabetical order. stages: for each, the windows that judge there. views: the views that
-    judge beside them. longest: the longest learned touch, in steps. readouts: scale → its readout. matcher, conformal:
-    of the kept touches. held_out: the touches that it was weighed by, weighing: how; None where nothing was learned.
-    since: the touches that were sampled since the fit.
+    judge beside them. longest: the longest learned touch, in steps. readouts: scale → its readout. matcher: of the kept
+    touches. held_out: the touches that it was weighed by, weighing: how; None where nothing was learned. since: the
+    touches that were sampled since the fit.
     """
 
     kind: ReadoutName
@@ -282,7 +277,6 @@ class Model:
     held_out: HeldOut
     weighing: Weighing | None = None
     matcher: TouchMatcher | None = None
-    conformal: Conformal | None = None
     readouts: dict[Scale, Readout] = field(default_factory=dict)
     since: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
     _of_all: dict[Scale, npt.NDArray[np.intp]] = field(init=False, default_factory=dict)
@@ -318,18 +312,17 @@ class Model:
             if (own := readout.followed(memory.statistics, changed)) is None:
                 return None
             readouts[scale] = own
-        matcher, conformal = self.matcher, self.conformal
-        if matcher is not None and conformal is not None and memory.kept is not None:
-            if (kept := followed_to(matcher.kept, conformal, memory.kept.touches())) is None:
+        matcher = self.matcher
+        if matcher is not None and memory.kept is not None:
+            if not (kept := memory.kept.touches()):
                 return None
-            matcher, conformal = matcher.followed(kept[0]), kept[1]
+            matcher = matcher.followed(kept)
         there = {(material, key) for material, key, _ in self.held_out.sample}
         return replace(
             self,
             names=list(memory.statistics.materials),
             readouts=readouts,
             matcher=matcher,
-            conformal=conformal,
             longest=memory.statistics.longest,
             since=[(material, key, touch) for material, key, touch in memory.sample if (material, key) not in there],
         )
@@ -439,27 +432,6 @@ class Model:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
         novel = [scales[place] for place in measuring(scales)]
         return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
-
-
-def followed_to(
-    arrays: KeptArrays, conformal: Conformal, kept: Sequence[KeptTouch]
-) -> tuple[KeptArrays, Conformal] | None:
-    """What is made of kept touches, for those that are kept now; None where there are none."""
-    there, now = set(arrays.touches), {(touch.material, touch.key) for touch in kept}
-    if there == now:
-        return arrays, conformal
-    added, removed = [touch for touch in kept if (touch.material, touch.key) not in there], there - now
-    if (followed := arrays.followed(added, removed)) is None:
-        return None
-    if followed.longest != arrays.longest:
-        return followed, Conformal.of(kept)
-    return followed, conformal.followed(added, removed)
-
-
-def match_scores(matcher: TouchMatcher, names: Sequence[str], match: Match) -> FloatArray:
-    """The kept touches' scores of some materials, (C,); the least of all for materials of which none is kept."""
-    places, least = {name: i for i, name in enumerate(matcher.kept.materials)}, float(match.scores.min())
-    return np.array([match.scores[places[name]] if name in places else least for name in names])
 
 
 def tempered(chances: FloatArray, outliers: float) -> FloatArray:

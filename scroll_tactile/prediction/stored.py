@@ -16,8 +16,7 @@ import numpy as np
 
 from scroll_tactile import __version__
 from scroll_tactile.matching.likelihood import Likelihood
-from scroll_tactile.matching.match import NaturalDeviation
-from scroll_tactile.matching.matcher import TouchMatcher
+from scroll_tactile.matching.matcher import NaturalDeviation
 from scroll_tactile.prediction.model import Model, Weighing
 from scroll_tactile.signals.windows import Scale
 
@@ -51,9 +50,8 @@ def read_weighing(text: str, model: Model) -> Model:
         matcher = model.matcher
         if matcher is not None:
             spread, weights, *natural = found["kept"]
-            matcher = TouchMatcher(
-                matcher.kept, NaturalDeviation(Likelihood(np.array(spread), np.array(weights)), *natural)
-            )
+            likelihood = Likelihood(np.array(spread), np.array(weights))
+            matcher = replace(matcher, deviation=NaturalDeviation(likelihood, *natural))
     except (KeyError, TypeError, IndexError, RecursionError) as error:
         raise ValueError(f"it is no weighing ({type(error).__name__}: {error})") from error
     return replace(model, weighing=weighing, matcher=matcher)

@@ -27,8 +27,8 @@ from scroll_tactile.embeddings.convolution import (
     count_by_c,
     count_by_numpy,
 )
-from scroll_tactile.matching import comparing
-from scroll_tactile.matching.likelihood import MISSING
+from scroll_tactile.matching.kept_arrays import mean_distances
+from scroll_tactile.matching.likelihood import CLEAN, MISSING, Table
 
 SOURCES = Path(native.__file__).parent
 compiled = pytest.mark.skipif(not native.available, reason=f"the compiled kernels are not at work: {native.reason}")
@@ -98,26 +98,6 @@ def test_a_module_that_counts_wrong_is_not_used(monkeypatch):
         assert not convolution._agrees()
     finally:
         convolution._agrees.cache_clear()
-
-
-@compiled
-@pytest.mark.parametrize("name", ["sum_logs", "distances"])
-def test_a_module_that_compares_wrong_is_not_used(name, monkeypatch):
-    right = getattr(native, name)
-
-    def wrong(*arguments):
-        right(*arguments)
-        arguments[-1].reshape(-1)[-1] += 1
-
-    rows, guesses, known = np.arange(12, dtype=np.uint8).reshape(3, 4), np.int16([[4, 8, 12, 16]]), np.ones(4, bool)
-    expected = comparing.mean_distances(rows, guesses, known)
-    monkeypatch.setattr(native, name, wrong)
-    comparing._agrees.cache_clear()
-    try:
-        assert comparing.mean_distances(rows, guesses, known).tobytes() == expected.tobytes()
-        assert not comparing.compiled()
-    finally:
-        comparing._agrees.cache_clear()
 
 
 def arguments():
@@ -190,10 +170,10 @@ def test_touches_are_compared_as_by_numpy(data):
     guesses = rng.integers(-1024, 2041, (data.draw(st.integers(1, 5)), width)).astype(np.int16)
     known, own = rng.random(width) < 0.8, rng.integers(0, 256, width).astype(np.uint8)
     logs = rng.integers(-(2**15), 2**15, 256 * 256).astype(np.int16)
+    table = Table(CLEAN, logs, 0.0, 1.0, np.zeros(255), np.zeros(255), 1.0)
     with pytest.MonkeyPatch.context() as monkeypatch:
         by_c, by_numpy = both(
-            monkeypatch,
-            lambda: (comparing.mean_distances(rows, guesses, known), comparing.log_sums(own, rows, logs)),
+            monkeypatch, lambda: (mean_distances(rows, guesses, known), table.log_likelihoods(own, rows))
         )
     assert [array.tobytes() for array in by_c] == [array.tobytes() for array in by_numpy]
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from faults.model import Row, State
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.matching.conformal import Conformal
-from scroll_tactile.matching.match import KeptTouch
+from scroll_tactile.matching.kept_arrays import KeptArrays, KeptTouch
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import DESCRIBE, RETRACT, unspanned
 from scroll_tactile.results import Prediction
@@ -118,14 +118,14 @@ class Truth:
                 KeptTouch(name, key, kept_touches.levels(self.stream(key).readings))
                 for name, key in self.states[row].pairs
             ]
-            self._conformal[row] = Conformal.of(kept)
+            self._conformal[row] = Conformal(KeptArrays(kept))
         once = {stream.key: stream for stream in streams} if len(streams) > 1 else {b"": streams[0]}
         conformal = self._conformal[row]
-        rows = [conformal.p_rows(kept_touches.levels(once[key].readings)) for key in sorted(once)]
-        found = [dict(zip(conformal.materials, shares[:, 0].tolist(), strict=True)) for shares in rows]
+        levels = [kept_touches.levels(once[key].readings) for key in sorted(once)]
+        found = [conformal.p_rows(own, names)[:, 0].tolist() for own in levels]
         if len(found) == 1:
-            return tuple(found[0][name] for name in names)
-        return tuple(min(1.0, 2 * math.fsum(of[name] for of in found) / len(found)) for name in names)
+            return tuple(found[0])
+        return tuple(min(1.0, 2 * math.fsum(of) / len(found)) for of in zip(*found, strict=True))
 
 
 @dataclass

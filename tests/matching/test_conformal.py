@@ -1,11 +1,13 @@
 """Class-conditional conformal sets against a plain model, their coverage, and crepes on the same scores."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
-from scroll_tactile.matching.conformal import OTHER_WEIGHT, Conformal, Typicality
+from scroll_tactile.matching.conformal import OTHER_WEIGHT, Conformal
+from scroll_tactile.matching.kept_arrays import KeptArrays, KeptTouch, log_steps
 from scroll_tactile.matching.likelihood import MISSING
-from scroll_tactile.matching.match import KeptTouch
 
 CHANNELS, COLUMNS = 3, 40
 
@@ -24,14 +26,26 @@ def kept(materials=4, of_each=25, first=0):
     return [KeptTouch(f"m{m}", bytes([m, i]), touch(m, first + i)) for m in range(materials) for i in range(of_each)]
 
 
+class Typicality(NamedTuple):
+    share: float
+    least: float
+    of_all: float
+    least_of_all: float
+
+
+def conformal_of(touches, before=None):
+    return Conformal(KeptArrays(touches, before and before._kept), before)
+
+
 def p_values(conformal, asked):
-    return {name: Typicality(*row) for name, row in zip(conformal.materials, conformal.p_rows(asked), strict=True)}
+    names = conformal._kept.materials
+    return {name: Typicality(*row) for name, row in zip(names, conformal.p_rows(asked, names), strict=True)}
 
 
-def plain(touches, conformal, asked, reach):
+def plain(touches, edges, asked, reach):
     """p-values by the definition: each material in turn, each kept touch beside all others and the one asked about."""
-    steps = [conformal._steps_of([kept.levels])[0][: reach * CHANNELS].astype(float) for kept in touches]
-    new = conformal._steps_of([asked])[0][: reach * CHANNELS].astype(float)
+    levels = [*(kept.levels for kept in touches), asked]
+    *steps, new = (log_steps(each[None], edges)[0][0, :reach].astype(float) for each in levels)
     labels = [kept.material for kept in touches]
 
     def nonconformity(i, bag, own):
@@ -57,11 +71,11 @@ def plain(touches, conformal, asked, reach):
 @pytest.mark.parametrize("columns", [COLUMNS, 13])
 def test_p_values_are_those_of_the_definition(columns):
     touches = kept(materials=3, of_each=6)
-    conformal = Conformal.of(touches)
-    reach = int(np.searchsorted(conformal._edges[1:], columns, side="right"))
+    conformal, edges = conformal_of(touches), KeptArrays(touches).early
+    reach = int(np.searchsorted(edges[1:], columns, side="right"))
     for seed in range(50, 54):
         asked = touch(seed % 3, seed, columns)
-        found, expected = p_values(conformal, asked), plain(touches, conformal, asked, reach)
+        found, expected = p_values(conformal, asked), plain(touches, edges, asked, reach)
         assert found.keys() == expected.keys()
         assert all(found[name] == pytest.approx(expected[name]) for name in found)
 
@@ -71,7 +85,7 @@ def test_each_material_is_covered(columns):
     """Over the choice of what is kept, too: of any one choice coverage is off by that of 25 touches."""
     values = np.zeros((4, 30, 10, 2))  # of each material, draw and touch: among its own, and among all
     for draw in range(30):
-        conformal = Conformal.of(kept(first=1000 * draw))
+        conformal = conformal_of(kept(first=1000 * draw))
         for m, i in np.ndindex(4, 10):
             value = p_values(conformal, touch(m, 1000 * draw + 500 + i, columns))[f"m{m}"]
             values[m, draw, i] = value.share, value.of_all
@@ -85,49 +99,46 @@ def test_each_material_is_covered(columns):
 def test_any_order_and_any_way_to_it_gives_the_same_bytes():
     touches = kept(of_each=8)
     asked = touch(1, 200, 25)
-    first = p_values(Conformal.of(touches), asked)
-    assert p_values(Conformal.of(touches[::-1]), asked) == first
-    before = Conformal.of([*touches[:20], touches[-1]])
+    first = p_values(conformal_of(touches), asked)
+    assert p_values(conformal_of(touches[::-1]), asked) == first
+    before = conformal_of([*touches[:20], touches[-1]])
     start = p_values(before, asked)  # so that it has distances to follow
-    followed = before.followed(touches[20:-1], set())
+    followed = conformal_of(touches, before)
     assert p_values(followed, asked) == first
     assert p_values(before, asked) == start
-    gone = {(touch.material, touch.key) for touch in touches[3:6]}
-    left = [touch for touch in touches if (touch.material, touch.key) not in gone]
-    fewer = followed.followed([], gone)
-    assert p_values(fewer, asked) == p_values(Conformal.of(left), asked)
-    assert p_values(fewer.followed(touches[3:6], set()), asked) == first
-    assert p_values(fewer.followed(touches[3:6], set(fewer._touches[:2])), asked) == p_values(
-        Conformal.of(left[2:] + touches[3:6]), asked
-    )
+    left, swapped = touches[:3] + touches[6:], touches[2:]
+    fewer = conformal_of(left, followed)
+    assert p_values(fewer, asked) == p_values(conformal_of(left), asked)
+    assert p_values(conformal_of(touches, fewer), asked) == first
+    assert p_values(conformal_of(swapped, fewer), asked) == p_values(conformal_of(swapped), asked)
 
 
 def test_few_touches_exclude_nothing_and_one_material_is_always_typical():
     strange = np.full((CHANNELS, COLUMNS), 250, np.uint8)
-    few, enough = (p_values(Conformal.of(kept(of_each=count)), strange).values() for count in (18, 19))
+    few, enough = (p_values(conformal_of(kept(of_each=count)), strange).values() for count in (18, 19))
     assert min(few).share > 0.05 >= min(enough).share
     assert {value.least for value in few} == {1 / 19}
     assert max(value.of_all for value in few) <= 0.05  # of all materials together there are enough
-    alone = Conformal.of(kept(materials=1, of_each=5))
+    alone = conformal_of(kept(materials=1, of_each=5))
     assert 0 < p_values(alone, touch(0, 99))["m0"].share <= 1
-    assert min(p_values(Conformal.of(kept(materials=2, of_each=1)), touch(0, 99)).values()).share >= 0.5
+    assert min(p_values(conformal_of(kept(materials=2, of_each=1)), touch(0, 99)).values()).share >= 0.5
 
 
 def test_touches_too_short_or_with_gaps_are_compared_by_what_they_have():
     touches = kept(of_each=20)
-    long = Conformal.of([KeptTouch("m", b"0", np.zeros((1, 10_000), np.uint8))])
-    assert long.p_rows(np.zeros((1, 2), np.uint8)).tolist() == [[1.0] * 4]
-    conformal = Conformal.of(touches)
+    long = conformal_of([KeptTouch("m", b"0", np.zeros((1, 10_000), np.uint8))])
+    assert long.p_rows(np.zeros((1, 2), np.uint8), ["m"]).tolist() == [[1.0] * 4]
+    conformal = conformal_of(touches)
     gap = touch(2, 300).copy()
     gap[0, 5:30] = MISSING
     assert p_values(conformal, gap)["m2"].share > 0.05
     gap[:] = MISSING
-    assert np.isfinite(conformal.p_rows(gap)).all()
-    ragged = Conformal.of([*touches[:-1], KeptTouch("m3", b"s", touch(3, 400, 15))])
+    assert np.isfinite([*p_values(conformal, gap).values()]).all()
+    ragged = conformal_of([*touches[:-1], KeptTouch("m3", b"s", touch(3, 400, 15))])
     assert p_values(ragged, touch(3, 401))["m3"].share > 0.05
 
 
-def test_places_are_of_the_list_that_is_asked_for():
-    conformal = Conformal.of(kept(of_each=1))
-    for candidates, expected in ((["m0", "m1"], [[0, 1], [0, 1]]), (["a", "m1", "m3"], [[1, 3], [1, 2]])):
-        assert [places.tolist() for places in conformal.places(candidates)] == expected
+def test_rows_are_of_the_materials_that_are_asked_for():
+    conformal = conformal_of(kept(of_each=4))
+    every, asked = p_values(conformal, touch(1, 200)), conformal.p_rows(touch(1, 200), ["a", "m3", "m1"]).tolist()
+    assert asked == [[1.0] * 4, [*every["m3"]], [*every["m1"]]]

@@ -9,15 +9,16 @@ from scroll_tactile.matching.likelihood import (
     LEVELS,
     MISSING,
     MOST_TABLES,
+    NOISES,
     UNIT,
     Likelihood,
     Noise,
+    _table,
     levels_of,
-    noise_at,
 )
 from scroll_tactile.sensors import Sensor
 
-NOISES = [CLEAN, *(Noise(step) for step in (200, 393, 461)), Noise(137, True), Noise(387, True)]
+SOME = [CLEAN, *(Noise(step) for step in (200, 393, 461)), Noise(137, True), Noise(387, True)]
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +26,13 @@ def likelihood():
     return Likelihood(1 + 0.05 * np.arange(LEVELS), np.full(LEVELS, 1 / LEVELS))
 
 
-@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("noise", SOME)
 def test_each_level_becomes_some_level_with_certainty(likelihood, noise):
     chances = np.exp(likelihood.table(noise).logs.reshape(256, 256)[:LEVELS, :LEVELS] / UNIT)
     assert np.allclose(chances.sum(axis=0), 1, atol=2e-3)
 
 
-@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("noise", SOME)
 def test_chances_are_those_of_draws(likelihood, noise, draws=200_000):
     rng, reach = np.random.default_rng(0), noise.amplitude * (LEVELS - 1)
     table = likelihood.table(noise)
@@ -61,9 +62,10 @@ def test_noise_hides_how_touches_differ(likelihood):
     assert information[-1] < 0.01
 
 
-def test_only_the_latest_tables_are_kept(likelihood, monkeypatch):
-    make, made = Likelihood._made, []
-    monkeypatch.setattr(Likelihood, "_made", lambda self, noise: made.append(noise) or make(self, noise))
+def test_only_the_latest_tables_are_kept(monkeypatch):
+    make, made = _table, []
+    monkeypatch.setattr("scroll_tactile.matching.likelihood._table", lambda *of: made.append(of[-1]) or make(*of))
+    likelihood = Likelihood(np.full(LEVELS, 3.0), np.full(LEVELS, 1 / LEVELS))
     first = likelihood.table(Noise(0)).logs
     for step in range(1, MOST_TABLES + 2):
         likelihood.table(Noise(step))
@@ -76,14 +78,13 @@ def test_log_likelihoods_by_amplitude_are_those_of_the_tables():
     """Where the spread is one for all levels, a value's is that of its deviation, and of how far in the end is."""
     likelihood = Likelihood(np.full(LEVELS, 3.0), np.full(LEVELS, 1 / LEVELS))
     for column in (0, AMPLITUDES - 1, 393, AMPLITUDES + 100):
-        logs = likelihood.table(noise_at(column)).logs.reshape(256, 256) / UNIT
+        logs = likelihood.table(NOISES[column]).logs.reshape(256, 256) / UNIT
         found = likelihood.by_amplitude[:, column]
         away = np.arange(100)
         assert np.allclose(found[away], logs[120 - away // 2, 120 + (away + 1) // 2], atol=1e-3)
         for end, kept in ((0, away), (LEVELS - 1, LEVELS - 1 - away)):
             assert np.allclose(found[256 + away], logs[end, kept], atol=1e-3)
-    assert noise_at(393) == Noise(393)
-    assert noise_at(AMPLITUDES + 100) == Noise(100, True)
+    assert (NOISES[393], NOISES[AMPLITUDES + 100]) == (Noise(393), Noise(100, True))
     assert Noise(AMPLITUDES - 1).amplitude == pytest.approx(1, abs=0.01)
     assert not likelihood.by_amplitude[[255, 511]].any()
 

@@ -1,14 +1,15 @@
 """Kept touches asked about touches that noise, dead channels or gaps came over."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.kept_arrays import KeptArrays
+from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
-from scroll_tactile.matching.match import KeptTouch
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.sensors import Sensor
 
@@ -42,7 +43,7 @@ def noisy(levels, amplitude, seed, normal=False):
 
 
 def matcher_of(touches):
-    return TouchMatcher.of(KeptArrays.of(touches))
+    return TouchMatcher.of(touches)
 
 
 @pytest.fixture(scope="module")
@@ -93,19 +94,13 @@ def test_whatever_comes_and_goes_it_holds_what_a_set_would(toggled, rng):
     touches = [KeptTouch(one.material, one.key, one.levels[:, : 80 + 2 * i]) for i, one in enumerate(kept(each=4))]
     held, matcher = {0, 1, 2}, matcher_of(touches[:3])
     for i in toggled:
-        own = touches[i].material, touches[i].key
-        added, removed = ([], [own]) if i in held else ([touches[i]], [])
         before, count = matcher.kept, len(held)
-        held ^= {i}
-        followed = before.followed(added, removed)
+        held = held ^ {i} or {i}
+        matcher = matcher.followed([touches[j] for j in held])
         assert len(before) == count
-        assert (followed is None) == (not held)
-        if followed is None:
-            held, followed = {i}, before
-        matcher = matcher.followed(followed)
     stays = [touches[i] for i in held]
     rng.shuffle(stays)
-    anew = TouchMatcher(KeptArrays.of(stays), matcher.deviation)
+    anew = replace(matcher_of(stays), deviation=matcher.deviation)
     assert matcher.kept.touches == anew.kept.touches
     assert matcher.kept.materials == anew.kept.materials
     asked = noisy(touch(rng.randrange(MATERIALS), 100), 0.3, 1)
@@ -121,7 +116,7 @@ def test_a_touch_left_out_is_as_if_it_were_not_kept():
     touches = kept(each=4)
     matcher = matcher_of(touches)
     row = matcher.kept.rows()[touches[6].key]
-    without = matcher.followed(KeptArrays.of([stays for stays in touches if stays is not touches[6]]))
+    without = matcher.followed([stays for stays in touches if stays is not touches[6]])
     asked = matcher.kept.levels(row)
     left_out = matcher.match(asked, held_out=row)
     assert same(left_out, without.match(asked))
@@ -136,7 +131,7 @@ def test_excess_loss_of_beginnings_is_that_of_a_touch_that_ends_there(columns):
     matcher, steps = matcher_of([*touches, KeptTouch("short", b"s", touch(6, 0)[:, :50])]), [2, 40, 60]
     asked = touch(2, 100)[:, :columns]
     asked[1, 5:9] = MISSING
-    found = matcher.excess_at(matcher.beside(matcher.query(asked), CLEAN), steps)
+    found = matcher.beside(matcher.query(asked), CLEAN).excess_at(steps)
     expected = [matcher.match(asked[:, :until], noise=CLEAN).excess_loss for until in steps]
     assert found == pytest.approx(expected)
 
@@ -250,7 +245,6 @@ def test_touches_of_other_lengths_and_one_touch_alone():
     assert ragged.kept.materials[np.argmax(ragged.match(touch(6, 100)[:, :50]).scores)] == "short"
     assert ragged.kept.materials[np.argmax(ragged.match(noisy(touch(6, 100), 0.2, 0)).scores)] == "short"
     assert ragged.kept.materials[np.argmax(ragged.match(noisy(touch(1, 100), 0.2, 0)).scores)] == "m1"
-    assert ragged.kept.followed([], ragged.kept.touches) is None
     for wrong, said in (
         ([], "one or more"),
         ([*kept(each=1), KeptTouch("o", b"o", np.zeros((3, 9), np.uint8))], "same"),

@@ -26,7 +26,7 @@ from scroll_tactile.errors import (
 )
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.decision import DecisionRule, decision_rule
-from scroll_tactile.matching.match import KeptTouch
+from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
@@ -305,16 +305,13 @@ def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
             times = max(1, round(sampled.pairs[rows[0], 2] / len(rows)))
             codes[scale] = np.repeat(sampled.rows[rows], times, axis=0)
     statistics.remove(touch.material, codes, statistics.longest)  # of some length: readouts do not depend on lengths
-    readouts = dict(model.readouts)
+    readouts, matcher = dict(model.readouts), model.matcher
     for scale in codes:
         readouts[scale] = Task.of(statistics, scale, readouts[scale].reference, model.plan.shrinkage).solve()
-    other, matcher, conformal = replace(model, readouts=readouts), model.matcher, model.conformal
-    if matcher is None or conformal is None or own not in matcher.kept.touches:
-        return other
-    kept = matcher.kept.followed((), [own])
-    if kept is None:
-        return replace(other, matcher=None, conformal=None)
-    return replace(other, matcher=matcher.followed(kept), conformal=conformal.followed((), {own}))
+    if matcher is not None and memory.kept is not None:
+        kept = [each for each in memory.kept.touches() if (each.material, each.key) != own]
+        matcher = matcher.followed(kept) if kept else None
+    return replace(model, readouts=readouts, matcher=matcher)
 
 
 @dataclass

@@ -20,8 +20,8 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.prediction.features import Encoded
 from scroll_tactile.prediction.model import Model
 from scroll_tactile.readouts.attributes import GAMMAS, Curve, RidgeSystem, fit_curve, solve
-from scroll_tactile.readouts.calibration import novelty_measures
 from scroll_tactile.readouts.leave_one_out import StageScores
+from scroll_tactile.readouts.novelty import novelty_measures
 from scroll_tactile.results import Constituent
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread

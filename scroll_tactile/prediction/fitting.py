@@ -37,18 +37,10 @@ from scroll_tactile.prediction.model import (
     neighbours_of,
     tempered,
 )
-from scroll_tactile.readouts.calibration import (
-    AHEAD,
-    FEWEST,
-    TINY,
-    HeldOutProbabilities,
-    Neighbours,
-    calibrate_stage,
-    fit_weights,
-    held_out_probabilities,
-)
+from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, fit_weights
 from scroll_tactile.readouts.dependence import dependence_of
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
+from scroll_tactile.readouts.novelty import FEWEST, TINY, Neighbours, novelty_measures
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale, WindowPlan
@@ -172,27 +164,27 @@ def _weighed(draft: Draft, model: Model) -> Weighing | None:
     held_out = held_out_of(model, draft.sample)
     made = dict[tuple[int, Scale], Neighbours]()  # once for both rows of a stage
 
-    def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
-        """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
+    def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, StageScores, FloatArray, FloatArray]:
+        """How touches are judged by some scales at a stage, held-out ones, and what `Calibration.held_out` says."""
         found = StageScores(stage, draft.sample, [held_out[scale] for scale in scales])
         readouts = [model.readouts[scale] for scale in scales]
         near = neighbours_of(model, draft.sample, stage, scales, made) if len(found.places) >= FEWEST else []
         calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views), neighbours=near)
-        held = held_out_probabilities(found, scales, calibration, near)
-        own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
-        rate = _outlier_rate(own, len(held.names)) if len(own) else 0.0
-        return Row(steps, stage, tuple(scales), calibration, rate, rate), held
+        logs, distance = calibration.held_out(found, scales)
+        own = np.exp(logs[np.arange(len(logs)), found.targets])
+        rate = _outlier_rate(own, len(found.names)) if len(own) else 0.0
+        return Row(steps, stage, tuple(scales), calibration, rate, rate), found, logs, distance
 
     rows = [row(stage, scales, milestones[stage])[0] for stage, scales in enumerate(reached)]
-    complete, held = row(last, [*reached[last], *model.views], draft.least)
-    if len(held.keys):
-        complete = replace(complete, distance_limit=float(np.quantile(held.distance, WITHIN)))
+    complete, found, logs, distance = row(last, [*reached[last], *model.views], draft.least)
+    if len(distance):
+        complete = replace(complete, distance_limit=float(np.quantile(distance, WITHIN)))
     return Weighing(
         rows=tuple(rows),
         complete=complete,
         paced=row(last, model.views, 1)[0] if model.views else complete,
         tau=UNMATCHED,
-        dependence=dependence_of(held),
+        dependence=dependence_of(found.keys, found.targets, logs, complete.calibration.thresholds.novelties),
         least=draft.least,
         touches=sum(draft.counts),
         sample=draft.sample,
@@ -312,9 +304,10 @@ def rehearse(model: Model) -> None:
     with one_thread():
         for stage, row in enumerate(early):
             found = StageScores(stage, weighing.sample, [held_out[scale] for scale in row.scales])
-            held = held_out_probabilities(found, row.scales, row.calibration, model.neighbours(row))
-            for i, place in enumerate(held.places if held.names == names else ()):
-                own = np.exp(held.logs[i])
+            logs, _ = row.calibration.held_out(found, row.scales)
+            novelties = row.calibration.novelty(novelty_measures(found, model.neighbours(row))[0])
+            for i, place in enumerate(found.places if found.names == names else ()):
+                own = np.exp(logs[i])
                 if matcher is None or chosen is None:
                     answered = tempered(own, row.readout_outliers)
                 elif place in chosen:
@@ -324,8 +317,8 @@ def rehearse(model: Model) -> None:
                     answered = tempered(fused, row.outliers)
                 else:
                     continue
-                chances[place, stage], novelty[place, stage] = answered, held.novelty[i]
-                targets[place] = held.targets[i]
+                chances[place, stage], novelty[place, stage] = answered, novelties[i]
+                targets[place] = found.targets[i]
     reached = np.isfinite(novelty).any(axis=1)
     weighing.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
 
@@ -386,7 +379,7 @@ def _measured_paces(
     others, logs, targets = [], list[FloatArray](), list[int]()
     for number in range(len(PACES)):
         found = StageScores(number, weighing.sample, held_out)
-        held = held_out_probabilities(found, model.views, row.calibration)
+        log_chances, distances = row.calibration.held_out(found, model.views)
         own = [matches[number, place] for place in found.places]
         values = np.column_stack([found.distances().min(axis=2), [match.excess_loss for match in own]])
         mean, spread = values.mean(axis=0), np.maximum(values.std(axis=0), LEAST_SPREAD)
@@ -396,10 +389,10 @@ def _measured_paces(
         rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
         high = float(novelties[rank]) / max(row.calibration.thresholds.above("", 1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
-        for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
-            scores = match_scores(matcher, held.names, match)
+        for match, chances, distance in zip(own, np.exp(log_chances), distances.tolist(), strict=True):
+            scores = match_scores(matcher, found.names, match)
             logs.append(np.log(weighing.fused("paced", chances, match, scores, distance) + TINY))
-        targets += held.targets.tolist()
+        targets += found.targets.tolist()
     natural = np.vstack([row.calibration.scale_novelty, row.excess])
     power = fit_weights(np.stack(logs)[:, None], targets, np.ones(1), POWER_TOUCHES)
     return Paces(natural, np.stack(others), float(power[0]))

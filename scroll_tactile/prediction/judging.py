@@ -33,9 +33,9 @@ from scroll_tactile.matching.match import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import noisy_excess_of, paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, match_scores, tempered
-from scroll_tactile.readouts.calibration import NoveltyThresholds, held_out_probabilities
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.leave_one_out import StageScores
+from scroll_tactile.readouts.novelty import NoveltyThresholds, novelty_measures
 from scroll_tactile.results import Estimate, Prediction, Unusual
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.moments import one_thread
@@ -316,19 +316,20 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     for stage in range(len(weighing.rows) - 1, -1, -1):
         row = weighing.row("complete", stage)
         found = StageScores(stage, weighing.sample, [model.held_out[scale] for scale in row.scales])
-        held = held_out_probabilities(found, row.scales, row.calibration, model.neighbours(row))
-        for i, place in enumerate(held.places):
+        logs, distances = row.calibration.held_out(found, row.scales)
+        novelties = row.calibration.novelty(novelty_measures(found, model.neighbours(row))[0])
+        for i, place in enumerate(found.places):
             if place in answers:
                 continue
             material, key, _ = weighing.sample[place]
-            chances = np.exp(held.logs[i])
-            alone = Judgement(chances, float(held.novelty[i]), row, float(held.distance[i]))
+            chances = np.exp(logs[i])
+            alone = Judgement(chances, float(novelties[i]), row, float(distances[i]))
             if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):
                 [matched] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
-                result = _fused(model, held.names, alone, matched)
+                result = _fused(model, found.names, alone, matched)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
-            names = tuple(held.names)
+            names = tuple(found.names)
             called = names[int(result.probability.argmax())]
             threshold = row.calibration.thresholds.above(called, false_alarms)
             answers[place] = HeldOutTouch(material, key, names, result.probability, result.novelty, threshold)

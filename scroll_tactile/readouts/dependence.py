@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.readouts.calibration import FEWEST, HeldOutProbabilities, fit_weights
+from scroll_tactile.readouts.calibration import fit_weights
+from scroll_tactile.readouts.novelty import FEWEST, TINY
 
 __all__ = ["Dependence", "dependence_of"]
 
@@ -27,7 +28,6 @@ FloatArray = npt.NDArray[np.float64]
 
 DEFAULT = 0.25  # ρ and ρ' where nothing is measured: about that of prefixes of BioTac's touches
 PRIOR_TOUCHES = 2.0  # the prior of ρ counts as so many pairs
-TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -51,32 +51,33 @@ class Dependence:
         return math.fsum(novelties) / math.sqrt(count * (1 + (count - 1) * self.novelty))
 
 
-def dependence_of(held: HeldOutProbabilities) -> Dependence:
-    """Fit both to held-out touches."""
-    groups: dict[int, list[int]] = {}
-    for row in sorted(range(len(held.keys)), key=held.keys.__getitem__):
-        groups.setdefault(int(held.targets[row]), []).append(row)
-    several = [rows for _, rows in sorted(groups.items()) if len(rows) > 1]
-    pairs = [pair for rows in several for pair in zip(rows[::2], rows[1::2], strict=False)]
+def dependence_of(
+    keys: Sequence[bytes], targets: npt.NDArray[np.intp], logs: FloatArray, novelties: FloatArray
+) -> Dependence:
+    """Fit both to N held-out touches: their content hashes, materials, log-probabilities, (N, C), and novelties, (N,).
+
+    Where these are too few they may be without novelties.
+    """
+    order = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+    groups = [order[targets[order] == target] for target in np.unique(targets)]
+    several = [group for group in groups if len(group) > 1]
+    pairs = np.array([pair for group in several for pair in zip(group[::2], group[1::2], strict=False)], dtype=np.intp)
     if len(pairs) < FEWEST or len(groups) < 2:
         return Dependence()
-    scores = np.array([[held.logs[first] + held.logs[second]] for first, second in pairs])
     prior = np.array([1 / (1 + DEFAULT)])
-    weight = float(fit_weights(scores, [int(held.targets[first]) for first, _ in pairs], prior, PRIOR_TOUCHES)[0])
+    weight = float(fit_weights(logs[pairs].sum(axis=1)[:, None], targets[pairs[:, 0]], prior, PRIOR_TOUCHES)[0])
     rho = float(np.clip(1 / max(weight, TINY) - 1, 0.0, 1.0))
-    return Dependence(rho, _correlation([held.novelty[rows].tolist() for rows in several]))
+    return Dependence(rho, _correlation([novelties[group] for group in several]))
 
 
-def _correlation(groups: Sequence[Sequence[float]]) -> float:
+def _correlation(groups: Sequence[FloatArray]) -> float:
     """The intraclass correlation of groups, two values or more in each (Fisher 1925), from 0 to 1."""
-    counts = np.array([len(group) for group in groups])
-    means = np.array([np.mean(group) for group in groups])
-    total, mean = int(counts.sum()), float(np.concatenate([np.array(group) for group in groups]).mean())
-    if len(groups) < 2 or total <= len(groups):
+    if len(groups) < 2:
         return DEFAULT
-    within = sum(float(np.square(np.array(group) - own).sum()) for group, own in zip(groups, means, strict=True))
-    within /= total - len(groups)
-    between = float((counts * np.square(means - mean)).sum()) / (len(groups) - 1)
-    size = (total - float(np.square(counts).sum()) / total) / (len(groups) - 1)
+    counts, values = np.array([len(group) for group in groups]), np.concatenate(groups)
+    means, total, others = np.array([group.mean() for group in groups]), len(values), len(groups) - 1
+    within = float(np.square(values - np.repeat(means, counts)).sum()) / (total - len(groups))
+    between = float((counts * np.square(means - values.mean())).sum()) / others
+    size = (total - float(np.square(counts).sum()) / total) / others
     share = (between - within) / (between + (size - 1) * within) if between + within > 0 else 0.0
     return float(np.clip(share, 0.0, 1.0))

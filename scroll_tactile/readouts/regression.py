@@ -9,12 +9,12 @@ The residuals of a group of touches under the head that never had them follow fr
 group): r_g = B_gg⁻¹ α_g. Groups are touches for a head that answers for known materials, and materials for one that
 answers for new ones; λ is the one of least r². The features' units alone rest on all touches.
 
-Each scale has a head of its own, and a quantity is Σ_s w_s f_s with w ≥ 0, Σ w = 1, of least squared residual
-(stacked regression, Breiman 1996). A residual that calibrates is taken at the λ and w that are best for other touches:
-at those that it had a part in choosing, intervals of 80 % from 21 touches covered 71 %, and cover 75; from 45 touches
-77 and 79. Intervals are f ± a quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of
-the mean of their distributions (pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for many materials, and for
-few as far as these are like the next.
+Each scale has a head of its own, and a quantity is Σ_s w_s f_s with w ≥ 0, Σ w = 1, of least squared residual (stacked
+regression, Breiman 1996). A residual that calibrates is taken at the λ and w that are best for other touches: at those
+that it had a part in choosing, intervals of 80 % from 21 touches covered 71 %, and cover 75; from 45 touches 77 and 79.
+Intervals are f ± a quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of the mean of
+their distributions (pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for many materials, and for few as far
+as these are like the next.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +38,7 @@ LAMBDAS = tuple(2.0**power for power in range(5, -17, -1))  # in units of G's me
 LEAST_VARIANCE = 1e-3  # of a feature, as a share of their mean: what hardly varies is not blown up
 FOLDS = 10  # parts of the groups: for the residuals of each, λ and the weights of scales are chosen by the others
 PRIOR = 2.0  # touches: with fewer, the weights of scales are drawn to those of independent residuals
+TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -75,25 +75,22 @@ class Spectrum:
 
         targets: (n,). members: the places of each group's touches; no group has them all.
         """
-        onto = self.vectors.T @ targets
-        return np.stack([self._held_out(1.0 / (self.values + penalty), onto, members) for penalty in LAMBDAS])
+        filters = 1.0 / (self.values + np.array(LAMBDAS)[:, None])  # the eigenvalues of B
+        alpha = (filters * (self.vectors.T @ targets)) @ self.vectors.T
+        if len(members) == len(targets):
+            return np.asarray(alpha / (filters @ np.square(self.vectors).T))
+        residuals = np.empty_like(alpha)
+        for group in members:
+            own = self.vectors[group]
+            within = (own * filters[:, None]) @ own.T
+            residuals[:, group] = np.linalg.solve(within, alpha[:, group, None])[:, :, 0]
+        return residuals
 
     def solve(self, targets: FloatArray, penalty: float) -> tuple[FloatArray, float]:
         """(weights (d,), intercept) of the head over features that are not standardised."""
         alpha = self.vectors @ (self.vectors.T @ targets / (self.values + penalty))
         weights = self.unit * (alpha @ self.rows) / self.size
         return weights, float(targets.mean() - weights @ self.center)
-
-    def _held_out(self, filters: FloatArray, onto: FloatArray, members: Sequence[Groups]) -> FloatArray:
-        """The residuals of the held-out groups, (n,). filters: the eigenvalues of B, (n − 1,)."""
-        alpha = self.vectors @ (filters * onto)
-        if len(members) == len(alpha):
-            return np.asarray(alpha / (np.square(self.vectors) @ filters))
-        residuals = np.empty_like(alpha)
-        for group in members:
-            own = self.vectors[group]
-            residuals[group] = np.linalg.solve((own * filters) @ own.T, alpha[group])
-        return residuals
 
 
 @dataclass(frozen=True)
@@ -137,36 +134,35 @@ def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | 
     spectra: of the same n touches in the same order. targets: (n,), of any unit. groups: the material of each touch,
     numbered, (n,), two or more; None: each touch by itself is held out.
     """
-    numbers = np.arange(len(targets)) if groups is None else groups
+    every = np.arange(len(targets))
+    numbers = every if groups is None else groups
     members = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
     paths = np.stack([spectrum.held_out(targets, members) for spectrum in spectra])
     residuals, mass = np.empty(len(targets)), np.empty(len(targets))
     for first in range(min(FOLDS, len(members))):
         fold = np.concatenate(members[first::FOLDS])
-        among = _among(paths, np.setdiff1d(np.arange(len(targets)), fold))
-        residuals[fold] = among.residuals[fold] @ among.shares
+        best, shares = _chosen(paths, np.setdiff1d(every, fold))
+        residuals[fold] = _at(paths, best)[fold] @ shares
     for group in members:
         mass[group] = 1.0 / (len(members) * len(group))
-    chosen = _among(paths, np.arange(len(targets)))
-    solved = [spectrum.solve(targets, penalty) for spectrum, penalty in zip(spectra, chosen.penalties, strict=True)]
-    weights = np.stack([share * own for share, (own, _) in zip(chosen.shares, solved, strict=True)])
-    intercept = math.fsum(float(share) * own for share, (_, own) in zip(chosen.shares, solved, strict=True))
-    return RegressionHead(weights, intercept, chosen.shares, residuals, mass)
+    best, shares = _chosen(paths, every)
+    solved = [spectrum.solve(targets, LAMBDAS[at]) for spectrum, at in zip(spectra, best, strict=True)]
+    weights = np.stack([share * own for share, (own, _) in zip(shares, solved, strict=True)])
+    intercept = math.fsum(float(share) * own for share, (_, own) in zip(shares, solved, strict=True))
+    return RegressionHead(weights, intercept, shares, residuals, mass)
 
 
-class _Chosen(NamedTuple):
-    """λ of each scale, all touches' residuals at it, (n, S), and the weights of the scales, (S,)."""
+def _chosen(paths: FloatArray, places: Groups) -> tuple[Groups, FloatArray]:
+    """The places of λ, (S,), and the weights of scales, (S,), of least squared residuals among some touches.
 
-    penalties: list[float]
-    residuals: FloatArray
-    shares: FloatArray
-
-
-def _among(paths: FloatArray, places: Groups) -> _Chosen:
-    """What has the least squared residuals among some touches. paths: residuals of all, (S, penalties, n)."""
+    paths: residuals of all, (S, penalties, n).
+    """
     best = np.square(paths[:, :, places]).sum(axis=2).argmin(axis=1)  # ties go to the larger, which come first
-    residuals = np.stack([path[at] for path, at in zip(paths, best, strict=True)], axis=1)
-    return _Chosen([LAMBDAS[at] for at in best.tolist()], residuals, stacked(residuals[places]))
+    return best, stacked(_at(paths, best)[places])
+
+
+def _at(paths: FloatArray, best: Groups) -> FloatArray:
+    return paths[np.arange(len(best)), best].T
 
 
 def stacked(residuals: FloatArray) -> FloatArray:
@@ -176,19 +172,12 @@ def stacked(residuals: FloatArray) -> FloatArray:
     five scales. Of few touches the products between scales count for less, n / (n + PRIOR).
     """
     products = residuals.T @ residuals
-    products[np.diag_indices(len(products))] *= 1.0 + PRIOR / len(residuals)
-    count = len(products)
-    best, found = math.inf, np.full(count, 1.0 / count)
-    for size in range(1, count + 1):
-        for chosen in combinations(range(count), size):
-            among = np.ix_(chosen, chosen)
-            try:
-                own = np.linalg.solve(products[among], np.ones(size))
-            except np.linalg.LinAlgError:  # residuals that are all zero
-                continue
-            if not (own > 0).all() or not np.isfinite(own).all():
-                continue
-            if (loss := 1.0 / float(own.sum())) < best:
-                best, found = loss, np.zeros(count)
-                found[list(chosen)] = own / own.sum()
-    return found
+    every = range(len(products))
+    products[every, every] = products.diagonal() * (1.0 + PRIOR / len(residuals)) + TINY
+    best = np.zeros(len(products))
+    for chosen in (list(one) for size in every for one in combinations(every, size + 1)):
+        own = np.linalg.solve(products[np.ix_(chosen, chosen)], np.ones(len(chosen)))
+        if own.min() > 0 and own.sum() > best.sum():  # of w = own / Σ own, |R w|² is 1 / Σ own
+            best = np.zeros(len(products))
+            best[chosen] = own
+    return np.asarray(best / best.sum())

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.prediction.model import Model, Trajectories
-from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.calibration import Dependence
 from scroll_tactile.readouts.novelty import FEWEST, UNMEASURED
 from scroll_tactile.results import Prediction
 

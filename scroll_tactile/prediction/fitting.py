@@ -37,8 +37,7 @@ from scroll_tactile.prediction.model import (
     neighbours_of,
     tempered,
 )
-from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, fit_weights
-from scroll_tactile.readouts.dependence import dependence_of
+from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, dependence_of, fit_weights
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
 from scroll_tactile.readouts.novelty import FEWEST, TINY, Neighbours, novelty_measures
 from scroll_tactile.readouts.readout import ReadoutName

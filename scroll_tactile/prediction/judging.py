@@ -73,7 +73,7 @@ def answer(
     false_alarms: as in `Settings`.
 
     Probabilities and novelties of several touches add up as far as the touches are independent (see
-    `readouts.dependence`), in any order to the same bits; a touch that comes twice counts once. The p of their
+    `readouts.calibration`), in any order to the same bits; a touch that comes twice counts once. The p of their
     typicality is twice the mean of theirs, a bound that holds whatever the dependence between them (Vovk and Wang
     2020).
     """

@@ -22,8 +22,7 @@ from scroll_tactile.matching.kept_arrays import KeptArrays
 from scroll_tactile.matching.match import KeptTouch, Match
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.readouts.calibration import Calibration
-from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.calibration import Calibration, Dependence
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, Sampled, held_out_scores
 from scroll_tactile.readouts.novelty import TINY, Neighbours
 from scroll_tactile.readouts.readout import Readout, ReadoutName

@@ -73,7 +73,7 @@ def fit_curve(values: npt.ArrayLike, targets: npt.ArrayLike, prior: Curve, *, tu
     """
     half, count = -prior.offset / prior.slope, 1 + turning  # of weights: the slope, and the height at the prior's half
     features = np.stack([np.asarray(values, np.float64) - half, np.ones(np.size(values))], axis=1)[:, :count]
-    start, least = np.array([prior.slope, 0.0])[:count], np.array([0.0, -np.inf])[:count]
+    start, least = np.array([1.0, 0.0])[:count], np.array([0.0, -np.inf])[:count]
     scores = np.stack([np.zeros_like(features), features], axis=2)  # of absence and presence
-    slope, *height = fit_weights(scores, targets, start, 1.0, np.full(count, prior.slope), least).tolist()
+    slope, *height = fit_weights(scores, targets, np.full(count, prior.slope), 1.0, start, least).tolist()
     return Curve(slope, sum(height) - slope * half)

@@ -5,19 +5,25 @@ scale is fitted, which is a temperature (Platt 1999; Guo et al. 2017, arXiv 1706
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
-w⁰ the prior and ρ the number of touches that it counts as. First one weight common to all scales is fitted, then one
-for each scale, with the common one as its prior: scores of held-out touches are nearly collinear, and by themselves the
-weights run into a corner. Where a touch is viewed in several ways, a view has less weight the further the touch lies
-from its nearest material there: its scores count as min(1, u_k / r_k) s_k, r_k the squared Mahalanobis distance with
-diagonal scatter (`Readout.diagonal_distance`) and u_k its median over held-out touches. So a view that a change of
-speed, zero or length has distorted leaves the decision to the others.
+w⁰ the prior and ρ the number of touches that it counts as: first one weight common to all scales, then one for each,
+with the common one as its prior, for scores of several scales are nearly collinear. Where a touch is viewed in several
+ways, a view has less weight the further the touch lies from its nearest material there: its scores count as
+min(1, u_k / r_k) s_k, r_k the squared Mahalanobis distance with diagonal scatter (`Readout.diagonal_distance`) and u_k
+its median over held-out touches. So a view that a change of speed, zero or length has distorted leaves the decision to
+the others. Novelty is the mean of its measures (`novelty`), each standardised by held-out touches.
 
-Novelty is the mean of its measures (`novelty`), each standardised by held-out touches: weights that were fitted to
-these gained hardly more. All are functions of the statistics and the sample, and so of the set of observed touches.
+Touches of one material err alike, so k of them are not k independent witnesses. With ρ the correlation of two, their
+log-probabilities count as those of k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and the mean of k novelties has
+√((1 + (k − 1) ρ') / k) times the standard deviation of one:
+
+    log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
+
+ρ is fitted to pairs of held-out touches, by least log loss, and ρ' is their intraclass correlation (Fisher 1925).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -29,7 +35,16 @@ from scroll_tactile.readouts.novelty import FEWEST, TINY, UNMEASURED, Neighbours
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.signals.windows import Scale, measuring
 
-__all__ = ["AHEAD", "PRIOR_WEIGHT", "Calibration", "calibrate_stage", "fit_weights", "scale_weights"]
+__all__ = [
+    "AHEAD",
+    "PRIOR_WEIGHT",
+    "Calibration",
+    "Dependence",
+    "calibrate_stage",
+    "dependence_of",
+    "fit_weights",
+    "scale_weights",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -42,6 +57,8 @@ PRIOR_TOUCHES = 0.5  # the prior counts as so many touches
 COMMON_TOUCHES = 2.0  # the common weight counts as so many, as the prior of each scale's
 LEAST_COMMON = 1e-3  # of the prior
 SURER = 0.75
+CORRELATION = 0.25  # ρ and ρ' where nothing is measured: about that of prefixes of BioTac's touches
+PRIOR_PAIRS = 2.0  # the prior of ρ counts as so many
 
 
 @dataclass(frozen=True)
@@ -49,8 +66,7 @@ class Calibration:
     """How the scores and distances of one stage are to be read.
 
     weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
-    scale_novelty: mean and spread of the measures of novelty over known materials, shape (S', 2): the distance at each
-    scale that measures it, then u at each scale that has `Neighbours`.
+    scale_novelty: mean and spread of the measures of novelty over known materials, shape (S', 2).
     median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
     touch counts alike.
     thresholds: of the novelty of known touches, as far as any were held out.
@@ -68,9 +84,8 @@ class Calibration:
     def with_all_touches(self, touches: float) -> Calibration:
         """How touches to come are read; touches: k, the median number of those materials that have two or more.
 
-        Weights are fitted to scores of touches held out, by means of the k − 1 others. New ones are scored by means of
-        k, and more surely: their weights are (k / (k − 1))^¾ times as large, a power that was best on average, from two
-        touches of a material to ten, on sixteen sets.
+        Held-out touches are scored by means of the k − 1 others, new ones by k, and more surely: weights are
+        (k / (k − 1))^¾ times as large, a power that was best on average, from two touches to ten, on sixteen sets.
         """
         return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
 
@@ -121,7 +136,7 @@ def calibrate_stage(
     else:
         weights = np.full(len(scales), _weight_without_held_out(found.names, readouts, kind))
     if len(found.places) < FEWEST:
-        return Calibration(weights, _assumed([readouts[place] for place in measuring(scales)]), medians)
+        return Calibration(weights, np.array([_assumed(readouts[i]) for i in measuring(scales)]), medians)
     measures, if_new = novelty_measures(found, neighbours)
     mean, spread = measures.mean(axis=0), np.maximum(measures.std(axis=0), 1e-9 * (1 + np.abs(measures).max(axis=0)))
     # The mean over measures that are not fully correlated has a spread below 1: rescale it to 1.
@@ -134,9 +149,8 @@ def calibrate_stage(
 def scale_weights(scores: FloatArray, targets: npt.ArrayLike, prior: float) -> FloatArray:
     """The weights of scales, each drawn to the one that all have in common, as of `fit_weights`; prior: of that one."""
     common = fit_weights(scores.sum(axis=1, keepdims=True), targets, np.array([prior]))
-    return fit_weights(
-        scores, targets, np.repeat(np.maximum(common, LEAST_COMMON * prior), scores.shape[1]), COMMON_TOUCHES
-    )
+    common = np.maximum(common, LEAST_COMMON * prior)
+    return fit_weights(scores, targets, np.repeat(common, scores.shape[1]), COMMON_TOUCHES)
 
 
 def fit_weights(
@@ -144,16 +158,16 @@ def fit_weights(
     targets: npt.ArrayLike,
     prior: FloatArray,
     touches: float = PRIOR_TOUCHES,
-    unit: FloatArray | None = None,
+    start: FloatArray | float = 1.0,
     least: FloatArray | float = 0.0,
 ) -> FloatArray:
     """Weights of least log loss, a convex problem, drawn to the prior where touches are few.
 
     scores: of held-out touches, shape (touches, scales, classes). targets: the class of each. touches: how many the
-    prior counts as. unit: of a weight's distance from the prior, the prior itself unless given. least: of the weights.
+    prior counts as. start, least: the prior, and what the weights are at least, in units of `prior`.
     """
     gap = scores - np.take_along_axis(scores, np.asarray(targets, np.intp)[:, None, None], axis=2)
-    unit = prior if unit is None else unit
+    gap = gap * prior[:, None]
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         logits = np.einsum("tsc,s->tc", gap, weights)
@@ -161,31 +175,26 @@ def fit_weights(
         chances = np.exp(logits - top)
         total = chances.sum(axis=1, keepdims=True)
         chances /= total
-        mean = np.einsum("tsc,tc->ts", gap, chances)
-        pull = (weights - prior) / unit
+        mean, pull = np.einsum("tsc,tc->ts", gap, chances), weights - start
         value = float((np.log(total) + top).sum()) + touches * float(pull @ pull) / 2
         curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ mean
-        return value, mean.sum(axis=0) + touches * pull / unit, curve + np.diag(touches / unit**2)
+        return value, mean.sum(axis=0) + touches * pull, curve + touches * np.eye(len(prior))
 
     # Newton's steps, projected (Bertsekas 1982), in one to three weights: scipy.optimize is 20 MB and a tenth of a
     # second to import, of the quarter of a second in which a memory that was just opened answers.
-    weights = prior
+    weights = start + np.zeros(len(prior))
     value, slope, curve = loss(weights)
     for _ in range(MOST_STEPS):
-        free = (weights > least) | (slope < 0)
-        step = np.zeros_like(weights)
+        free, step = (weights > least) | (slope < 0), np.zeros(len(prior))
         step[free] = np.linalg.solve(curve[np.ix_(free, free)], slope[free])
         if float(slope @ step) <= 1e-13 * (1 + abs(value)):
             break
-        size = 1.0
-        while True:
-            tried = np.maximum(weights - size * step, least)
-            after = loss(tried)
-            if after[0] <= value - 1e-4 * float(slope @ (weights - tried)) or size < 1e-9:
-                break
+        size, tried = 1.0, np.maximum(weights - step, least)
+        while (after := loss(tried))[0] > value - 1e-4 * float(slope @ (weights - tried)) and size >= 1e-9:
             size /= 2
+            tried = np.maximum(weights - size * step, least)
         weights, (value, slope, curve) = tried, after
-    return weights
+    return np.asarray(prior * weights)
 
 
 def _weight_without_held_out(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName) -> float:
@@ -198,22 +207,70 @@ def _weight_without_held_out(names: Sequence[str], readouts: Sequence[Readout], 
     share = PRIOR_WEIGHT[kind] / len(readouts)
     if kind == "ridge" or len(names) < 2:  # a ridge's scores are of targets of 0 and 1
         return share
-    ahead = np.zeros((len(names), len(names)))
+    ahead = np.diag(np.full(len(names), np.inf))
     for readout in readouts:
         own = [readout.places[name] for name in names]
         gram = readout.derived().gram[np.ix_(own, own)]
-        sizes = np.diagonal(gram)
-        ahead += (sizes[:, None] + sizes - 2 * gram) / 2
-    np.fill_diagonal(ahead, np.inf)
+        ahead += (np.diagonal(gram)[:, None] + np.diagonal(gram) - 2 * gram) / 2
     return min(share, AHEAD / max(float(np.median(ahead.min(axis=1))), TINY))
 
 
-def _assumed(readouts: Sequence[Readout]) -> FloatArray:
-    """Mean and spread of novelty where too few touches are held out: from the distances of the class means alone."""
-    shapes = []
-    for readout in readouts:
-        derived = readout.derived()
-        sizes = np.diagonal(derived.gram)
-        typical = np.einsum("ri,ij,rj->r", derived.gram, derived.background, derived.gram) - sizes
-        shapes.append([float(typical.mean()), max(float(sizes.mean()), 1e-9) / UNMEASURED])
-    return np.array(shapes)
+def _assumed(readout: Readout) -> tuple[float, float]:
+    """Mean and spread of a distance where too few touches are held out: from those of the class means alone."""
+    gram, background = readout.derived().gram, readout.derived().background
+    sizes = np.diagonal(gram)
+    typical = np.einsum("ri,ij,rj->r", gram, background, gram) - sizes
+    return float(typical.mean()), max(float(sizes.mean()), 1e-9) / UNMEASURED
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Correlations of two touches of one material, from 0 to 1: ρ of their log-probabilities, ρ' of their novelties."""
+
+    log_probability: float = CORRELATION
+    novelty: float = CORRELATION
+
+    def probability(self, chances: Sequence[FloatArray]) -> FloatArray:
+        """The probability of the candidates, (C,), from those by each touch."""
+        # math.fsum is exact before it rounds: any order of the touches gives the same bits.
+        logs = np.log(np.maximum(np.array(chances), TINY))
+        logits = np.array([math.fsum(column) for column in logs.T]) / (1 + (len(logs) - 1) * self.log_probability)
+        together = np.exp(logits - logits.max())
+        return np.asarray(together / together.sum())
+
+    def standard(self, novelties: Sequence[float]) -> float:
+        """The novelty of all together, in standard deviations of that of known materials' touches."""
+        count = len(novelties)
+        return math.fsum(novelties) / math.sqrt(count * (1 + (count - 1) * self.novelty))
+
+
+def dependence_of(
+    keys: Sequence[bytes], targets: npt.NDArray[np.intp], logs: FloatArray, novelties: FloatArray
+) -> Dependence:
+    """Fit both to N held-out touches: their content hashes, materials, log-probabilities, (N, C), and novelties, (N,).
+
+    Where these are too few they may be without novelties.
+    """
+    order = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
+    groups = [order[targets[order] == target] for target in np.unique(targets)]
+    several = [group for group in groups if len(group) > 1]
+    pairs = np.array([pair for group in several for pair in zip(group[::2], group[1::2], strict=False)], dtype=np.intp)
+    if len(pairs) < FEWEST or len(groups) < 2:
+        return Dependence()
+    prior = np.array([1 / (1 + CORRELATION)])
+    weight = float(fit_weights(logs[pairs].sum(axis=1)[:, None], targets[pairs[:, 0]], prior, PRIOR_PAIRS)[0])
+    rho = float(np.clip(1 / max(weight, TINY) - 1, 0.0, 1.0))
+    return Dependence(rho, _intraclass([novelties[group] for group in several]))
+
+
+def _intraclass(groups: Sequence[FloatArray]) -> float:
+    """The correlation within groups, two values or more in each, from 0 to 1."""
+    if len(groups) < 2:
+        return CORRELATION
+    counts, values = np.array([len(group) for group in groups]), np.concatenate(groups)
+    means, total, others = np.array([group.mean() for group in groups]), len(values), len(groups) - 1
+    within = float(np.square(values - np.repeat(means, counts)).sum()) / (total - len(groups))
+    between = float((counts * np.square(means - values.mean())).sum()) / others
+    size = (total - float(np.square(counts).sum()) / total) / others
+    share = (between - within) / max(between + (size - 1) * within, TINY)
+    return float(np.clip(share, 0.0, 1.0))

@@ -45,51 +45,47 @@ TINY = 1e-300
 class Spectrum:
     """The features of n touches at one scale, and the eigenvectors of their Gram matrix; of any number of quantities.
 
-    rows: X, standardised, (n, d). unit: one over the standard deviation of each feature, (d,). center: (d,). size: s.
-    vectors: of C G C across 1, (n, n − 1). values: its eigenvalues, (n − 1,).
+    rows: X / √s, (n, d). center, unit: (d,), as rows are made: (features − center) · unit. vectors: of C G C across 1,
+    (n, n − 1). values: its eigenvalues, (n − 1,).
     """
 
     rows: FloatArray
-    unit: FloatArray
     center: FloatArray
-    size: float
+    unit: FloatArray
     vectors: FloatArray
     values: FloatArray
 
     @classmethod
     def of(cls, rows: npt.NDArray[np.number]) -> Spectrum:
         """The spectrum of features, (n, d), n ≥ 2. The caller has set BLAS to one thread: then it is the same bits."""
-        features = rows.astype(np.float64)
-        center, variance = features.mean(axis=0), features.var(axis=0)
+        center, variance = rows.mean(axis=0), rows.var(axis=0)
         floor = LEAST_VARIANCE * float(variance.mean())
         unit = 1.0 / np.sqrt(variance + floor) if floor > 0 else np.ones_like(variance)
-        features = (features - center) * unit
-        size = float(np.square(features).sum()) / len(rows) or 1.0  # rows that are all equal say nothing
-        across = contrasts(len(rows))
-        onto = across @ features
-        values, vectors = np.linalg.eigh(onto @ onto.T / size)
-        return cls(features, unit, center, size, across.T @ vectors, np.maximum(values, 0.0))
+        unit /= math.sqrt(float((variance * np.square(unit)).sum())) or 1.0  # rows that are all equal say nothing
+        scaled, across = (rows - center) * unit, contrasts(len(rows))
+        onto = across @ scaled
+        values, vectors = np.linalg.eigh(onto @ onto.T)
+        return cls(scaled, center, unit, across.T @ vectors, np.maximum(values, 0.0))
 
-    def held_out(self, targets: FloatArray, members: Sequence[Groups]) -> FloatArray:
+    def held_out(self, targets: FloatArray, numbers: Groups) -> FloatArray:
         """The residuals of each group held out, at each of LAMBDAS, (penalties, n).
 
-        targets: (n,). members: the places of each group's touches; no group has them all.
+        targets: (n,). numbers: the group of each touch, (n,); no group has them all.
         """
         filters = 1.0 / (self.values + np.array(LAMBDAS)[:, None])  # the eigenvalues of B
         alpha = (filters * (self.vectors.T @ targets)) @ self.vectors.T
-        if len(members) == len(targets):
+        if len(np.unique(numbers)) == len(targets):
             return np.asarray(alpha / (filters @ np.square(self.vectors).T))
-        residuals = np.empty_like(alpha)
-        for group in members:
-            own = self.vectors[group]
+        for number in np.unique(numbers):
+            own = self.vectors[numbers == number]
             within = (own * filters[:, None]) @ own.T
-            residuals[:, group] = np.linalg.solve(within, alpha[:, group, None])[:, :, 0]
-        return residuals
+            alpha[:, numbers == number] = np.linalg.solve(within, alpha[:, numbers == number, None])[:, :, 0]
+        return np.asarray(alpha)
 
     def solve(self, targets: FloatArray, penalty: float) -> tuple[FloatArray, float]:
         """(weights (d,), intercept) of the head over features that are not standardised."""
         alpha = self.vectors @ (self.vectors.T @ targets / (self.values + penalty))
-        weights = self.unit * (alpha @ self.rows) / self.size
+        weights = self.unit * (alpha @ self.rows)
         return weights, float(targets.mean() - weights @ self.center)
 
 
@@ -97,72 +93,60 @@ class Spectrum:
 class RegressionHead:
     """Predicts a quantity from a touch's features at some scales, and how far it may be off.
 
-    weights: for each scale, (S, d); a scale without weight has zeros. intercept: in the unit of the targets. shares:
-    the weight of each scale, (S,). residuals: target less prediction of each touch, held out with its group, (n,).
-    mass: the weight of each residual, all one in sum, and of each group alike, (n,).
+    weights: for each scale, (S, d). intercept: in the unit of the targets. residuals: target less prediction of each
+    touch, held out with its group, (n,). mass: the weight of each residual, all one in sum, each group's alike, (n,).
     """
 
     weights: FloatArray
     intercept: float
-    shares: FloatArray
     residuals: FloatArray
     mass: FloatArray
 
     def __call__(self, features: Sequence[FloatArray]) -> float:
         """The quantity, of mean features (d,) at each scale."""
-        own = (float(w @ x) for w, x in zip(self.weights, features, strict=True))
-        return math.fsum((self.intercept, *own))
+        return math.fsum((self.intercept, *(float(w @ x) for w, x in zip(self.weights, features, strict=True))))
 
     def half_width(self, risk: float) -> float:
         """What |error| exceeds with a probability of `risk` or less; infinite where the touches are too few to say.
 
         The ⌈(n + 1)(1 − risk)⌉-th smallest |r|: n + 1 touches, the new one among them, have every rank alike.
         """
-        count = len(self.residuals)
+        count, off = len(self.residuals), np.abs(self.residuals)
         # Exact products such as 20 · 0.95 are not to be pushed over by rounding.
         rank = math.ceil((count + 1) * (1 - risk) - 1e-9)
-        if rank > count:
-            return math.inf
-        order = np.argsort(np.abs(self.residuals), kind="stable")
+        order = np.argsort(off, kind="stable")
         reached = np.cumsum(self.mass[order]) * count >= rank - 1e-6
-        return float(np.abs(self.residuals)[order[int(np.argmax(reached))]])
+        return float(off[order][reached][0]) if rank <= count else math.inf
 
 
 def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | None = None) -> RegressionHead:
     """The head of some touches, read at each of the scales.
 
     spectra: of the same n touches in the same order. targets: (n,), of any unit. groups: the material of each touch,
-    numbered, (n,), two or more; None: each touch by itself is held out.
+    numbered from 0, (n,), two or more; None: each touch by itself is held out.
     """
-    every = np.arange(len(targets))
-    numbers = every if groups is None else groups
-    members = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
-    paths = np.stack([spectrum.held_out(targets, members) for spectrum in spectra])
-    residuals, mass = np.empty(len(targets)), np.empty(len(targets))
-    for first in range(min(FOLDS, len(members))):
-        fold = np.concatenate(members[first::FOLDS])
-        best, shares = _chosen(paths, np.setdiff1d(every, fold))
-        residuals[fold] = _at(paths, best)[fold] @ shares
-    for group in members:
-        mass[group] = 1.0 / (len(members) * len(group))
-    best, shares = _chosen(paths, every)
+    numbers = np.arange(len(targets)) if groups is None else groups
+    paths = np.stack([spectrum.held_out(targets, numbers) for spectrum in spectra])
+    counts, residuals = np.bincount(numbers), np.empty(len(targets))
+    for part in range(min(FOLDS, len(counts))):
+        fold = numbers % FOLDS == part
+        _, shares, all_ = _chosen(paths, ~fold)
+        residuals[fold] = all_[fold] @ shares
+    best, shares, _ = _chosen(paths, np.ones(len(targets), bool))
     solved = [spectrum.solve(targets, LAMBDAS[at]) for spectrum, at in zip(spectra, best, strict=True)]
-    weights = np.stack([share * own for share, (own, _) in zip(shares, solved, strict=True)])
+    weights = shares[:, None] * np.stack([own for own, _ in solved])
     intercept = math.fsum(float(share) * own for share, (_, own) in zip(shares, solved, strict=True))
-    return RegressionHead(weights, intercept, shares, residuals, mass)
+    return RegressionHead(weights, intercept, residuals, 1.0 / (len(counts) * counts[numbers]))
 
 
-def _chosen(paths: FloatArray, places: Groups) -> tuple[Groups, FloatArray]:
-    """The places of λ, (S,), and the weights of scales, (S,), of least squared residuals among some touches.
+def _chosen(paths: FloatArray, among: npt.NDArray[np.bool_]) -> tuple[Groups, FloatArray, FloatArray]:
+    """What has the least squared residuals among some touches: the places of λ, (S,), and the weights of scales, (S,).
 
-    paths: residuals of all, (S, penalties, n).
+    Also all touches' residuals there, (n, S). paths: residuals of all, (S, penalties, n).
     """
-    best = np.square(paths[:, :, places]).sum(axis=2).argmin(axis=1)  # ties go to the larger, which come first
-    return best, stacked(_at(paths, best)[places])
-
-
-def _at(paths: FloatArray, best: Groups) -> FloatArray:
-    return paths[np.arange(len(best)), best].T
+    best = np.square(paths[:, :, among]).sum(axis=2).argmin(axis=1)  # ties go to the larger, which come first
+    residuals = paths[np.arange(len(best)), best].T
+    return best, stacked(residuals[among]), residuals
 
 
 def stacked(residuals: FloatArray) -> FloatArray:

@@ -39,36 +39,34 @@ NOVEL = Curve(1.0, -2.0)  # of a novelty in spreads, likewise
 
 
 class StageHeads:
-    """The heads of one stage over its C materials: constituent → its head, in `presence` and in `share`.
+    """The heads of one stage over its C materials.
 
-    novel: from standardised novelty to the probability of a new material.
+    heads: constituent → those of its presence and its share. novel: from standardised novelty to the probability of a
+    new material.
     """
 
     def __init__(self, model: Model, stage: int, targets: Mapping[str, Target]) -> None:
         self._model, self._row = model, model.fitted.rows[stage]
-        found = StageScores(stage, model.fitted.sample, [model.held_out[scale] for scale in self._row.scales])
-        weights = self._row.calibration.weights
-        total = float(weights.sum())
-        self._weights = weights / total if total > 0 else np.full(len(weights), 1 / len(weights))
-        self._names = found.names
-        z = np.einsum("s,nsc->nc", self._weights, found.z())
-        gram = np.zeros((len(found.names), len(found.names)))  # of the reference materials, in the order of the names
-        for weight, scale in zip(self._weights, self._row.scales, strict=True):
-            places = [model.readouts[scale].places[name] for name in found.names]
-            gram += weight * model.readouts[scale].derived().gram[np.ix_(places, places)]
-        novelties = [self._row.calibration.novelty(own) for own in novelty_measures(found, model.neighbours(self._row))]
-        self.novel = fit_curve(np.concatenate(novelties), np.repeat([0, 1], len(found.targets)), NOVEL)
-        head = partial(_head, found, z, gram, {})
-        self.presence = {name: head(target.presence, curved=True) for name, target in targets.items()}
-        self.share = {name: head(target.share, curved=False) for name, target in targets.items()}
+        calibration, scales = self._row.calibration, self._row.scales
+        found = StageScores(stage, model.fitted.sample, [model.held_out[scale] for scale in scales])
+        total = float(calibration.weights.sum())
+        weights = calibration.weights / total if total > 0 else np.full(len(scales), 1 / len(scales))
+        self._read = [
+            (weight, model.readouts[scale], [model.readouts[scale].places[name] for name in found.names])
+            for weight, scale in zip(weights.tolist(), scales, strict=True)
+        ]
+        grams = [weight * readout.derived().gram[np.ix_(places, places)] for weight, readout, places in self._read]
+        novelties = map(calibration.novelty, novelty_measures(found, model.neighbours(self._row)))
+        self.novel = fit_curve(np.concatenate([*novelties]), np.repeat([0, 1], len(found.targets)), NOVEL)
+        head = partial(_head, found, np.einsum("s,nsc->nc", weights, found.z()), sum(grams), {})
+        self.heads = {
+            name: (head(of.presence, curved=True), head(of.share, curved=False)) for name, of in targets.items()
+        }
 
     def read(self, means: Mapping[Scale, FloatArray]) -> tuple[FloatArray, float]:
         """z of a touch's mean features by scale, (C,), and the probability that it is new, by a prior of one half."""
-        z = np.zeros(len(self._names))
-        for weight, scale in zip(self._weights, self._row.scales, strict=True):
-            readout = self._model.readouts[scale]
-            z += weight * readout.centred(means[scale])[[readout.places[name] for name in self._names]]
-        return z, float(self.novel(self._model.novelty(self._row, means, self._model.names)))
+        z = sum(weight * readout.centred(means[readout.scale])[places] for weight, readout, places in self._read)
+        return np.asarray(z), float(self.novel(self._model.novelty(self._row, means, self._model.names)))
 
 
 def _head(
@@ -82,23 +80,23 @@ def _head(
 ) -> Head:
     """The head of one constituent. found: the sampled touches, held out, with z, (N, C). gram: of the C materials.
 
-    inverses: B of the materials known at each γ, made once for all constituents that are known of these. known:
-    material → target. curved: whether it is a presence.
+    inverses: B at each γ, made once for all constituents that are known of the same materials. known: material →
+    target. curved: whether it is a presence.
     """
-    names = [name for name in found.names if name in known]
-    places, values = np.searchsorted(found.names, names), np.array([known[name] for name in names], dtype=np.float64)
+    places = np.array([place for place, name in enumerate(found.names) if name in known], dtype=np.intp)
+    values = np.array([known[found.names[place]] for place in places], dtype=np.float64)
     if len(places) < 2:
         return f"it is known of {len(places)} of the materials observed for long enough; a head takes two or more"
     if np.ptp(values) == 0:
         return f"{'every' if values[0] else 'no'} material observed for long enough has it, as far as known"
-    solved = inverses.setdefault(places.tobytes(), [])
-    if not solved:
-        solved += [solve(gram[np.ix_(places, places)], gamma) for gamma in GAMMAS]
+    if places.tobytes() not in inverses:
+        inverses[places.tobytes()] = [solve(gram[np.ix_(places, places)], gamma) for gamma in GAMMAS]
+    solved = inverses[places.tobytes()]
     # A head is tried by touches of materials whose others differ, without these.
     differing = [place for i, place in enumerate(places) if np.ptp(np.delete(values, i)) > 0]
     tried = np.flatnonzero(np.isin(found.targets, differing))
     own, asked = np.searchsorted(places, found.targets[tried]), z[np.ix_(tried, places)]
-    heads = [heads_without(inverse, values)[:, own] for inverse in solved]
+    heads = (heads_without(inverse, values)[:, own] for inverse in solved)
     predicted = np.array([np.einsum("nk,kn->n", asked, head[:-1]) + head[-1] for head in heads])
     best = int(np.square(predicted - values[own]).sum(axis=1).argmin()) if len(tried) else UNTRIED
     weights = np.zeros(len(found.names) + 1)
@@ -138,19 +136,18 @@ class Composer:
         feels_like: probability of each observed material. encoded: the touch, with the scales of `scales_for`.
         expected: the prior probability of a new material.
         """
-        heads = self.stages[self._stage(encoded.steps)]
-        z, new = heads.read(encoded.means)
+        stage = self.stages[self._stage(encoded.steps)]
+        z, new = stage.read(encoded.means)
         # Bayes: the curve was fitted to as many new touches as known ones, a prior of one half.
         odds = new * expected, (1 - new) * (1 - expected)
         unfamiliar = odds[0] / sum(odds) if sum(odds) else expected
-        found = constituents(self.targets, heads.presence, heads.share, feels_like, z, unfamiliar)
+        found = constituents(self.targets, stage.heads, feels_like, z, unfamiliar)
         return tuple(found[name] for name in wanted), unfamiliar
 
 
 def constituents(
     targets: Mapping[str, Target],
-    presences: Mapping[str, Head],
-    shares: Mapping[str, Head],
+    heads: Mapping[str, tuple[Head, Head]],
     feels_like: Mapping[str, float],
     z: FloatArray,
     unfamiliar: float,
@@ -167,20 +164,20 @@ def constituents(
         value = float(weights[:-1] @ z + weights[-1])
         value = min(max(value, 0.0), 1.0) if curve is None else float(curve(value))
         observed = {material: feels_like[material] for material in known if material in feels_like}
+        familiar = sum(chance * known[material] for material, chance in observed.items())
         weight = (1 - unfamiliar) * sum(observed.values())
-        familiar = (1 - unfamiliar) * sum(chance * known[material] for material, chance in observed.items())
-        return min(max(familiar + (1 - weight) * value, 0.0), 1.0)
+        return min(max((1 - unfamiliar) * familiar + (1 - weight) * value, 0.0), 1.0)
 
     found = {}
     for name, target in targets.items():
-        having = ((material, feels_like.get(material, 0.0)) for material, has in target.presence.items() if has)
-        evidence = sorted((item for item in having if item[1] > 0), key=lambda item: (-item[1], item[0]))
+        presence, share = heads[name]
+        having = [(-feels_like.get(material, 0.0), material) for material, has in target.presence.items() if has]
         found[name] = Constituent(
             name=name,
-            presence=weighed(presences[name], target.presence),
-            share=weighed(shares[name], target.share),
-            evidence=tuple(evidence[:MOST_EVIDENCE]),
-            unlearned=why if isinstance(why := presences[name], str) else "",
+            presence=weighed(presence, target.presence),
+            share=weighed(share, target.share),
+            evidence=tuple((material, -less) for less, material in sorted(having)[:MOST_EVIDENCE] if less),
+            unlearned=presence if isinstance(presence, str) else "",
         )
     known = [found[name].share for name, target in targets.items() if target.share]
     total = sum(share for share in known if share is not None)

@@ -7,10 +7,9 @@ classes is white, each material counting as one row:
     [G_KK + γ I   1] [α]   [t]
     [1ᵀ           0] [b] = [0].
 
-The weights in feature space are W α = (S_w/N + λI)⁻¹ Mᵀ α. Mᵀ α takes the place of Σ_y c_y t_yᵀ in the paper's readout,
-and the scatter between materials that of the scatter between touches. A material whose target is unknown enters only
-the scatter within classes. With B the inverse of that matrix, the head without material i follows from it (Allen 1974,
-PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches whose materials are left out of the head.
+A material whose target is unknown enters only the scatter within classes. With B the inverse of that matrix, the head
+without material i follows from it (Allen 1974, PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches whose materials
+are left out of the head.
 """
 
 from __future__ import annotations

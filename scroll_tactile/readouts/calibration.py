@@ -5,16 +5,15 @@ scale is fitted, which is a temperature (Platt 1999; Guo et al. 2017, arXiv 1706
 
     p_y = exp(Σ_k w_k s_ky) / Σ_z exp(Σ_k w_k s_kz),    w = argmin_{w ≥ 0} −Σ log p_target + ρ/2 Σ_k (w_k / w⁰_k − 1)²,
 
-w⁰ the prior and ρ the number of touches that it counts as: first one weight common to all scales, then one for each,
-with the common one as its prior, for scores of several scales are nearly collinear. Where a touch is viewed in several
-ways, a view has less weight the further the touch lies from its nearest material there: its scores count as
-min(1, u_k / r_k) s_k, r_k the squared Mahalanobis distance with diagonal scatter (`Readout.diagonal_distance`) and u_k
-its median over held-out touches. So a view that a change of speed, zero or length has distorted leaves the decision to
-the others. Novelty is the mean of its measures (`novelty`), each standardised by held-out touches.
+w⁰ the prior, counted as ρ touches: first one weight common to all scales, then one for each, with the common one as its
+prior, for scores of several scales are nearly collinear. A view has less weight the further the touch lies from its
+nearest material there: its scores count as min(1, u_k / r_k) s_k, r_k the distance by diagonal scatter and u_k its
+median over held-out touches. So a view that a change of speed, zero or length has distorted leaves the decision to the
+others. Novelty is the mean of its measures (`novelty`), each standardised by held-out touches.
 
-Touches of one material err alike, so k of them are not k independent witnesses. With ρ the correlation of two, their
-log-probabilities count as those of k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and the mean of k novelties has
-√((1 + (k − 1) ρ') / k) times the standard deviation of one:
+Touches of one material err alike: with ρ the correlation of two, log-probabilities of k count as those of
+k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and their mean novelty has √((1 + (k − 1) ρ') / k) times the standard
+deviation of one:
 
     log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
 
@@ -35,16 +34,7 @@ from scroll_tactile.readouts.novelty import FEWEST, TINY, UNMEASURED, Neighbours
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.signals.windows import Scale, measuring
 
-__all__ = [
-    "AHEAD",
-    "PRIOR_WEIGHT",
-    "Calibration",
-    "Dependence",
-    "calibrate_stage",
-    "dependence_of",
-    "fit_weights",
-    "scale_weights",
-]
+__all__ = ["AHEAD", "Calibration", "Dependence", "calibrate_stage", "dependence_of", "fit_weights", "scale_weights"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -84,8 +74,8 @@ class Calibration:
     def with_all_touches(self, touches: float) -> Calibration:
         """How touches to come are read; touches: k, the median number of those materials that have two or more.
 
-        Held-out touches are scored by means of the k − 1 others, new ones by k, and more surely: weights are
-        (k / (k − 1))^¾ times as large, a power that was best on average, from two touches to ten, on sixteen sets.
+        Held-out ones are scored by means of k − 1 others, new ones by k, and more surely: weights are (k / (k − 1))^¾
+        times as large, a power that was best on average, from two touches to ten, on sixteen sets.
         """
         return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
 
@@ -119,9 +109,8 @@ def calibrate_stage(
     viewed: bool = False,
     neighbours: Sequence[Neighbours] = (),
 ) -> Calibration:
-    """Calibrate one stage.
+    """Calibrate one stage by touches held out of some readouts, in their order.
 
-    found: the scores of held-out touches by each scale that judges. readouts: of these scales, in their order.
     viewed: whether a scale's weight falls with a touch's diagonal distance. neighbours: of the windows among the
     scales, at the same stage; where too few touches were held out, only distances measure novelty.
     """
@@ -163,11 +152,11 @@ def fit_weights(
 ) -> FloatArray:
     """Weights of least log loss, a convex problem, drawn to the prior where touches are few.
 
-    scores: of held-out touches, shape (touches, scales, classes). targets: the class of each. touches: how many the
-    prior counts as. start, least: the prior, and what the weights are at least, in units of `prior`.
+    scores: of held-out touches, (touches, scales, classes). targets: the class of each. touches: how many the prior
+    counts as. start, least: the prior, and what the weights are at least, in units of `prior`.
     """
-    gap = scores - np.take_along_axis(scores, np.asarray(targets, np.intp)[:, None, None], axis=2)
-    gap = gap * prior[:, None]
+    own = np.take_along_axis(scores, np.asarray(targets, np.intp)[:, None, None], axis=2)
+    gap = (scores - own) * prior[:, None]
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         logits = np.einsum("tsc,s->tc", gap, weights)
@@ -180,8 +169,8 @@ def fit_weights(
         curve = np.einsum("tsc,trc,tc->sr", gap, gap, chances, optimize=True) - mean.T @ mean
         return value, mean.sum(axis=0) + touches * pull, curve + touches * np.eye(len(prior))
 
-    # Newton's steps, projected (Bertsekas 1982), in one to three weights: scipy.optimize is 20 MB and a tenth of a
-    # second to import, of the quarter of a second in which a memory that was just opened answers.
+    # Newton's steps, projected (Bertsekas 1982), in a few weights: scipy.optimize is 20 MB, and a tenth of a second to
+    # import of the quarter of one in which a memory that was just opened answers.
     weights = start + np.zeros(len(prior))
     value, slope, curve = loss(weights)
     for _ in range(MOST_STEPS):
@@ -200,9 +189,8 @@ def fit_weights(
 def _weight_without_held_out(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName) -> float:
     """The weight of each scale where no touch can be held out, most materials having one.
 
-    Within-class scatter is then that within single touches, and touches of one material differ by far more. So only the
-    distances between the materials can set the weight: a touch at the mean of its material gets AHEAD logits more than
-    the next material, and one halfway between two materials is as likely to be either.
+    Scatter is then that within single touches, and touches of one material differ by far more. So the distances between
+    the materials set the weight: a touch at the mean of its material gets AHEAD logits more than the next material.
     """
     share = PRIOR_WEIGHT[kind] / len(readouts)
     if kind == "ridge" or len(names) < 2:  # a ridge's scores are of targets of 0 and 1
@@ -249,7 +237,7 @@ def dependence_of(
 ) -> Dependence:
     """Fit both to N held-out touches: their content hashes, materials, log-probabilities, (N, C), and novelties, (N,).
 
-    Where these are too few they may be without novelties.
+    Fewer than FEWEST may be without novelties.
     """
     order = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
     groups = [order[targets[order] == target] for target in np.unique(targets)]

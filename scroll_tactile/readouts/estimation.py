@@ -2,8 +2,7 @@
 
 A touch is estimated by the heads of the length that it reached: before it is complete as it was at its last milestone,
 by the sampled touches as they were then; complete by complete ones, views among them. So a residual that calibrates an
-interval is of a touch like the one that is asked for. A head is fitted when it is first asked for, and is a function of
-the set of sampled touches and their values: no order and no earlier state has a part in it.
+interval is of a touch like the one that is asked for. Heads are functions of the set of sampled touches and values.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class Estimator:
     """Estimates the quantities of touches from sampled ones, in one state of a memory.
 
     sample: the touches that carry a value, in the sample's order. least: the steps from which on a touch is complete.
-    Made by `Estimator.of`. Any number of threads may use it: one that comes second fits the same heads again.
+    Any number of threads may use it: one that comes second fits the same heads again.
     """
 
     plan: WindowPlan
@@ -81,11 +80,11 @@ class Estimator:
 
     @cached_property
     def last(self) -> int:
-        """The stage from which on touches are complete."""
+        """The stage of complete touches."""
         return len(self.plan.stages(max(self.least, self.plan.milestones()[0]))) - 1
 
     def stage(self, steps: int) -> int:
-        """By which heads a touch of so many steps is estimated: the stage that it reached last, `last` if complete."""
+        """By whose heads a touch of so many steps is estimated: the stage that it reached last, `last` if complete."""
         return self.last if steps >= self.least else max(0, min(len(self.plan.stages(steps)), self.last) - 1)
 
     def length(self, steps: int) -> int:
@@ -113,10 +112,9 @@ class Estimator:
     def estimate(
         self, wanted: Sequence[str], means: Mapping[Scale, FloatArray], steps: int, risk: float, *, known: bool
     ) -> dict[str, Estimate]:
-        """The estimates of some quantities.
+        """The estimates of some quantities. known: whether the material is a learned one.
 
         means: mean features in grid units, (d,), of a touch of so many steps cut to its `length`, at `scales_for`.
-        known: whether its material is a learned one.
         """
         scales, heads = self._at(self.stage(steps))
         features = [means[scale] for scale in scales if scale in means]  # of an empty memory none

@@ -1,9 +1,8 @@
 """Novelty: how unlike the known touches one is, and from where on it is called new.
 
-Touches may be off the sampled ones in features in which no material differs, and relative Mahalanobis distances (Ren et
-al. 2021) do not see that. So beside them stands the distance to the nearest sampled touch s of x next to the distances
-around s, as local outlier factors have it (Breunig, Kriegel, Ng and Sander 2000): with N(s) the five nearest others of
-s and |·| a distance by diagonal scatter,
+Its measures are relative Mahalanobis distances (Ren et al. 2021), and u, which sees features in which no material
+differs: a local outlier factor (Breunig, Kriegel, Ng and Sander 2000), with s the sampled touch nearest to x, N(s) the
+five nearest others of s and |·| a distance by diagonal scatter,
 
     u(x) = log |x − s| − log mean_{r in N(s)} |s − r|.
 
@@ -41,9 +40,8 @@ class NoveltyThresholds:
     """Up to which novelty a touch counts as one of its material, and below which as one that is known.
 
     A material has a threshold of its own where OWN of its held-out touches are expected above it, 40 at 5 %. The others
-    share one in which each material counts alike: else one of hundreds of touches sets it, and those of a dozen, which
-    are known less well, are called new. Both hold for touches that are exchangeable with the sampled ones: not for
-    another run, speed or sensor.
+    share one in which each material counts alike, or one of hundreds of touches would set it. Both hold for touches
+    that are exchangeable with the sampled ones: not for another run, speed or sensor.
 
     names: the materials, ascending. targets: the place of each held-out touch's material among them, (N,). novelties:
     standardised novelty of these touches, (N,). if_new: the same had their own materials never been observed, (N,).
@@ -55,10 +53,7 @@ class NoveltyThresholds:
     if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def above(self, material: str, false_alarms: float) -> float:
-        """The novelty above which a touch that is answered `material` is new: a share `false_alarms` of known ones.
-
-        Of "", and of a material with few touches, that which all share.
-        """
+        """Above which novelty a touch that is answered `material`, or "" for any, is new: `false_alarms` of known ones."""
         if len(self.novelties) < FEWEST:
             return UNMEASURED
         if (material, false_alarms) not in self._found:
@@ -71,10 +66,7 @@ class NoveltyThresholds:
         return self._found[material, false_alarms]
 
     def below(self, false_alarms: float) -> float:
-        """The novelty below which a touch is known: no larger a share of new ones lies there.
-
-        New ones are the held-out touches without their materials. -inf where these are too few, or of one material.
-        """
+        """Below which novelty a touch is known: no larger a share of new ones lies there; -inf where none were tried."""
         if (None, false_alarms) not in self._found:
             several = len(set(self.targets.tolist())) > 1
             found = -_conformal(-self.if_new, self._alike, false_alarms) if several else -np.inf
@@ -93,15 +85,14 @@ class NoveltyThresholds:
 
     @cached_property
     def _found(self) -> dict[tuple[str | None, float], float]:
-        """What was asked for before, by material and share: every answer asks for the same."""
+        """What was asked for before, for every answer asks for the same; None: of `below`."""
         return {}
 
 
 def _conformal(values: FloatArray, weights: FloatArray, share: float) -> float:
     """The least value above which no more than this share of the weight lies, with a new one's of 1; inf if none is.
 
-    Of weights that are equal it is the conformal quantile: of n + 1 exchangeable values the new one lies above it with
-    no larger probability. Weighted ones: Tibshirani, Foygel Barber, Candès and Ramdas 2019, arXiv 1904.06019.
+    Of equal weights it is the conformal quantile; weighted: Tibshirani, Foygel Barber, Candès and Ramdas 2019.
     """
     order = np.argsort(-values, kind="stable")
     above = np.concatenate([[0.0], np.cumsum(weights[order])[:-1]])
@@ -113,10 +104,9 @@ def _conformal(values: FloatArray, weights: FloatArray, share: float) -> float:
 class Neighbours:
     """The rows of one scale that sampled touches have at one stage, among which a touch lies near one or near none.
 
-    readout: of the scale. sample: of which the calibration is made. stages: the scales that judge at each. stage: whose
-    rows. Rows are scaled to a spread of 1 within materials and held in single precision: 1 MB of 256 touches.
-
-    places: of the touches among the sample that have such a row, ascending. names: their materials.
+    Rows are scaled to a spread of 1 within materials and held in single precision: 1 MB of 256 touches.
+    stages: the scales that judge at each. places: of the touches among the sample that have such a row, ascending.
+    names: their materials.
     """
 
     def __init__(self, readout: Readout, sample: Sampled, stages: Sequence[Sequence[Scale]], stage: int) -> None:
@@ -153,10 +143,7 @@ class Neighbours:
         return float(self._local(away, lambda near: self._distances(self._rows[near]))[0])
 
     def held_out(self, places: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """u of sampled touches, each left out, (N,), and the same without all touches of their materials, (N,).
-
-        places: of these touches in the sample.
-        """
+        """u of N sampled touches at these places, each left out, and without all touches of their materials, (N,)."""
         between, at = self._distances(self._rows), np.searchsorted(self.places, places)
         kinds = np.unique(self.names, return_inverse=True)[1]
         itself, alike = at[:, None] == np.arange(len(between)), kinds[at][:, None] == kinds
@@ -190,9 +177,9 @@ class Neighbours:
 
 
 def novelty_measures(found: StageScores, neighbours: Sequence[Neighbours]) -> tuple[FloatArray, FloatArray]:
-    """What the novelty of N held-out touches is measured by, and the same had their own materials never been observed.
+    """The least distance at each scale that measures novelty, then u among neighbours, of N held-out touches, (N, S').
 
-    Both (N, S'): the least distance at each scale that measures novelty, then u among neighbours.
+    And the same had their own materials never been observed.
     """
     local = [each.held_out(found.places) for each in neighbours]
     known, new = found.distances().min(axis=2, initial=np.inf), found.distances_if_new()

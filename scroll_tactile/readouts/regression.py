@@ -10,11 +10,9 @@ group): r_g = B_gg⁻¹ α_g. Groups are touches for a head that answers for kno
 answers for new ones; λ is the one of least r². The features' units alone rest on all touches.
 
 Each scale has a head of its own, and a quantity is Σ_s w_s f_s with w ≥ 0, Σ w = 1, of least squared residual (stacked
-regression, Breiman 1996). A residual that calibrates is taken at the λ and w that are best for other touches: at those
-that it had a part in choosing, intervals of 80 % from 21 touches covered 71 %, and cover 75; from 45 touches 77 and 79.
-Intervals are f ± a quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of the mean of
-their distributions (pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for many materials, and for few as far
-as these are like the next.
+regression, Breiman 1996). A residual that calibrates is taken at the λ and w that are best for other touches. Intervals
+are f ± a quantile of |r| (split conformal: Vovk, Gammerman and Shafer 2005); over materials, of the mean of their
+distributions (pooled CDFs: Dunn, Wasserman and Ramdas 2022), which holds for few as far as these are like the next.
 """
 
 from __future__ import annotations
@@ -152,8 +150,8 @@ def _chosen(paths: FloatArray, among: npt.NDArray[np.bool_]) -> tuple[Groups, Fl
 def stacked(residuals: FloatArray) -> FloatArray:
     """The weights w ≥ 0, Σ w = 1, (S,), of least |R w|², of residuals R, (n, S).
 
-    Every subset of the scales is solved for, and the best whose weights are all positive is taken: exact, and there are
-    five scales. Of few touches the products between scales count for less, n / (n + PRIOR).
+    Exact: the best subset of the five scales whose weights are all positive. Of few touches the products between scales
+    count for less, n / (n + PRIOR).
     """
     products = residuals.T @ residuals
     every = range(len(products))

@@ -1,9 +1,8 @@
 """The composition of a touch, by a ridge regression (a head) for each constituent over the readouts of a model.
 
-If a touch is of an observed material, its composition is the mean of the materials' descriptions, weighted by their
-probabilities. If it is of a new material, the heads predict it. The novelty weighs these two cases. Heads and novelty
-are calibrated on the sampled touches: each is scored by readouts that never observed it, and by heads that never
-observed its material. A material described after it was touched gives the same as one described before, to the bit.
+A touch of an observed material has the mean of the materials' descriptions, weighted by their probabilities; one of a
+new material what the heads predict. The novelty weighs these two cases. Heads and novelty are calibrated on the sampled
+touches: each is scored by readouts that never observed it, and by heads that never observed its material.
 """
 
 from __future__ import annotations
@@ -39,10 +38,9 @@ NOVEL = Curve(1.0, -2.0)  # of a novelty in spreads, likewise
 
 
 class StageHeads:
-    """The heads of one stage over its C materials.
+    """The heads of one stage over its C materials: constituent → those of its presence and of its share.
 
-    heads: constituent → those of its presence and its share. novel: from standardised novelty to the probability of a
-    new material.
+    novel: from standardised novelty to the probability of a new material.
     """
 
     def __init__(self, model: Model, stage: int, targets: Mapping[str, Target]) -> None:
@@ -78,10 +76,9 @@ def _head(
     *,
     curved: bool,
 ) -> Head:
-    """The head of one constituent. found: the sampled touches, held out, with z, (N, C). gram: of the C materials.
+    """The head of one constituent: known, material → target; curved where it is a presence.
 
-    inverses: B at each γ, made once for all constituents that are known of the same materials. known: material →
-    target. curved: whether it is a presence.
+    found: the sampled touches, held out, with z, (N, C). gram: of the C materials. inverses: B at each γ, by materials.
     """
     places = np.array([place for place, name in enumerate(found.names) if name in known], dtype=np.intp)
     values = np.array([known[found.names[place]] for place in places], dtype=np.float64)

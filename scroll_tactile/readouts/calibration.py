@@ -11,9 +11,8 @@ nearest material there: its scores count as min(1, u_k / r_k) s_k, r_k the dista
 median over held-out touches. So a view that a change of speed, zero or length has distorted leaves the decision to the
 others. Novelty is the mean of its measures (`novelty`), each standardised by held-out touches.
 
-Touches of one material err alike: with ρ the correlation of two, log-probabilities of k count as those of
-k / (1 + (k − 1) ρ) (the design effect; Kish 1965), and their mean novelty has √((1 + (k − 1) ρ') / k) times the standard
-deviation of one:
+Touches of one material err alike. With ρ the correlation of two, k count as k / (1 + (k − 1) ρ) (the design effect;
+Kish 1965) in their log-probabilities and, with ρ', in their standardised novelty:
 
     log p = Σ_i log p_i / (1 + (k − 1) ρ) + constant,    novelty = Σ_i novelty_i / √(k (1 + (k − 1) ρ')).
 
@@ -55,11 +54,9 @@ PRIOR_PAIRS = 2.0  # the prior of ρ counts as so many
 class Calibration:
     """How the scores and distances of one stage are to be read.
 
-    weights: of the scores of the S scales that fit at the stage, shape (S,), ≥ 0.
-    scale_novelty: mean and spread of the measures of novelty over known materials, shape (S', 2).
-    median_distances: the median diagonal distance of known touches at each scale, shape (S,); infinite where every
-    touch counts alike.
-    thresholds: of the novelty of known touches, as far as any were held out.
+    weights: of the scores of the S scales that judge, (S,), ≥ 0. scale_novelty: mean and spread of the measures of
+    novelty of known touches, (S', 2); thresholds: of it, as far as any were held out. median_distances: the median
+    diagonal distance of known touches at each scale, (S,); infinite where every touch counts alike.
     """
 
     weights: FloatArray
@@ -72,10 +69,9 @@ class Calibration:
         return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
 
     def with_all_touches(self, touches: float) -> Calibration:
-        """How touches to come are read; touches: k, the median number of those materials that have two or more.
+        """How touches to come are read: more surely than held-out ones, by means of one touch more.
 
-        Held-out ones are scored by means of k − 1 others, new ones by k, and more surely: weights are (k / (k − 1))^¾
-        times as large, a power that was best on average, from two touches to ten, on sixteen sets.
+        touches: k, the median number of those materials that have two or more. The power was best on sixteen sets.
         """
         return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
 
@@ -90,10 +86,7 @@ class Calibration:
         return np.asarray(((measures - mean) / spread).mean(axis=-1))
 
     def held_out(self, found: StageScores, scales: Sequence[Scale]) -> tuple[FloatArray, FloatArray]:
-        """How N touches are answered that were held out of these scales, and how far off they are.
-
-        Log-probabilities of the materials, (N, C), and the least relative distance at a scale that measures it, (N,).
-        """
+        """Log-probabilities, (N, C), of touches held out of these scales, and their least relative distance, (N,)."""
         away = found.diagonal_distances()
         logits = np.einsum("ns,nsc->nc", self.weights_at(away), found.scores())
         logits -= logits.max(axis=1, keepdims=True, initial=-np.inf)
@@ -187,10 +180,9 @@ def fit_weights(
 
 
 def _weight_without_held_out(names: Sequence[str], readouts: Sequence[Readout], kind: ReadoutName) -> float:
-    """The weight of each scale where no touch can be held out, most materials having one.
+    """The weight where no touch can be held out: by it a material's own mean gets AHEAD logits more than the next one.
 
-    Scatter is then that within single touches, and touches of one material differ by far more. So the distances between
-    the materials set the weight: a touch at the mean of its material gets AHEAD logits more than the next material.
+    Scatter is then that within single touches, and touches of one material differ by far more.
     """
     share = PRIOR_WEIGHT[kind] / len(readouts)
     if kind == "ridge" or len(names) < 2:  # a ridge's scores are of targets of 0 and 1
@@ -235,10 +227,7 @@ class Dependence:
 def dependence_of(
     keys: Sequence[bytes], targets: npt.NDArray[np.intp], logs: FloatArray, novelties: FloatArray
 ) -> Dependence:
-    """Fit both to N held-out touches: their content hashes, materials, log-probabilities, (N, C), and novelties, (N,).
-
-    Fewer than FEWEST may be without novelties.
-    """
+    """Fit both to N held-out touches; fewer than FEWEST may be without novelties. keys: their content hashes."""
     order = np.array(sorted(range(len(keys)), key=keys.__getitem__), dtype=np.intp)
     groups = [order[targets[order] == target] for target in np.unique(targets)]
     several = [group for group in groups if len(group) > 1]
@@ -255,10 +244,10 @@ def _intraclass(groups: Sequence[FloatArray]) -> float:
     """The correlation within groups, two values or more in each, from 0 to 1."""
     if len(groups) < 2:
         return CORRELATION
-    counts, values = np.array([len(group) for group in groups]), np.concatenate(groups)
-    means, total, others = np.array([group.mean() for group in groups]), len(values), len(groups) - 1
-    within = float(np.square(values - np.repeat(means, counts)).sum()) / (total - len(groups))
+    counts, means = np.array([(len(group), group.mean()) for group in groups]).T
+    values, others = np.concatenate(groups), len(groups) - 1
+    within = float(np.square(values - np.repeat(means, counts.astype(int))).sum()) / (len(values) - len(groups))
     between = float((counts * np.square(means - values.mean())).sum()) / others
-    size = (total - float(np.square(counts).sum()) / total) / others
+    size = (len(values) - float(np.square(counts).sum()) / len(values)) / others
     share = (between - within) / max(between + (size - 1) * within, TINY)
     return float(np.clip(share, 0.0, 1.0))

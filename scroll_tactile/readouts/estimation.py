@@ -69,9 +69,7 @@ class Estimator:
     ) -> Estimator:
         """The estimator of a sample. before: an earlier one, whose heads it takes where they last."""
         made = cls(plan, [each for each in sample if each[2].annotation.values], dict(quantities), least)
-        if before is None or made._state != before._state:
-            return made
-        return before if before.least == least else replace(made, _fitted=before._fitted)
+        return made if before is None or made._state != before._state else replace(made, _fitted=before._fitted)
 
     @property
     def _state(self) -> tuple[object, ...]:
@@ -134,7 +132,11 @@ class Estimator:
     def _fit(self, stage: int) -> tuple[list[Scale], dict[str, Heads | str]]:
         found = [(material, touch, self._rows(touch, stage)) for material, _, touch in self.sample]
         there = [(material, dict(touch.annotation.values), rows) for material, touch, rows in found if rows]
-        scales = sorted(set.intersection(*(set(rows) for *_, rows in there))) if there else self._judging(stage)
+        scales = (
+            sorted(set.intersection(*(set(rows) for *_, rows in there)))
+            if there
+            else self.plan.judging(self.plan.milestones()[stage])
+        )
         fitted, spectra = dict[str, Heads | str](), dict[tuple[int, ...], list[Spectrum]]()
         for name, quantity in self.quantities.items():
             carrying = tuple(i for i, (_, values, _) in enumerate(there) if name in values)
@@ -150,16 +152,13 @@ class Estimator:
             fitted[name] = Heads(known, new, materials, targets)
         return scales, fitted
 
-    def _judging(self, stage: int) -> list[Scale]:
-        return self.plan.judging(self.plan.milestones()[stage])
-
     def _rows(self, touch: SampledTouch, stage: int) -> dict[Scale, npt.NDArray[np.int32]]:
         """The rows of a sampled touch as it was at a stage, by scale; none where it was not there at that length."""
         own = int(touch.pairs[:, 0].max())  # the touch's last stage, at which its length is its own
+        at = own if stage == self.last else stage
         if own < self.last or (own > self.last and self.plan.judged == "widest"):
             return {}
-        at = own if stage == self.last else stage
-        scales = sorted([*self._judging(at), *(self.plan.views if at == own else ())])
+        scales = sorted([*self.plan.judging(self.plan.milestones()[at]), *(self.plan.views if at == own else ())])
         places = zip(touch.pairs.tolist(), touch.rows, strict=True)
         return {scales[place]: row for (number, place, _), row in places if number == at}
 

@@ -44,7 +44,7 @@ class NoveltyThresholds:
     that are exchangeable with the sampled ones: not for another run, speed or sensor.
 
     names: the materials, ascending. targets: the place of each held-out touch's material among them, (N,). novelties:
-    standardised novelty of these touches, (N,). if_new: the same had their own materials never been observed, (N,).
+    of these touches, (N,). if_new: the same had their own materials never been observed, (N,).
     """
 
     names: Sequence[str] = ()
@@ -53,7 +53,7 @@ class NoveltyThresholds:
     if_new: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def above(self, material: str, false_alarms: float) -> float:
-        """Above which novelty a touch that is answered `material`, or "" for any, is new: `false_alarms` of known ones."""
+        """Above which novelty a touch that is answered `material`, or "" for any, is new, as false alarms are."""
         if len(self.novelties) < FEWEST:
             return UNMEASURED
         if (material, false_alarms) not in self._found:
@@ -66,7 +66,7 @@ class NoveltyThresholds:
         return self._found[material, false_alarms]
 
     def below(self, false_alarms: float) -> float:
-        """Below which novelty a touch is known: no larger a share of new ones lies there; -inf where none were tried."""
+        """Below which novelty a touch is known: no larger a share of new ones lies there; -inf where none was tried."""
         if (None, false_alarms) not in self._found:
             several = len(set(self.targets.tolist())) > 1
             found = -_conformal(-self.if_new, self._alike, false_alarms) if several else -np.inf
@@ -129,7 +129,7 @@ class Neighbours:
         return [place for place, *_ in found], [material for _, material, _ in found], self._scaled(rows)
 
     def extended(self, sample: Sampled) -> Neighbours:
-        """These and touches that were sampled since, which are never held out."""
+        """These and touches that were sampled since, never held out."""
         other, (_, names, rows) = copy.copy(self), self._of(sample)
         other.names, other._rows = [*self.names, *names], np.concatenate([self._rows, rows])
         other._sizes = np.concatenate([self._sizes, np.square(rows).sum(axis=1)])
@@ -151,19 +151,15 @@ class Neighbours:
         return known, new
 
     def _local(self, seen: FloatArray, between: Callable[[npt.NDArray[np.intp]], FloatArray]) -> FloatArray:
-        """u by distances from the rows, infinite from those left out, (N, M); 0 where all are but one.
-
-        between: the distances of some of the rows from all.
-        """
+        """u by distances from the rows, (N, M), infinite from those left out; between: those of some rows from all."""
         rows, near = np.arange(len(seen)), seen.argmin(axis=1)
         around = np.where(np.isinf(seen), np.inf, between(near))
         around[rows, near] = np.inf
         nearest = np.sort(np.partition(around, min(NEAREST, len(self.names) - 1), axis=1)[:, :NEAREST], axis=1)
         count = np.isfinite(nearest).sum(axis=1)
-        several, total = count > 0, np.where(np.isfinite(nearest), nearest, 0.0).sum(axis=1)
-        u = np.zeros(len(seen))
-        u[several] = np.log(seen[rows, near][several]) - np.log(total[several] / count[several])
-        return u
+        total = np.where(np.isfinite(nearest), nearest, 0.0).sum(axis=1)
+        mean = np.divide(total, count, out=np.ones(len(seen)), where=count > 0)
+        return np.asarray(np.log(np.where(count > 0, seen[rows, near], 1.0) / mean))  # 0 where all but one are left out
 
     def _scaled(self, features: npt.NDArray[np.number]) -> npt.NDArray[np.float32]:
         return np.asarray((features - self._origin) * self._unit, dtype=np.float32)

@@ -138,9 +138,9 @@ def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | 
 
 
 def _chosen(paths: FloatArray, among: npt.NDArray[np.bool_]) -> tuple[Groups, FloatArray, FloatArray]:
-    """What has the least squared residuals among some touches: the places of λ, (S,), and the weights of scales, (S,).
+    """The places of λ and the weights of the scales, (S,) both, of least r² among some touches, and all residuals there.
 
-    Also all touches' residuals there, (n, S). paths: residuals of all, (S, penalties, n).
+    paths: residuals of all touches, (S, penalties, n).
     """
     best = np.square(paths[:, :, among]).sum(axis=2).argmin(axis=1)  # ties go to the larger, which come first
     residuals = paths[np.arange(len(best)), best].T

@@ -34,9 +34,8 @@ def solve(gram: FloatArray, gamma: float) -> FloatArray:
     gram: G_KK, (K, K), K ≥ 2. gamma: γ, a share of G's diagonal.
     """
     count = len(gram)
-    centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
-    # Materials with equal means have G = 0: then any γ predicts the mean of the targets.
-    size = max(float(np.trace(centred)) / count, 1e-12)
+    # Of G centred. Materials with equal means have G = 0: then any γ predicts the mean of the targets.
+    size = max(float(np.trace(gram)) / count - float(gram.mean()), 1e-12)
     system = np.ones((count + 1, count + 1))
     system[:count, :count] = (gram + gram.T) / 2 + gamma * size * np.eye(count)
     system[count, count] = 0.0

@@ -132,11 +132,8 @@ class Estimator:
     def _fit(self, stage: int) -> tuple[list[Scale], dict[str, Heads | str]]:
         found = [(material, touch, self._rows(touch, stage)) for material, _, touch in self.sample]
         there = [(material, dict(touch.annotation.values), rows) for material, touch, rows in found if rows]
-        scales = (
-            sorted(set.intersection(*(set(rows) for *_, rows in there)))
-            if there
-            else self.plan.judging(self.plan.milestones()[stage])
-        )
+        had = [set(rows) for *_, rows in there] or [set(self.plan.judging(self.plan.milestones()[stage]))]
+        scales = sorted(set.intersection(*had))
         fitted, spectra = dict[str, Heads | str](), dict[tuple[int, ...], list[Spectrum]]()
         for name, quantity in self.quantities.items():
             carrying = tuple(i for i, (_, values, _) in enumerate(there) if name in values)

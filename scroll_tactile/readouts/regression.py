@@ -138,7 +138,7 @@ def fit_head(spectra: Sequence[Spectrum], targets: FloatArray, groups: Groups | 
 
 
 def _chosen(paths: FloatArray, among: npt.NDArray[np.bool_]) -> tuple[Groups, FloatArray, FloatArray]:
-    """The places of λ and the weights of the scales, (S,) both, of least r² among some touches, and all residuals there.
+    """The places of λ and the weights of the scales, (S,) each, of least r² among some touches; all residuals there.
 
     paths: residuals of all touches, (S, penalties, n).
     """

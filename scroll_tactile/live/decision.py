@@ -25,8 +25,8 @@ import numpy.typing as npt
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.prediction.model import Model, Trajectories
-from scroll_tactile.readouts.calibration import FEWEST, UNMEASURED
-from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.calibration import Dependence
+from scroll_tactile.readouts.novelty import FEWEST, UNMEASURED
 from scroll_tactile.results import Prediction
 
 __all__ = ["DecisionRule", "decision_rule"]

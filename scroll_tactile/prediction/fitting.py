@@ -33,16 +33,9 @@ from scroll_tactile.prediction.model import (
     softmax,
     tempered,
 )
-from scroll_tactile.readouts.calibration import (
-    AHEAD,
-    FEWEST,
-    HeldOutProbabilities,
-    calibrate_stage,
-    fit_weights,
-    held_out_probabilities,
-)
-from scroll_tactile.readouts.dependence import dependence_of
+from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, dependence_of, fit_weights
 from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
+from scroll_tactile.readouts.novelty import FEWEST
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
@@ -142,28 +135,28 @@ def _weighed(model: Model, least: int, counts: Sequence[int]) -> Weighing | None
     last, milestones, held_out = len(reached) - 1, model.plan.milestones(), model.held_out
     several = [count for count in counts if count > 1]
 
-    def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, HeldOutProbabilities]:
-        """How touches are judged by some scales at a stage, and the probabilities of held-out ones there."""
+    def row(stage: int, scales: Sequence[Scale], steps: int) -> tuple[Row, StageScores, FloatArray, FloatArray]:
+        """How touches are judged by some scales at a stage, held-out ones, and what `Calibration.held_out` says."""
         found, readouts = held_out.at(stage, scales), [model.readouts[scale] for scale in scales]
         near = held_out.neighbours(stage, scales) if len(found.places) >= FEWEST else []
         calibration = calibrate_stage(found, readouts, model.kind, viewed=bool(model.views), neighbours=near)
-        held = held_out_probabilities(found, scales, calibration, near)
-        own = np.exp(held.logs[np.arange(len(held.targets)), held.targets])
-        rate = _outlier_rate(own, len(held.names)) if len(own) else 0.0
+        logs, distance = calibration.held_out(found, scales)
+        own = np.exp(logs[np.arange(len(logs)), found.targets])
+        rate = _outlier_rate(own, len(found.names)) if len(own) else 0.0
         if several:  # touches to come are scored more surely than those held out
             calibration = calibration.with_all_touches(float(np.median(several)))
-        return Row(steps, stage, tuple(scales), calibration, rate, rate), held
+        return Row(steps, stage, tuple(scales), calibration, rate, rate), found, logs, distance
 
     rows = [row(stage, scales, milestones[stage])[0] for stage, scales in enumerate(reached)]
-    complete, held = row(last, [*reached[last], *model.views], least)
-    if len(held.keys):
-        complete = replace(complete, distance_limit=float(np.quantile(held.distance, WITHIN)))
+    complete, found, logs, distance = row(last, [*reached[last], *model.views], least)
+    if len(distance):
+        complete = replace(complete, distance_limit=float(np.quantile(distance, WITHIN)))
     return Weighing(
         rows=tuple(rows),
         complete=complete,
         paced=row(last, model.views, 1)[0] if model.views else complete,
         tau=UNMATCHED,
-        dependence=dependence_of(held),
+        dependence=dependence_of(found.keys, found.targets, logs, complete.calibration.thresholds.novelties),
         least=least,
         touches=sum(counts),
     )
@@ -263,9 +256,9 @@ def rehearse(model: Model) -> None:
     targets = np.zeros(shape[0], np.intp)
     with one_thread():
         for stage, row in enumerate(weighing.early):
-            held = held_out.by(row)
-            for i, place in enumerate(held.places if held.names == names else ()):
-                own = np.exp(held.logs[i])
+            found, logs, _, novelties = held_out.by(row)
+            for i, place in enumerate(found.places if found.names == names else ()):
+                own = np.exp(logs[i])
                 if matcher is None or chosen is None:
                     answered = tempered(own, row.readout_outliers)
                 elif place in chosen:
@@ -275,8 +268,8 @@ def rehearse(model: Model) -> None:
                     answered = tempered(softmax(logits), row.outliers)
                 else:
                     continue
-                chances[place, stage], novelty[place, stage] = answered, held.novelty[i]
-                targets[place] = held.targets[i]
+                chances[place, stage], novelty[place, stage] = answered, novelties[i]
+                targets[place] = found.targets[i]
     reached = np.isfinite(novelty).any(axis=1)
     held_out.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
 
@@ -337,7 +330,7 @@ def _measured_paces(
     others, logits, targets = [], list[FloatArray](), list[int]()
     for number in range(len(PACES)):
         found = StageScores(number, held_out.sample, scores)
-        held = held_out_probabilities(found, model.views, row.calibration)
+        log_chances, distances = row.calibration.held_out(found, model.views)
         own = [matches[number, place] for place in found.places]
         values = np.column_stack([found.distances().min(axis=2), [match.excess_loss for match in own]])
         mean, spread = values.mean(axis=0), np.maximum(values.std(axis=0), LEAST_SPREAD)
@@ -347,10 +340,10 @@ def _measured_paces(
         rank = min(len(novelties) - 1, math.ceil(WITHIN * (len(novelties) + 1)) - 1)
         high = float(novelties[rank]) / max(row.calibration.thresholds.above("", 1 - WITHIN), LEAST_SPREAD)
         others.append(np.stack([mean, spread * max(1.0, high)], axis=1))
-        for match, chances, distance in zip(own, np.exp(held.logs), held.distance.tolist(), strict=True):
-            scored = matcher.scores_of(held.names, match)
+        for match, chances, distance in zip(own, np.exp(log_chances), distances.tolist(), strict=True):
+            scored = matcher.scores_of(found.names, match)
             logits.append(weighing.logits("paced", chances, match, scored, distance))
-        targets += held.targets.tolist()
+        targets += found.targets.tolist()
     natural = np.vstack([row.calibration.scale_novelty, row.excess])
     power = fit_weights(np.stack(logits)[:, None], targets, np.ones(1), POWER_TOUCHES)
     return Paces(natural, np.stack(others), float(power[0]))

@@ -32,8 +32,8 @@ from scroll_tactile.matching.matcher import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import noisy_excess_of, paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, softmax, tempered
-from scroll_tactile.readouts.calibration import NoveltyThresholds
 from scroll_tactile.readouts.estimation import Estimator
+from scroll_tactile.readouts.novelty import NoveltyThresholds
 from scroll_tactile.results import Estimate, Prediction, Unusual
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.moments import one_thread
@@ -69,7 +69,7 @@ def answer(
     false_alarms: as in `Settings`.
 
     Probabilities and novelties of several touches add up as far as the touches are independent (see
-    `readouts.dependence`), in any order to the same bits; a touch that comes twice counts once. The p of their
+    `readouts.calibration`), in any order to the same bits; a touch that comes twice counts once. The p of their
     typicality is twice the mean of theirs, a bound that holds whatever the dependence between them (Vovk and Wang
     2020).
     """
@@ -281,20 +281,20 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
     rows = {} if matcher is None else matcher.kept.rows()
     for stage in range(len(weighing.rows) - 1, -1, -1):
         row = weighing.row("complete", stage)
-        held = model.held_out.by(row)
-        for i, place in enumerate(held.places):
+        found, logs, distances, novelties = model.held_out.by(row)
+        for i, place in enumerate(found.places):
             if place in answers:
                 continue
             material, key, _ = model.held_out.sample[place]
-            chances = np.exp(held.logs[i])
-            alone = Judgement(chances, float(held.novelty[i]), row, float(held.distance[i]))
+            chances = np.exp(logs[i])
+            alone = Judgement(chances, float(novelties[i]), row, float(distances[i]))
             if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):
                 [matched] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
-                result = _fused(model, held.names, alone, matched)
+                result = _fused(model, found.names, alone, matched)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
             thresholds = [row.calibration.thresholds]
-            said = _prediction(held.names, result.probability, result.novelty, thresholds, false_alarms)
+            said = _prediction(found.names, result.probability, result.novelty, thresholds, false_alarms)
             answers[place] = HeldOutTouch(material, key, said)
     return list(answers.values())
 

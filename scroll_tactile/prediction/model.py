@@ -20,15 +20,9 @@ import numpy.typing as npt
 from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.matcher import Match, TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.readouts.calibration import (
-    TINY,
-    Calibration,
-    HeldOutProbabilities,
-    Neighbours,
-    held_out_probabilities,
-)
-from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.calibration import Calibration, Dependence
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
+from scroll_tactile.readouts.novelty import TINY, Neighbours, novelty_measures
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.results import Unusual
 from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
@@ -224,9 +218,11 @@ class HeldOut:
         """Their scores at a stage by some scales."""
         return StageScores(stage, self.sample, [self.scores[scale] for scale in scales])
 
-    def by(self, row: Row) -> HeldOutProbabilities:
-        """Their probabilities and novelties by the readouts, as a row weighs them."""
-        return held_out_probabilities(self.at(row.stage, row.scales), row.scales, row.calibration, self.around(row))
+    def by(self, row: Row) -> tuple[StageScores, FloatArray, FloatArray, FloatArray]:
+        """Their scores, and by these as a row weighs them `Calibration.held_out` and their novelties, (N,)."""
+        found = self.at(row.stage, row.scales)
+        novelties = row.calibration.novelty(novelty_measures(found, self.around(row))[0])
+        return found, *row.calibration.held_out(found, row.scales), novelties
 
     def around(self, row: Row) -> list[Neighbours]:
         """Those among which a touch lies in a row's windows; none where too few were held out to measure that."""

@@ -7,10 +7,9 @@ classes is white, each material counting as one row:
     [G_KK + γ I   1] [α]   [t]
     [1ᵀ           0] [b] = [0].
 
-The weights in feature space are W α = (S_w/N + λI)⁻¹ Mᵀ α. Mᵀ α takes the place of Σ_y c_y t_yᵀ in the paper's readout,
-and the scatter between materials that of the scatter between touches. A material whose target is unknown enters only
-the scatter within classes. With B the inverse of that matrix, the head without material i follows from it (Allen 1974,
-PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches whose materials are left out of the head.
+A material whose target is unknown enters only the scatter within classes. With B the inverse of that matrix, the head
+without material i follows from it (Allen 1974, PRESS): α − B_{·i} α_i / B_ii. So γ is chosen by touches whose materials
+are left out of the head.
 """
 
 from __future__ import annotations
@@ -20,44 +19,36 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["GAMMAS", "Curve", "RidgeSystem", "fit_curve", "solve"]
+from scroll_tactile.readouts.calibration import fit_weights
+
+__all__ = ["GAMMAS", "Curve", "fit_curve", "heads_without", "solve"]
 
 FloatArray = npt.NDArray[np.float64]
 
-GAMMAS = (1e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0, 3.0, 10.0)  # as shares of the mean of G's diagonal, centred
+GAMMAS = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01, 0.001)  # shares of the mean of G's diagonal, centred; ties: the first
 
 
-@dataclass(frozen=True)
-class RidgeSystem:
-    """A factorised system of one set of known materials and one γ.
+def solve(gram: FloatArray, gamma: float) -> FloatArray:
+    """B, (K + 1, K + 1), the intercept last: B[:, :K] t are the (α, b) of targets t of the known materials.
 
-    inverse: B, shape (K + 1, K + 1), the intercept last.
+    gram: G_KK, (K, K), K ≥ 2. gamma: γ, a share of G's diagonal.
     """
-
-    inverse: FloatArray
-
-    def weights(self, targets: FloatArray) -> FloatArray:
-        """(α, b), shape (K + 1,), of targets of the known materials, shape (K,)."""
-        weights: FloatArray = self.inverse[:, :-1] @ targets
-        return weights
-
-    def weights_without(self, weights: FloatArray, place: int) -> FloatArray:
-        """(α, b), shape (K + 1,), had material `place` never been observed; its own α is 0."""
-        others: FloatArray = weights - self.inverse[:, place] * (weights[place] / self.inverse[place, place])
-        others[place] = 0.0
-        return others
-
-
-def solve(gram: FloatArray, gamma: float) -> RidgeSystem:
-    """Factorise the system of known materials with G_KK, shape (K, K), K ≥ 2, and γ, a share of G's diagonal."""
     count = len(gram)
-    centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
-    # Materials with equal means have G = 0: then any γ predicts the mean of the targets.
-    size = max(float(np.trace(centred)) / count, 1e-12)
-    system = np.zeros((count + 1, count + 1))
+    # Of G centred. Materials with equal means have G = 0: then any γ predicts the mean of the targets.
+    size = max(float(np.trace(gram)) / count - float(gram.mean()), 1e-12)
+    system = np.ones((count + 1, count + 1))
     system[:count, :count] = (gram + gram.T) / 2 + gamma * size * np.eye(count)
-    system[count, :count] = system[:count, count] = 1.0
-    return RidgeSystem(np.asarray(np.linalg.inv(system), dtype=np.float64))
+    system[count, count] = 0.0
+    return np.asarray(np.linalg.inv(system))
+
+
+def heads_without(inverse: FloatArray, targets: FloatArray) -> FloatArray:
+    """(α, b) had each of the materials never been observed, its own α then 0: a column each, (K + 1, K)."""
+    own, known = inverse[:, :-1], np.arange(len(targets))
+    weights = own @ targets
+    heads = weights[:, None] - own * (weights[:-1] / np.diagonal(own))
+    heads[known, known] = 0.0
+    return np.asarray(heads)
 
 
 @dataclass(frozen=True)
@@ -69,38 +60,18 @@ class Curve:
 
     def __call__(self, values: npt.ArrayLike) -> FloatArray:
         """Probabilities, of the same shape."""
-        from scipy.special import expit
-
-        probabilities: FloatArray = expit(self.slope * np.asarray(values, dtype=np.float64) + self.offset)
-        return probabilities
+        return np.asarray(np.exp(-np.logaddexp(0.0, -(self.slope * np.asarray(values, np.float64) + self.offset))))
 
 
-def fit_curve(
-    values: npt.ArrayLike, targets: npt.ArrayLike, prior: Curve, *, rows: float = 1.0, turning: bool = True
-) -> Curve:
+def fit_curve(values: npt.ArrayLike, targets: npt.ArrayLike, prior: Curve, *, turning: bool = True) -> Curve:
     """The logistic curve of least log loss (Platt 1999), its slope not below 0, drawn to `prior` where touches are few.
 
-    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. rows: how many touches the prior counts
-    as. turning: whether the value at which it passes a half may differ from the prior's.
+    values, targets: shape (N,), N ≥ 0; targets are 0 or 1. The prior counts as one touch. turning: whether the value at
+    which it passes a half may differ from the prior's.
     """
-    from scipy.special import expit
-
-    truth = np.asarray(targets, dtype=np.float64)
-    if not len(truth):
-        return prior
-    half = -prior.offset / prior.slope
-    from_half = np.asarray(values, dtype=np.float64) - half
-
-    def loss(point: FloatArray) -> tuple[float, FloatArray]:
-        logits = point[0] * from_half + point[1]
-        miss = expit(logits) - truth
-        pull = (point - start) / prior.slope
-        value = float(np.sum(np.logaddexp(0.0, logits) - truth * logits)) + rows * float(pull @ pull) / 2
-        return value, np.array([miss @ from_half, miss.sum()]) + rows * pull / prior.slope
-
-    start = np.array([prior.slope, 0.0])
-    bounds = [(0.0, None), (None, None) if turning else (0.0, 0.0)]
-    from scipy.optimize import minimize  # late, as in `calibration`
-
-    slope, above = minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B").x.tolist()
-    return Curve(slope, above - slope * half)
+    half, count = -prior.offset / prior.slope, 1 + turning  # of weights: the slope, and the height at the prior's half
+    features = np.stack([np.asarray(values, np.float64) - half, np.ones(np.size(values))], axis=1)[:, :count]
+    start, least = np.array([1.0, 0.0])[:count], np.array([0.0, -np.inf])[:count]
+    scores = np.stack([np.zeros_like(features), features], axis=2)  # of absence and presence
+    slope, *height = fit_weights(scores, targets, np.full(count, prior.slope), 1.0, start, least).tolist()
+    return Curve(slope, sum(height) - slope * half)

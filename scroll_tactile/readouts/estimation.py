@@ -2,8 +2,7 @@
 
 A touch is estimated by the heads of the length that it reached: before it is complete as it was at its last milestone,
 by the sampled touches as they were then; complete by complete ones, views among them. So a residual that calibrates an
-interval is of a touch like the one that is asked for. A head is fitted when it is first asked for, and is a function of
-the set of sampled touches and their values: no order and no earlier state has a part in it.
+interval is of a touch like the one that is asked for. Heads are functions of the set of sampled touches and values.
 """
 
 from __future__ import annotations
@@ -50,14 +49,14 @@ class Estimator:
     """Estimates the quantities of touches from sampled ones, in one state of a memory.
 
     sample: the touches that carry a value, in the sample's order. least: the steps from which on a touch is complete.
-    Made by `Estimator.of`. Any number of threads may use it: one that comes second fits the same heads again.
+    Any number of threads may use it: one that comes second fits the same heads again.
     """
 
     plan: WindowPlan
     sample: list[Sampled]
     quantities: Mapping[str, Quantity]
     least: int
-    _fitted: dict[int, dict[str, Heads | str]] = field(default_factory=dict)
+    _fitted: dict[int, tuple[list[Scale], dict[str, Heads | str]]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -69,25 +68,21 @@ class Estimator:
         before: Estimator | None = None,
     ) -> Estimator:
         """The estimator of a sample. before: an earlier one, whose heads it takes where they last."""
-        carrying = [(material, key, touch) for material, key, touch in sample if touch.annotation.values]
-        made = cls(plan, carrying, dict(quantities), least)
-        if before is None or made._state != before._state:
-            return made
-        return before if before.least == least else replace(made, _fitted=before._fitted)
+        made = cls(plan, [each for each in sample if each[2].annotation.values], dict(quantities), least)
+        return made if before is None or made._state != before._state else replace(made, _fitted=before._fitted)
 
-    @cached_property
+    @property
     def _state(self) -> tuple[object, ...]:
         """What heads are a function of, beside the touches' content."""
-        touches = [(material, key, touch.annotation) for material, key, touch in self.sample]
-        return touches, self.quantities, self.last
+        return [(name, key, touch.annotation) for name, key, touch in self.sample], self.quantities, self.last
 
     @cached_property
     def last(self) -> int:
-        """The stage from which on touches are complete."""
+        """The stage of complete touches."""
         return len(self.plan.stages(max(self.least, self.plan.milestones()[0]))) - 1
 
     def stage(self, steps: int) -> int:
-        """By which heads a touch of so many steps is estimated: the stage that it reached last, `last` if complete."""
+        """By whose heads a touch of so many steps is estimated: the stage that it reached last, `last` if complete."""
         return self.last if steps >= self.least else max(0, min(len(self.plan.stages(steps)), self.last) - 1)
 
     def length(self, steps: int) -> int:
@@ -98,13 +93,9 @@ class Estimator:
         """
         return steps if self.stage(steps) == self.last else self.plan.milestones()[self.stage(steps)]
 
-    def scales(self, stage: int) -> list[Scale]:
-        """The scales that are read at a stage: its windows; of complete touches all that each of them has."""
-        return self._judging(stage) if stage < self.last else self._of_complete
-
     def scales_for(self, steps: int) -> list[Scale]:
-        """The scales that are read of a touch of so many steps, cut to its `length`."""
-        return self.scales(self.stage(steps))
+        """The scales that are read of a touch of so many steps, cut to its `length`: all that sampled ones have."""
+        return self._at(self.stage(steps))[0]
 
     def wanted(self, names: Sequence[str] | None) -> list[str]:
         """The quantities that are asked for, all where it is None. Raises AnnotationError for one not declared."""
@@ -119,57 +110,52 @@ class Estimator:
     def estimate(
         self, wanted: Sequence[str], means: Mapping[Scale, FloatArray], steps: int, risk: float, *, known: bool
     ) -> dict[str, Estimate]:
-        """The estimates of some quantities.
+        """The estimates of some quantities. known: whether the material is a learned one.
 
         means: mean features in grid units, (d,), of a touch of so many steps cut to its `length`, at `scales_for`.
-        known: whether its material is a learned one.
         """
-        stage = self.stage(steps)
-        features = [means[scale] for scale in self.scales(stage) if scale in means]  # of an empty memory none
-        found = {name: (self.heads(stage)[name], self.quantities[name]) for name in wanted}
-        return {name: _estimate(heads, of, features, risk, known=known) for name, (heads, of) in found.items()}
+        scales, heads = self._at(self.stage(steps))
+        features = [means[scale] for scale in scales if scale in means]  # of an empty memory none
+        return {name: _estimate(heads[name], self.quantities[name], features, risk, known=known) for name in wanted}
 
     def heads(self, stage: int) -> dict[str, Heads | str]:
         """The heads of a stage, by quantity, or in words why there are none."""
+        return self._at(stage)[1]
+
+    def _at(self, stage: int) -> tuple[list[Scale], dict[str, Heads | str]]:
+        """The scales and the heads of a stage, fitted when they are first asked for."""
         if stage not in self._fitted:
             with one_thread():
                 self._fitted[stage] = self._fit(stage)
         return self._fitted[stage]
 
-    def _fit(self, stage: int) -> dict[str, Heads | str]:
-        scales, spectra = self.scales(stage), dict[tuple[int, ...], list[Spectrum]]()
-        rows = {i: rows for i, (*_, touch) in enumerate(self.sample) if (rows := self._rows(touch, stage))}
-        fitted: dict[str, Heads | str] = {}
+    def _fit(self, stage: int) -> tuple[list[Scale], dict[str, Heads | str]]:
+        found = [(material, touch, self._rows(touch, stage)) for material, _, touch in self.sample]
+        there = [(material, dict(touch.annotation.values), rows) for material, touch, rows in found if rows]
+        had = [set(rows) for *_, rows in there] or [set(self.plan.judging(self.plan.milestones()[stage]))]
+        scales = sorted(set.intersection(*had))
+        fitted, spectra = dict[str, Heads | str](), dict[tuple[int, ...], list[Spectrum]]()
         for name, quantity in self.quantities.items():
-            steps = {i: dict(self.sample[i][2].annotation.values).get(name) for i in rows}
-            values = {i: quantity.value(found) for i, found in steps.items() if found is not None}
-            carrying, targets = tuple(values), np.array([*values.values()])
-            materials = tuple(self.sample[i][0] for i in carrying)
+            carrying = tuple(i for i, (_, values, _) in enumerate(there) if name in values)
+            targets = np.array([quantity.value(there[i][1][name]) for i in carrying])
+            materials = tuple(there[i][0] for i in carrying)
             if reason := _lacking(targets, materials):
                 fitted[name] = reason
                 continue
             if carrying not in spectra:  # quantities that the same touches carry share them
-                spectra[carrying] = [Spectrum.of(np.stack([rows[i][scale] for i in carrying])) for scale in scales]
+                spectra[carrying] = [Spectrum.of(np.stack([there[i][2][scale] for i in carrying])) for scale in scales]
             groups = np.unique(materials, return_inverse=True)[1]
             known, new = fit_head(spectra[carrying], targets), fit_head(spectra[carrying], targets, groups)
             fitted[name] = Heads(known, new, materials, targets)
-        return fitted
-
-    @cached_property
-    def _of_complete(self) -> list[Scale]:
-        complete = [set(rows) for *_, touch in self.sample if (rows := self._rows(touch, self.last))]
-        return sorted(set.intersection(*complete)) if complete else self._judging(self.last)
-
-    def _judging(self, stage: int) -> list[Scale]:
-        return self.plan.judging(self.plan.milestones()[stage])
+        return scales, fitted
 
     def _rows(self, touch: SampledTouch, stage: int) -> dict[Scale, npt.NDArray[np.int32]]:
         """The rows of a sampled touch as it was at a stage, by scale; none where it was not there at that length."""
         own = int(touch.pairs[:, 0].max())  # the touch's last stage, at which its length is its own
+        at = own if stage == self.last else stage
         if own < self.last or (own > self.last and self.plan.judged == "widest"):
             return {}
-        at = own if stage == self.last else stage
-        scales = sorted([*self._judging(at), *(self.plan.views if at == own else ())])
+        scales = sorted([*self.plan.judging(self.plan.milestones()[at]), *(self.plan.views if at == own else ())])
         places = zip(touch.pairs.tolist(), touch.rows, strict=True)
         return {scales[place]: row for (number, place, _), row in places if number == at}
 
@@ -190,22 +176,14 @@ def _estimate(
 ) -> Estimate:
     if not isinstance(heads, str) and len(features) < len(heads.known.weights):
         heads = "the sampled touches that carry a value are longer than this one; observe some as short, with a value"
+    none = Estimate(value=None, low=None, high=None, unit=quantity.unit, risk=risk, known=known)
     if isinstance(heads, str):
-        return Estimate(value=None, low=None, high=None, unit=quantity.unit, risk=risk, known=known, missing=heads)
+        return replace(none, missing=heads)
     head = heads.known if known else heads.new
     said, half = head(features), head.half_width(risk)
     value, low, high = (min(max(one, quantity.low), quantity.high) for one in (said, said - half, said + half))
     missing = ""
     if math.isinf(half):
         missing = f"the interval is the range: one of risk {risk:g} takes {math.ceil(1 / risk - 1e-9) - 1} touches"
-    return Estimate(
-        value=value,
-        low=low,
-        high=high,
-        unit=quantity.unit,
-        risk=risk,
-        known=known,
-        touches=len(heads.targets),
-        materials=len(set(heads.materials)),
-        missing=missing,
-    )
+    touches, materials = len(heads.targets), len(set(heads.materials))
+    return replace(none, value=value, low=low, high=high, touches=touches, materials=materials, missing=missing)

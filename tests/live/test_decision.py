@@ -11,7 +11,7 @@ from scroll_tactile.errors import InputError
 from scroll_tactile.live.decision import DecisionRule, decision_rule, in_pairs, least_sure
 from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.model import Trajectories
-from scroll_tactile.readouts.dependence import Dependence
+from scroll_tactile.readouts.calibration import Dependence
 from scroll_tactile.results import Prediction
 from scroll_tactile.simulation.scene import Scene
 

@@ -163,7 +163,7 @@ def test_heads_for_the_unseen_are_chosen_by_leaving_objects_out():
     lower = Task.of(statistics, 1, statistics.names(1)).scatter
     scatter = np.tril(lower) + np.tril(lower, -1).T
     gram = means @ np.linalg.solve(scatter + head.penalty * np.trace(scatter) / 6 * np.eye(6), means.T)
-    system = np.linalg.inv(solve(gram, head.gamma).inverse)
+    system = np.linalg.inv(solve(gram, head.gamma))
     targets = np.array([[known[f"m{i:02}"]["bright"] == value for value in head.values] for i in range(20)], float)
     error = 0.0
     for i in range(20):

@@ -10,8 +10,7 @@ import pytest
 from scroll_tactile import Kernels, Sensor, TactileLearner
 from scroll_tactile.errors import DescriptionError, MaterialError
 from scroll_tactile.memory.descriptions import checked, targets_of
-from scroll_tactile.prediction.composition import Composer, ConstituentHead, StageHeads
-from scroll_tactile.readouts.attributes import Curve
+from scroll_tactile.prediction.composition import constituents
 
 SKIN = Sensor(name="skin", channels=4, rate=50.0, low=-2.0, high=2.0, unit="N", duration=1.0)
 PARTS = ("cotton", "linen", "silk", "wool")
@@ -101,12 +100,9 @@ def test_shares_sum_to_one_or_to_no_more_where_some_are_unknown(unknown, shares)
     """Of a touch of materials that were observed, which its probabilities alone compose."""
     descriptions = {"a": {"wool": 1.0}, "b": {"wool": 0.5, "silk": 0.5}}
     targets = targets_of({name: checked(name, description) for name, description in descriptions.items()})
-    head = ConstituentHead(np.arange(2), np.zeros(3), None)
-    heads = {name: "too few" if name in unknown else head for name in targets}
-    stage = StageHeads(Curve(1.0, 0.0), heads, heads)
-    composer = Composer(None, targets, [stage], [])
-    found = composer._constituents(["silk", "wool"], stage, {"a": 0.5, "b": 0.5}, np.zeros(3), 0.0)
-    assert [constituent.share for constituent in found] == shares
+    heads = {name: ("too few",) * 2 if name in unknown else ((np.zeros(3), None),) * 2 for name in targets}
+    found = constituents(targets, heads, {"a": 0.5, "b": 0.5}, np.zeros(2), 0.0)
+    assert [found[name].share for name in ("silk", "wool")] == shares
 
 
 class TestDescribing:

@@ -11,17 +11,14 @@ from scipy.special import logsumexp
 
 from scroll_tactile.readouts.calibration import (
     AHEAD,
-    FEWEST,
     PRIOR_WEIGHT,
     Calibration,
-    Neighbours,
-    NoveltyThresholds,
     calibrate_stage,
     fit_weights,
-    held_out_probabilities,
     scale_weights,
 )
 from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
+from scroll_tactile.readouts.novelty import FEWEST, Neighbours, NoveltyThresholds, novelty_measures
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.sample import SampledTouch, TouchSample
@@ -244,15 +241,13 @@ def test_a_touch_is_as_new_as_it_is_far_from_the_nearest_beside_what_lies_around
     assert found.novelty(features, {"1", "4"}) == pytest.approx(local_novelty(touch, of_two), abs=1e-4)
 
 
-@pytest.mark.parametrize("asked", [False, True])
-def test_a_held_out_touch_is_as_new_as_without_it_or_without_its_material(asked):
+def test_a_held_out_touch_is_as_new_as_without_it_or_without_its_material():
     statistics, sample = scene(touches=30)
-    found, readout, scaled = neighbours(statistics, sample)
+    found, _, scaled = neighbours(statistics, sample)
     materials, places = [material for material, *_ in sample], [3, 4, 11, 29]
-    moved = np.random.default_rng(2).normal(size=(4, DIMENSION)) * 60_000 if asked else None
-    known, if_new = found.held_out(places, moved)
+    known, if_new = found.held_out(places)
     for i, place in enumerate(places):
-        touch = scaled[place] if moved is None else (moved[i] - readout.origin) * np.sqrt(readout.precision)
+        touch = scaled[place]
         others = [scaled[other] for other in scaled if other != place]
         strangers = [scaled[other] for other in scaled if materials[other] != materials[place]]
         assert known[i] == pytest.approx(local_novelty(touch, others), abs=1e-4)
@@ -363,14 +358,13 @@ def test_a_stage_with_neighbours_measures_novelty_by_both(touches):
     near = [Neighbours(readout, sample, STAGES, 1) for readout in readouts]
     stage = calibrate_stage(found, readouts, "lda", neighbours=near)
     assert len(stage.scale_novelty) == (4 if touches == 60 else 2)
-    held = held_out_probabilities(found, SCALES, stage, near)
-    assert len(held.novelty) == touches
+    assert len(stage.thresholds.novelties) == (60 if touches == 60 else 0)
     if touches == 60:
         distances = [found.distances().min(axis=2), *(one.held_out(found.places)[0] for one in near)]
         measures = np.column_stack(distances)
         mean = ((measures - measures.mean(axis=0)) / measures.std(axis=0)).mean(axis=1)
-        np.testing.assert_allclose(held.novelty, mean / mean.std(), rtol=1e-6)
-        np.testing.assert_array_equal(stage.thresholds.novelties, held.novelty)
+        np.testing.assert_allclose(stage.thresholds.novelties, mean / mean.std(), rtol=1e-6)
+        np.testing.assert_array_equal(stage.novelty(novelty_measures(found, near)[0]), stage.thresholds.novelties)
         assert np.mean(stage.thresholds.if_new) > 3
         assert stage.thresholds.names == found.names
         # Any order of observation, the same bits.

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from scroll_tactile.readouts.calibration import HeldOutProbabilities
-from scroll_tactile.readouts.dependence import DEFAULT, Dependence, dependence_of
+from scroll_tactile.readouts.calibration import CORRELATION, Dependence, dependence_of
 
 NAMES = [f"m{i}" for i in range(12)]
 
@@ -31,21 +30,17 @@ def held(rows):
     logits = np.array([row[2] for row in rows]).reshape(len(rows), len(NAMES))
     logs = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
     targets, novelty = np.array([row[1] for row in rows], dtype=np.intp), np.array([row[3] for row in rows])
-    return HeldOutProbabilities(
-        NAMES, [*range(len(rows))], [row[0] for row in rows], targets, logs, np.ones(len(rows)), novelty
-    )
+    return [row[0] for row in rows], targets, logs, novelty
 
 
 def picked(found, places):
     """Some of them, in this order."""
-    at = list(places)
-    keys = [found.keys[place] for place in at]
-    logs, targets, novelty = found.logs[at], found.targets[at], found.novelty[at]
-    return HeldOutProbabilities(NAMES, at, keys, targets, logs, found.distance[at], novelty)
+    keys, *rest = found
+    return [keys[place] for place in places], *(values[list(places)] for values in rest)
 
 
 def test_touches_that_say_the_same_count_less():
-    loose, tight = dependence_of(apart(0.0)), dependence_of(apart(0.9))
+    loose, tight = dependence_of(*apart(0.0)), dependence_of(*apart(0.9))
     assert loose.log_probability < tight.log_probability <= 1
     assert loose.log_probability < 0.25
     assert loose.novelty == pytest.approx(0.0, abs=0.1)
@@ -54,12 +49,12 @@ def test_touches_that_say_the_same_count_less():
 
 def test_it_is_of_the_set():
     found = apart(0.5)
-    assert dependence_of(picked(found, range(len(found.keys))[::-1])) == dependence_of(found)
+    assert dependence_of(*picked(found, range(len(found[0]))[::-1])) == dependence_of(*found)
 
 
 @pytest.mark.parametrize("touches", [held([]), picked(apart(0.5), range(5))], ids=["none", "five"])
 def test_few_touches_have_the_usual(touches):
-    assert dependence_of(touches) == Dependence(DEFAULT, DEFAULT)
+    assert dependence_of(*touches) == Dependence(CORRELATION, CORRELATION)
 
 
 def test_one_touch_is_what_it_is_and_any_order_gives_the_same_bits():

@@ -127,7 +127,7 @@ def test_heads_last_as_long_as_their_touches(estimator):
     estimator.heads(0)
     same = Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 99, estimator)
     assert same.heads(0) is estimator.heads(0) and same.least == 99
-    assert Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 100, estimator) is estimator
+    assert Estimator.of(PLAN, [*LEARNED], {"force": FORCE}, 100, estimator).heads(0) is estimator.heads(0)
     fewer = Estimator.of(PLAN, LEARNED[1:], {"force": FORCE}, 100, estimator)
     assert fewer.heads(0)["force"].known.weights.tobytes() != estimator.heads(0)["force"].known.weights.tobytes()
 

@@ -74,8 +74,8 @@ def fit_heads(
         for penalty in sorted(PENALTIES, reverse=True):
             ridge = penalty * variance * np.eye(len(task.origin))
             solved = InverseTriangle(task.scatter + ridge).solve(means)
-            for gamma in sorted(GAMMAS, reverse=True):
-                system = solve(solved @ means.T, gamma).inverse
+            for gamma in GAMMAS:
+                system = solve(solved @ means.T, gamma)
                 for key, truth in known.items():
                     values = np.unique(truth)
                     weights = system[:, :-1] @ (truth[:, None] == values).astype(np.float64)

@@ -34,8 +34,8 @@ from scroll_tactile.prediction.features import FeatureExtractor, stream_of
 from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.readouts.calibration import FEWEST
 from scroll_tactile.readouts.leave_one_out import rows_at
+from scroll_tactile.readouts.novelty import FEWEST
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.results import Observation, Prediction
 from scroll_tactile.signals.stream import Stream, fewest_readings, validate

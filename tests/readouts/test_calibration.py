@@ -206,6 +206,10 @@ def test_views_are_calibrated_on_scores_that_are_doubted_as_those_of_a_touch_wil
     targets = [apart[0].names.index(material) for material in materials]
     expected = scale_weights(doubted, targets, PRIOR_WEIGHT[kind] / 2)
     np.testing.assert_allclose(viewed.weights, expected, rtol=1e-9)
+    logs, distance = viewed.held_out(found, SCALES)
+    logits = (doubted * viewed.weights[:, None]).sum(axis=1)
+    np.testing.assert_allclose(logs, logits - logsumexp(logits, axis=1, keepdims=True), atol=1e-9)
+    np.testing.assert_allclose(distance, (away / viewed.median_distances).min(axis=1))
     # Every scale has a part in the novelty, viewed or not.
     near, by_first, by_second = np.array([3.0, 5.0]), np.array([10.0, 5.0]), np.array([3.0, 12.0])
     for calibration in (viewed, plain):

@@ -119,8 +119,10 @@ def _prediction(
 
 def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
     """The judgement of a touch by a model, or by the logits of f*."""
-    if encoded.logits is not None:
-        return model.judge(candidates, encoded.means, encoded.steps, "complete", encoded.logits)
+    if (logits := encoded.logits) is not None:
+        row = model.fitted.row("complete", len(model.fitted.rows) - 1)
+        chances = softmax(np.array([logits[name] for name in candidates]))
+        return Judgement(chances, model.novelty(row, encoded.means, candidates), row)
     weighing, own = model.fitted, _own_hypothesis(model, encoded)
     alone = model.judge(candidates, encoded.means, encoded.steps, own)
     length, matcher = len(encoded.stream), model.matcher

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import CapacityError, ScrollTactileError
+from scroll_tactile.errors import CapacityError
 from scroll_tactile.matching.matcher import Match, TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.readouts.calibration import Calibration, Dependence
@@ -57,21 +57,13 @@ LEAST_DISTANCE_WEIGHT = 0.5  # the least weight at another pace, as a share of t
 
 @contextmanager
 def enough_memory() -> Iterator[None]:
-    """Raise CapacityError where the system has no memory left for the readouts; what was observed is kept.
-
-    Raises ScrollTactileError where sums that came from elsewhere have no readout: see `validation.gate`.
-    """
+    """Raise CapacityError where the system has no memory left for the readouts; what was observed is kept."""
     try:
         yield
     except MemoryError as error:
         raise CapacityError(
             f"the system has no memory left for the readouts ({error}); what was observed is kept. Name fewer "
             "materials in a scene, or give the process more"
-        ) from error
-    except np.linalg.LinAlgError as error:  # never of sums of rows: the shrunk scatter is positive definite
-        raise ScrollTactileError(
-            f"the sums of this memory have no readout ({error}): they are of no touches that were observed. Look at "
-            "where it came from (scroll-tactile memory check), and go back to a copy from before"
         ) from error
 
 
@@ -174,20 +166,12 @@ class Weighing:
         chances: probabilities by the readouts; scores: log-likelihoods by the kept touches; both (C,).
         """
         power = self.paces.power if hypothesis == "paced" and self.paces is not None else 1.0
-        sure = (1 - match.noise_share) * self._distance_weight(hypothesis, distance)
+        sure, limit = 1 - match.noise_share, self.complete.distance_limit
+        if hypothesis != "prefix" and np.isfinite(limit):  # readouts weigh less, the further off the touch is
+            least = (1.0 if hypothesis == "complete" else LEAST_DISTANCE_WEIGHT) / max(limit, 1.0)
+            sure *= float(np.clip(1.0 / max(distance, 1e-9), least, 1.0))
         beta = (BESIDE * sure + (1 - sure)) / (1 + (1 / self.tau - 1) * match.information)
         return np.asarray(power * (sure * np.log(np.maximum(chances, TINY)) + beta * scores))
-
-    def _distance_weight(self, hypothesis: Hypothesis, distance: float) -> float:
-        """The weight of the readouts for a touch at a relative distance, in (0, 1]: less, the further it is off.
-
-        Of a complete touch at least 1 / limit, at another pace half of that; of a prefix it is 1.
-        """
-        limit = self.complete.distance_limit
-        if hypothesis == "prefix" or not np.isfinite(limit):
-            return 1.0
-        least = (1.0 if hypothesis == "complete" else LEAST_DISTANCE_WEIGHT) / max(limit, 1.0)
-        return float(np.clip(1.0 / max(distance, 1e-9), least, 1.0))
 
 
 @dataclass(eq=False)
@@ -275,7 +259,6 @@ class Model:
     matcher: TouchMatcher | None = None
     readouts: dict[Scale, Readout] = field(default_factory=dict)
     since: list[tuple[str, bytes, SampledTouch]] = field(default_factory=list)
-    _of_all: dict[Scale, npt.NDArray[np.intp]] = field(init=False, default_factory=dict)
     _extended: dict[int, list[Neighbours]] = field(init=False, default_factory=dict)  # by stage
 
     @property
@@ -339,12 +322,11 @@ class Model:
         means: Mapping[Scale, FloatArray],
         steps: int,
         hypothesis: Hypothesis,
-        tuned: Mapping[str, float] | None = None,
     ) -> Judgement:
         """Weigh the candidates for a touch by the readouts alone.
 
         means: for each of the scales of `scales_for`, mean features in grid units, (d,). steps: observed so far.
-        hypothesis: what the touch is taken for. tuned: logits of f*, by material, in place of the last stage's scores.
+        hypothesis: what the touch is taken for.
 
         Each stage that is the last one of some candidate weighs the candidates that have rows there. Those without rows
         at a later stage keep their probability; the later stages divide the remaining probability among the others.
@@ -352,46 +334,32 @@ class Model:
         weighing = self.fitted
         decided = self._decided(candidates, len(self.plan.stages(steps)))
         if hypothesis == "paced":  # every touch has views, of all of it
-            decided = [(len(weighing.rows) - 1, range(len(candidates)))]
+            decided = [(len(weighing.rows) - 1, [*range(len(candidates))])]
         probability, distance = np.ones(len(candidates)), 0.0
         for i, (stage, members) in enumerate(decided):
-            among = np.asarray(members, dtype=np.intp)
-            mass = float(probability[among].sum()) if i else 1.0
-            names = candidates if len(members) == len(candidates) else [candidates[place] for place in members]
-            if tuned is not None and stage == len(self.stages) - 1:
-                logits = np.array([tuned[name] for name in names])
-            else:
-                logits, distance = self._weighted(weighing.row(hypothesis, stage), means, names, steps)
-            probability[among] = softmax(logits) * mass
+            mass, names = float(probability[members].sum()) if i else 1.0, [candidates[place] for place in members]
+            logits, distance = self._weighted(weighing.row(hypothesis, stage), means, names, steps)
+            probability[members] = softmax(logits) * mass
         best = int(np.argmax(probability))
         row = weighing.row(hypothesis, max(stage for stage, members in decided if best in members))
         return Judgement(probability, self.novelty(row, means, candidates), row, distance)
 
-    def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, Sequence[int]]]:
+    def _decided(self, candidates: Sequence[str], reached: int) -> list[tuple[int, list[int]]]:
         """(stage, places of the candidates weighed there), for each stage that is the last one of any candidate."""
-        stages = self.stages[: min(reached, len(self.fitted.rows))]
-        groups = [self._observed_at(scales, candidates) for scales in stages]
+        groups = []
+        for scales in self.stages[: min(reached, len(self.fitted.rows))]:
+            known = [self.readouts[scale].places for scale in scales]
+            groups.append([i for i, name in enumerate(candidates) if all(name in places for places in known)])
         return [
             (stage, members)
             for stage, members in enumerate(groups)
             if members and (stage + 1 == len(groups) or len(groups[stage + 1]) < len(members))
         ]
 
-    def _observed_at(self, scales: Sequence[Scale], candidates: Sequence[str]) -> Sequence[int]:
-        """The places of the candidates that were observed at all of these scales."""
-        known = [self.readouts[scale].places for scale in scales]
-        if all(len(places) == len(self.names) for places in known):
-            return range(len(candidates))
-        return [i for i, name in enumerate(candidates) if all(name in places for places in known)]
-
     def _places(self, scale: Scale, names: Sequence[str]) -> npt.NDArray[np.intp]:
         """The places of those materials that a scale knows."""
         places = self.readouts[scale].places
-        if names is not self.names:
-            return np.array([places[name] for name in names if name in places], dtype=np.intp)
-        if scale not in self._of_all:
-            self._of_all[scale] = self._places(scale, list(names))
-        return self._of_all[scale]
+        return np.array([places[name] for name in names if name in places], dtype=np.intp)
 
     def _weighted(
         self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str], steps: int

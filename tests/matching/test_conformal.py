@@ -1,6 +1,6 @@
 """Class-conditional conformal sets against a plain model, their coverage, and crepes on the same scores."""
 
-from typing import NamedTuple
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from scroll_tactile.matching.kept_arrays import KeptArrays, KeptTouch, log_steps
 from scroll_tactile.matching.likelihood import MISSING
 
 CHANNELS, COLUMNS = 3, 40
+Typicality = namedtuple("Typicality", "share least of_all least_of_all")
 
 
 def touch(material, seed, columns=COLUMNS):
@@ -24,13 +25,6 @@ def touch(material, seed, columns=COLUMNS):
 
 def kept(materials=4, of_each=25, first=0):
     return [KeptTouch(f"m{m}", bytes([m, i]), touch(m, first + i)) for m in range(materials) for i in range(of_each)]
-
-
-class Typicality(NamedTuple):
-    share: float
-    least: float
-    of_all: float
-    least_of_all: float
 
 
 def conformal_of(touches, before=None):

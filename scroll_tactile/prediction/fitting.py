@@ -189,13 +189,13 @@ def _by_kept_touches(model: Model, matcher: TouchMatcher) -> Model:
     kept, chosen, weighing = matcher.kept, _chosen(model, matcher), model.fitted
     if len(chosen) < FEWEST or len(kept.materials) < 2:
         return model
-    found = [matcher.beside(matcher.query(kept.levels(row), held_out=row), CLEAN) for row in chosen]
-    matches = [matcher.result(each) for each in found]
-    early = [row.steps for row in weighing.early]
-    losses = np.full((len(found), len(early)), np.nan)
-    for of, each in zip(losses, found, strict=True):
-        reached = [steps for steps in early if steps < each.query.columns]
-        of[: len(reached)] = each.excess_at(reached)
+    early, matches = [row.steps for row in weighing.early], list[Match]()
+    losses = np.full((len(chosen), len(early)), np.nan)
+    for loss, row in zip(losses, chosen, strict=True):
+        beside = matcher.beside(matcher.query(kept.levels(row), held_out=row), CLEAN)
+        reached = [steps for steps in early if steps < beside.query.columns]
+        loss[: len(reached)] = beside.excess_at(reached)
+        matches.append(matcher.result(beside))
     whole = np.array([match.excess_loss for match in matches])
 
     def weighed(row: Row, loss: FloatArray) -> Row:

@@ -286,6 +286,8 @@ class Model:
 
         The class means are those of all observations, the scatter and the weighing stay as they were fitted.
         """
+        if not changed:
+            return self
         readouts = {}
         for scale, readout in self.readouts.items():
             if (own := readout.followed(memory.statistics, changed)) is None:

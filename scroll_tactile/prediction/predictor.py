@@ -60,22 +60,15 @@ FASTER = 2  # times the touches of the last fit: where there are more, or fewer 
 
 @dataclass
 class _Fit:
-    """A fit of a memory, done or in a thread, and what changed since it began.
+    """A model, and what changed since its fit began; beside a fit in a thread the model before it.
 
     version, retractions: of the memory then. changed: the materials that changed since; None where any may have.
     """
 
-    model: Future[Model]
+    model: Model
     version: int
     retractions: int
     changed: set[str] | None = field(default_factory=set)
-
-    @classmethod
-    def done(cls, model: Model, version: int, retractions: int) -> _Fit:
-        """Of a model that is there."""
-        made = cls(Future(), version, retractions)
-        made.model.set_result(model)
-        return made
 
 
 class LogitsReader(Protocol):
@@ -100,7 +93,7 @@ class Predictor:
         self.replaced = False
         self._axes: dict[str, Predictor] = {}
         self._fit: _Fit | None = None  # its model follows the memory
-        self._job: _Fit | None = None
+        self._job: tuple[Future[Model], _Fit] | None = None  # in the thread
         self._version = -1  # of the memory up to which changes are noted
         self._worker: ThreadPoolExecutor | None = None
         self._process = os.getpid()
@@ -249,20 +242,19 @@ class Predictor:
         with self.ledger.lock, enough_memory():
             memory = self.ledger.memory  # first: after an interrupted change this reads the memory again, a new version
             self._note_changes()
-            fit, job = self._fit, self._job
-            if job is not None and job.model.done():
-                self._job = None
-                if job.model.exception() is None and job.changed is not None:
-                    fit = job
+            fit = self._fit
+            if self._job is not None and self._job[0].done():
+                (future, job), self._job = self._job, None
+                if future.exception() is None and job.changed is not None:
+                    job.model, fit = future.result(), job
             elif fit is None:
                 fit = self._restored()
             elif fit.changed == set():
-                return fit.model.result()
+                return fit.model
             self._fit = None  # an interrupted call leaves no model
-            model = None if fit is None else _followed(fit, memory)
-            if fit is None or model is None:
-                return self._fit_now(None if fit is None else fit.model.result())
-            self._fit = _Fit.done(model, fit.version, fit.retractions)
+            if fit is None or (model := _followed(fit, memory)) is None:
+                return self._fit_now(None if fit is None else fit.model)
+            self._fit = _Fit(model, fit.version, fit.retractions)
             self._begin_fit()
             return model
 
@@ -286,11 +278,10 @@ class Predictor:
 
     def _settled(self) -> Model:
         """The model fitted to the present memory: a function of the set of observations alone."""
-        before = None if self._fit is None else self._fit.model.result()
         self._note_changes()
-        if self._fit is None or before is None or self._fit.version != self._version:
-            return self._fit_now(before)
-        return before
+        if self._fit is None or self._fit.version != self._version:
+            return self._fit_now(None if self._fit is None else self._fit.model)
+        return self._fit.model
 
     def prepare(self) -> None:
         """Begin to fit models anew where enough touches came since the last fit; called after an observation."""
@@ -306,7 +297,7 @@ class Predictor:
         if self.ledger.version == self._version:
             return
         changed, self.ledger.changed, self._version = self.ledger.changed, set(), self.ledger.version
-        for fit in (self._fit, self._job):
+        for fit in (self._fit, self._job and self._job[1]):
             if fit is not None:
                 fit.changed = None if fit.changed is None or changed is None else fit.changed | changed
 
@@ -314,14 +305,14 @@ class Predictor:
         """Begin a fit if enough touches came or went. A lack of memory or threads raises nothing here."""
         if self._fit is None or self._job is not None:
             return
-        model, memory = self._fit.model.result(), self.ledger.memory
+        model, memory = self._fit.model, self.ledger.memory
         if abs(memory.statistics.touches - model.touches) < max(LEAST, model.touches // GROWTH):
             return
         # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
         with suppress(MemoryError, InputError, RuntimeError):
             draft = Draft.of(memory, self.recipe.settings.readout, model)
             self._worker = self._worker or ThreadPoolExecutor(1, "scroll-tactile fit")
-            self._job = _Fit(self._worker.submit(draft.fit), self._version, memory.retractions)
+            self._job = self._worker.submit(draft.fit), _Fit(model, self._version, memory.retractions)
 
     def _restored(self) -> _Fit | None:
         """The model by the weighing of the checkpoint that the memory was read from; None where it has none that fits.
@@ -336,12 +327,12 @@ class Predictor:
         except ValueError as error:
             logger.warning("the weighing in the memory's checkpoint is not used, and fitted anew: %.300s", error)
             return None
-        return _Fit.done(model, -1, memory.retractions)
+        return _Fit(model, -1, memory.retractions)
 
     def _fit_now(self, before: Model | None) -> Model:
         self._fit, self._job, memory = None, None, self.ledger.memory
         model = Draft.of(memory, self.recipe.settings.readout, before).fit()
-        self._fit = _Fit.done(model, self._version, memory.retractions)
+        self._fit = _Fit(model, self._version, memory.retractions)
         return model
 
     def _composed_by(self) -> Composer:
@@ -364,7 +355,7 @@ class Predictor:
                     worker.shutdown()
                 # Where something was retracted since, what it was fitted to counts no more.
                 fit, now = predictor._fit, predictor.ledger.memory.retractions
-                if fit is not None and fit.retractions == now and (text := weighing_text(fit.model.result())):
+                if fit is not None and fit.retractions == now and (text := weighing_text(fit.model)):
                     weighings[axis] = text
             self.ledger.close({HEALTH: partial(health_to_store, self.ledger)}, weighings)
 
@@ -376,16 +367,11 @@ class Predictor:
 
 def _followed(fit: _Fit, memory: Memory) -> Model | None:
     """A fit's model with what changed since; None where a call waits for another fit."""
-    model, now = fit.model.result(), memory.statistics.touches
-    if fit.changed is None:
-        return None
+    model, now = fit.model, memory.statistics.touches
+    outgrown = not model.touches <= FASTER * now <= FASTER * FASTER * model.touches
     if model.touches <= FEW:
         outgrown = abs(now - model.touches) >= min(LEAST, model.touches + 1)
-    else:
-        outgrown = not model.touches <= FASTER * now <= FASTER * FASTER * model.touches
-    if outgrown:
-        return None
-    return model.followed(memory, fit.changed) if fit.changed else model
+    return None if outgrown or fit.changed is None else model.followed(memory, fit.changed)
 
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:

@@ -193,7 +193,7 @@ def test_a_fit_that_ends_answers_and_has_followed_what_came_since(monkeypatch):
         learner.observe("a", stream("a", 90 + i))
     job = learner._predictor._job
     learner.observe("d", stream("d", 93))
-    job.model.result()
+    job[0].result()
     require_followed(learner)
     assert present(learner).touches == len(OBSERVED) + 3
     learner.settle()
@@ -243,11 +243,11 @@ def test_an_observation_is_acknowledged_though_nothing_can_be_fitted_beside(monk
             assert learner.observe("a", stream("a", 90 + i)).sequence == len(OBSERVED) + 1 + i
             require_followed(learner)
         if (job := learner._predictor._job) is not None:
-            assert job.model.exception() is error  # it has ended
+            assert job[0].exception() is error  # it has ended
     learner.observe("a", stream("a", 95))
     require_followed(learner)
     job = learner._predictor._job
-    job.model.result()  # a fit that failed beside is made again
+    job[0].result()  # a fit that failed beside is made again
     assert bits(learner) == expected(later(6))
 
 
@@ -264,7 +264,7 @@ def fitting(monkeypatch, tmp_path):
         learner.predict(stream(*PROBES[0]))
         for i in range(3):
             learner.observe("a", stream("a", 90 + i))
-        assert not learner._predictor._job.model.done()
+        assert not learner._predictor._job[0].done()
         yield learner
 
 
@@ -273,7 +273,7 @@ def test_closed_pickled_and_copied_while_a_fit_runs(fitting):
         assert bits(snapshot) == expected(later(3))
     job = fitting._predictor._job
     fitting.close()
-    assert job.model.done()
+    assert job[0].done()
     for _ in range(3):
         require_followed(fitting)
     fitting.close()
@@ -283,7 +283,7 @@ def test_a_material_that_is_forgotten_while_a_fit_runs_is_gone(fitting):
     job = fitting._predictor._job
     fitting.forget("b")
     require_followed(fitting)
-    job.model.result()
+    job[0].result()
     require_followed(fitting)
     with fitting.live(contact="manual") as live:
         live.begin()

@@ -174,9 +174,9 @@ class Prediction:
         Infinite where nothing was ever observed; 0 where only one material was: there is nothing to compare it with.
     known: False means "never felt this", and `material` is then only the nearest: the novelty is above that of all but
         a share of the material's touches, the false-alarm rate. True: it is below that of all but as large a share of
-        touches of materials that were left out whole. None: neither holds, or too few touches could be left out, fewer
-        than 1 / rate − 1 (19 at 0.05), or of one material. The rates hold for touches that could have been among the
-        learned ones, not for those of another run, speed or sensor.
+        touches of materials that were left out whole. None: neither holds, noise hides it (`unusual` has "noisy"), or
+        too few touches could be left out, fewer than 1 / rate − 1 (19 at 0.05), or of one material. The rates hold for
+        touches that could have been among the learned ones, not for those of another run, speed or sensor.
     seconds: how much touch the answer rests on: the stream's length, at most that of the longest touch learned. Of a
         camera's stream only the frames in contact count, and the one at rest. Of several streams it is the sum.
     tuned: whether f*, the fine-tuned model, gave the probabilities, and not f. Novelty is always f's.

@@ -42,7 +42,7 @@ from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = ["Draft", "noisy_excess_of", "paces_of", "rehearse"]
+__all__ = ["Draft", "paces_of", "rehearse"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,7 +53,6 @@ UNMATCHED = 1 / 16_000  # τ where nothing can be held out: a larger one misclas
 PRIOR_OUTLIERS = 0.5  # of one more touch than the held-out ones
 STEPS = 100  # of EM
 PACES = 2.0, 0.5  # times a touch's own, at which it is judged as others made faster or slower
-SOUGHT = 16  # kept touches, to twice as many, in which noise is sought: a search takes some 10 ms
 EVEN = 4.0  # times the energy of noise that those stay below: there the share of noise is a half
 ROUNDING = 1 / 12  # squared levels: the noise of rounding to levels
 POWER_TOUCHES = 2.0  # how many touches the prior of a power, 1, counts as
@@ -104,12 +103,8 @@ class Draft:
                 model = replace(model, weighing=weighing)
                 if model.matcher is not None:
                     model = _by_kept_touches(model, model.matcher)
-        if self.before is not None and model.weighing is not None:
-            # What was asked of the earlier model: else the next to ask of this one would wait for it.
-            if self.before.held_out.trajectories is not None:
-                rehearse(model)
-            if self.before.weighing is not None and self.before.weighing.noisy_excess is not None:
-                noisy_excess_of(model)
+        if self.before is not None and self.before.held_out.trajectories is not None:
+            rehearse(model)  # else a live session would wait for it
         give_back_scratch()
         return model
 
@@ -272,24 +267,6 @@ def rehearse(model: Model) -> None:
                 targets[place] = found.targets[i]
     reached = np.isfinite(novelty).any(axis=1)
     held_out.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
-
-
-def noisy_excess_of(model: Model) -> tuple[float, float]:
-    """Mean and spread of the excess loss of known touches in which noise was sought; measured when first asked for.
-
-    Under the likeliest noise a touch has far less excess than under none, noise by itself included.
-    """
-    weighing, matcher = model.fitted, model.matcher
-    if weighing.noisy_excess is None and matcher is not None:
-        rows = list(_chosen(model, matcher))
-        rows = rows[:: max(1, len(rows) // SOUGHT)]
-        if len(rows) < FEWEST:
-            return weighing.complete.excess
-        with one_thread():
-            queries = [matcher.query(matcher.kept.levels(row), held_out=row) for row in rows]
-            losses = np.array([matcher.beside(query, None).excess for query in queries])
-        weighing.noisy_excess = _mean_and_spread(losses)
-    return weighing.noisy_excess or weighing.complete.excess
 
 
 def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
 from scroll_tactile.matching.matcher import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
-from scroll_tactile.prediction.fitting import noisy_excess_of, paces_of
+from scroll_tactile.prediction.fitting import paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, softmax, tempered
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.novelty import NoveltyThresholds
@@ -86,16 +86,18 @@ def answer(
         novelty = model.fitted.dependence.standard([judgement.novelty for judgement in judgements])
     thresholds = [judgement.row.calibration.thresholds for judgement in judgements]
     found = _prediction(candidates, probability, novelty, thresholds, false_alarms)
+    unusual = {way for judgement in judgements for way in judgement.unusual}
     places = {name: place for place, name in enumerate(candidates)}
     own_share, own_least, all_share, all_least = typical[[places[name] for name, _ in found.ranking]].T.tolist()
     return replace(
         found,
+        known=None if found.known and "noisy" in unusual else found.known,
         seconds=math.fsum(touch.seconds for touch in own),
         tuned=all(touch.logits is not None for touch in own),
         typicality=tuple(own_share),
         typicality_of_all=tuple(all_share),
         least_typicality=(*own_least, max(all_least)),
-        unusual=tuple(sorted({way for judgement in judgements for way in judgement.unusual})),
+        unusual=tuple(sorted(unusual)),
     )
 
 
@@ -221,10 +223,8 @@ def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: M
     match = matched.match
     scores = model.matcher.scores_of(candidates, match)
     logits = model.fitted.logits(matched.hypothesis, alone.probability, match, scores, alone.distance)
-    share = match.noise_share
-    mean, spread = alone.row.excess if match.noise == CLEAN else noisy_excess_of(model)
-    novelty = (1 - share) * alone.novelty + share * (match.excess_loss - mean) / spread
-    return replace(alone, probability=tempered(softmax(logits), alone.row.outliers), novelty=float(novelty))
+    novelty = (1 - match.noise_share) * alone.novelty  # what noise hides is not told
+    return replace(alone, probability=tempered(softmax(logits), alone.row.outliers), novelty=novelty)
 
 
 def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:

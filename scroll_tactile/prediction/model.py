@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.errors import CapacityError
+from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.matcher import Match, TouchMatcher
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.readouts.calibration import Calibration, Dependence
@@ -64,6 +64,11 @@ def enough_memory() -> Iterator[None]:
         raise CapacityError(
             f"the system has no memory left for the readouts ({error}); what was observed is kept. Name fewer "
             "materials in a scene, or give the process more"
+        ) from error
+    except np.linalg.LinAlgError as error:  # never of sums of rows: the shrunk scatter is positive definite
+        raise ScrollTactileError(
+            f"the sums of this memory have no readout ({error}): they are of no touches that were observed. Look at "
+            "where it came from (scroll-tactile memory check), and go back to a copy from before"
         ) from error
 
 
@@ -134,7 +139,7 @@ class Weighing:
     rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
     another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
     of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
-    to. paces, noisy_excess: measured when they are first asked for, see `fitting`.
+    to. paces: measured when they are first asked for, see `fitting.paces_of`.
     """
 
     rows: tuple[Row, ...]
@@ -145,7 +150,6 @@ class Weighing:
     least: int
     touches: int
     paces: Paces | None = None
-    noisy_excess: tuple[float, float] | None = None
 
     def row(self, hypothesis: Hypothesis, stage: int) -> Row:
         """How a touch is judged at a stage."""

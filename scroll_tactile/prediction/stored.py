@@ -22,7 +22,7 @@ from scroll_tactile.signals.windows import Scale
 
 __all__ = ["read_weighing", "weighing_text"]
 
-MADE_BY = f"{__version__}, 2"  # the release, in which judging may differ, and the version of these fields
+MADE_BY = f"{__version__}, 3"  # the release, in which judging may differ, and the version of these fields
 
 
 def weighing_text(model: Model) -> str | None:

@@ -22,7 +22,6 @@ from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import AxisLedger, Ledger
 from scroll_tactile.persistence.replaying import exemplar_candidates, load
-from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.current import CurrentModel
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
@@ -37,7 +36,6 @@ from scroll_tactile.signals.correction import corrected_stream
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
-from scroll_tactile.validation.stored_watch import NAME as HEALTH
 
 __all__ = ["LogitsReader", "Predictor", "nothing_known"]
 
@@ -282,7 +280,7 @@ class Predictor:
                 predictor.current.close()
             texts = {axis: predictor.current.stored(predictor.ledger) for axis, predictor in predictors.items()}
             weighings = {axis: text for axis, text in texts.items() if text is not None}
-            self.ledger.close({HEALTH: partial(health_to_store, self.ledger)}, weighings)
+            self.ledger.close(weighings)
 
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""

@@ -297,18 +297,9 @@ class LogReader:
         with reported(self.path, "measuring the log"):
             return self._file.size()
 
-    @property
-    def first_place(self) -> LogPlace:
-        """The place of the first frame behind the header."""
-        assert self._first is not None, "its header is damaged"
-        return LogPlace.behind(self._first)
-
-    def reader_at(self, place: LogPlace) -> LogReader:
-        """Return another reader, of heads alone, of the same open file, whatever its path names by now.
-
-        That one is not to be closed.
-        """
-        return LogReader(self.path, place=place, payloads=False, file=self._file)
+    def reader_of_heads(self) -> LogReader:
+        """Return another reader of the same open file, of heads alone, from its beginning; it is not to be closed."""
+        return LogReader(self.path, payloads=False, file=self._file)
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

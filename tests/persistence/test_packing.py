@@ -132,7 +132,8 @@ class TestDamage:
         listed.close()
         inside = listed._ranges
         described = [name for name in inside if name.count("/") == 3 and name.endswith("/zarr.json")]  # not read whole
-        spare = described if pack else [name for name in inside if name.startswith("checkpoints")]
+        spare = [name for name in inside if name.startswith("checkpoints") and (not pack or "/log-" in name)]
+        spare += described if pack else []
         # The frame that ends a log proves what is before it, and nothing proves that.
         shorter = {name: FRAME_BYTES for name in inside if name.startswith("log-")}
         needed = [(begin, size - shorter.get(name, 0)) for name, (begin, size) in inside.items() if name not in spare]

@@ -165,6 +165,7 @@ class OpenLog:
             if arrays:
                 head, payload = decode_row(self.log.read(self.rows.offsets[index], size)[1])
             else:
+                self.log.frame(self.rows.offsets[index], size)
                 head, payload = decode_head(head_bytes(self.log, self.rows.offsets[index], size), size), None
             if head.sequence != sequence:
                 raise ValueError(f"it has the number {head.sequence}")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from folder_attacks import CONSTITUENTS, QUANTITIES, QUANTITY, ROW, ROWS, description, identities, row
-from forging import checkpoint_of, copied, get_identity, put_arrays, put_checkpoint, put_row, row_of, seal, set_identity
+from forging import checkpoint_of, copied, get_identity, put_arrays, put_row, row_of, seal, set_identity
 from scroll_tactile_store import DamageError, StoreError
 from touches import PAD, SETTINGS, filled, held, stream
 
@@ -157,8 +157,8 @@ def packed_row(**changes):
 CHECKPOINTS = {}
 
 
-def checkpoint(change, *, compaction=False):
-    """Another checkpoint: where the newest lies, or one that stands for all rows; what there was is read once."""
+def checkpoint(change):
+    """Another checkpoint where the newest lies; what there was is read once."""
 
     def put(path):
         current = (path / "CURRENT").read_bytes()
@@ -168,9 +168,6 @@ def checkpoint(change, *, compaction=False):
         attributes, arrays = map(dict, CHECKPOINTS[current])
         change(attributes, arrays)
         arrays = {name: one for name, one in arrays.items() if one is not None}
-        if compaction:
-            put_checkpoint(path, attributes, arrays, compaction=True)
-            return
         known = put_arrays(path, 1, {name: one for name, one in arrays.items() if one is not before.get(name)})
         for name in before.keys() - arrays.keys():
             del known["arrays"][name]
@@ -179,12 +176,12 @@ def checkpoint(change, *, compaction=False):
     return put
 
 
-def summed(name, spoil, **options):
+def summed(name, spoil):
     def change(attributes, arrays):
         triangle(name, attributes, arrays)
         arrays[name] = spoil(arrays[name])
 
-    return checkpoint(change, **options)
+    return checkpoint(change)
 
 
 def triangle(name, attributes, arrays):

@@ -119,7 +119,6 @@ LINKS = {
     "checkpoints/00000001": "12345",
     "checkpoints/00000077": "12345",
     "checkpoints/00000077.partial": "12345",
-    "derived": "12345",
     "holder.json": "file",
     "holder.json.new": "file",
     "lock": "file",

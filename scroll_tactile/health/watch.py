@@ -27,18 +27,7 @@ from scroll_tactile.health.channel_numbers import KINDS, UNIT, Numbers
 from scroll_tactile.health.diagnosis import Deviation, Floats, Rows, Scatter, SensorChange, diagnose, diagnose_rest
 from scroll_tactile.results import Health
 
-__all__ = [
-    "AT_REST",
-    "MOST_ROWS",
-    "RECENT",
-    "SCORES",
-    "STAKES",
-    "Cell",
-    "Watch",
-    "WatchRules",
-    "WatchedRow",
-    "WatchedRows",
-]
+__all__ = ["STAKES", "Watch", "WatchRules", "WatchedRow", "WatchedRows"]
 
 Whole = npt.NDArray[np.int32]
 
@@ -142,7 +131,7 @@ class Watch:
     bound: of the probability that it ever alarms where all rows are exchangeable within their cells: a material, a
     length, a level. alarmed: the row that raised the alarm; None as long as there is none. evidence: the logarithm of
     the mean martingale after the last row; grew: after each, to base ten, in a list that copies share. taken: how many
-    rows counted. The rest is what a copy on disk needs: see `validation.stored_watch`.
+    rows counted.
     """
 
     def __init__(self, channels: int, bound: float) -> None:
@@ -214,7 +203,6 @@ class Watch:
             self.change = diagnose_rest(recent, self.cells[AT_REST].rows, n, levels=levels)
         else:
             behind = [each.row > self.since[top] for each in recent]
-            behind[-1] = True  # as it is, unless somebody else wrote what was kept
             self.change = diagnose(recent, behind, self.scatter, top, self.bound)
 
 
@@ -256,9 +244,10 @@ class WatchedRows:
     cells as they were: 0.7 MB each after 4000 rows of 19 channels.
     """
 
-    def __init__(self, rules: WatchRules, watch: Watch, *, last: int, known: int, lost: int) -> None:
-        self.rules, self.watch, self.last, self.known, self.lost = rules, watch, last, known, lost
-        self._earlier = [_Earlier(rules.after, Watch(watch.channels, rules.bound), 0)]  # the first is before all rows
+    def __init__(self, rules: WatchRules, channels: int, lost: int = 0) -> None:
+        self.rules, self.watch, self.lost = rules, Watch(channels, rules.bound), lost
+        self.last, self.known = rules.after, 0
+        self._earlier = [_Earlier(rules.after, self.watch.copy(), 0)]  # the first is before all rows
 
     def take(self, row: WatchedRow) -> None:
         """Take the next row."""

@@ -361,7 +361,7 @@ class Ledger(OpenMemory):
             store, memory = self.require_store("merge"), self.memory
             self._require_no_batch("a merge")
             with MemoryStore.open(other, mode="read") as source:
-                source.read_with(memory.plan, thorough=rules.thorough)
+                source.read_with(memory.plan)
                 plan = MergePlan.of(store, memory, source, self.contents(), rules)
                 with self._mutation(), store.batch():
                     added = plan.append_to(store, memory, lambda done, of: progress("merging", done, of))

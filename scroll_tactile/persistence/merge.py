@@ -35,7 +35,6 @@ from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.validation.gate import (
     MemoryStore,
     quantities_of,
-    require_counted,
     wrong_retractions,
     wrong_values,
 )
@@ -52,14 +51,13 @@ class MergeRules:
 
     one_name: as in learning from files, a content has one name, the first in either memory: touches under another name
     are refused. clipped: contents that clipping produced; their refusals mention it. default_source: for touches
-    without a source. thorough: see `Gate`.
+    without a source.
     """
 
     one_name: bool = False
     descriptions: Choice = "same"
     clipped: Collection[bytes] = ()
     default_source: str | None = None
-    thorough: bool = True
 
 
 @dataclass(frozen=True)
@@ -104,8 +102,6 @@ class MergePlan:
         _require_mergeable(ours, memory, theirs)
         compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
         quantities = _quantities(ours, memory, theirs, found, heads)
-        if found is not None:
-            require_counted(theirs.path, found, heads)
         incoming = active_rows(heads)
         declared = memory.quantities | {quantity.name: quantity for quantity in quantities}
         known, refused = _already_there(incoming, contents, ours.path, compacted, rules, declared)

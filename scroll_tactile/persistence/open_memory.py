@@ -8,27 +8,22 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
-import numpy.typing as npt
-from scroll_tactile_store import Checkpoint, CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
+from scroll_tactile_store import CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
 
-from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.errors import InputError
 from scroll_tactile.health.watch import WatchedRows, WatchRules
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Changed
 from scroll_tactile.persistence.contents import ListedContents, StoredContents
 from scroll_tactile.persistence.replaying import apply_appended
 
-__all__ = ["Derived", "OpenMemory", "give_back_scratch"]
+__all__ = ["OpenMemory", "give_back_scratch"]
 
 logger = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer")
-
-Derived = tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]
-"""Arrays and attributes that are stored beside a checkpoint."""
 
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
 REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
@@ -240,22 +235,12 @@ class OpenMemory:
     def _note_saved(self) -> None:
         self._saved, self._saved_weighings = self._memory.sequence, dict(self._memory.weighings)
 
-    def derived(self, name: str) -> Checkpoint | None:
-        """The arrays stored under a name beside the checkpoint that the memory was loaded from, if any."""
-        if self.store is None or self._closed:
-            return None
-        found = self.store.derived(name)
-        return found if found is not None and found.number == self.memory.checkpoint else None
-
     def take_weighing(self) -> str | None:
         """What the checkpoint that the memory was read from says of how materials are weighed, once."""
         return self.memory.weighings.pop("", None)
 
-    def close(self, derived: Mapping[str, Callable[[], Derived | None]], weighings: Mapping[str, str]) -> None:
-        """As `TactileLearner.close`.
-
-        derived: by name, what gives the arrays to store with the newest checkpoint. weighings: see `Memory`.
-        """
+    def close(self, weighings: Mapping[str, str]) -> None:
+        """As `TactileLearner.close`. weighings: see `Memory`."""
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
@@ -269,21 +254,9 @@ class OpenMemory:
                     if self._memory.sequence > self._saved or self._memory.weighings != self._saved_weighings:
                         self._pass_over_failures(store)
                         self._write_checkpoint()
-                    for name, arrays in derived.items():
-                        self._keep(store, name, arrays)
             finally:
                 store.close()
                 give_back_scratch()
-
-    def _keep(self, store: Store, name: str, derived: Callable[[], Derived | None]) -> None:
-        """Store what is derived from the memory; a failure is logged only, as the next user derives it again."""
-        try:
-            if (made := derived()) is not None:
-                arrays, attributes = made
-                last = self._memory.sequence
-                store.keep_derived(name, arrays, last_sequence=last, attributes=attributes)
-        except (StoreError, ScrollTactileError, MemoryError, np.linalg.LinAlgError) as error:
-            logger.warning("%s: %s could not be kept, and will be made again: %s", store.path, name, error)
 
 
 def give_back_scratch() -> None:

@@ -39,7 +39,7 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.persistence.replaying import load, refill, replay
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted, require_counted
+from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted
 
 __all__ = ["Reembedding"]
 
@@ -156,8 +156,6 @@ def _require_readings(store: Store) -> None:
     elif bare:
         what = f"{len(bare)} rows, such as {bare[0]}, were observed without keeping them (exemplars=0)"
     else:
-        if (newest := store.latest()) is not None:
-            require_counted(store.path, newest, heads)
         return
     raise MismatchError(
         f"{store.path} cannot be embedded again, which takes the readings of every observation: {what}. Open it with "

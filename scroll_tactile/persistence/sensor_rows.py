@@ -1,12 +1,11 @@
 """What the rows of a journal say of the sensor: its health, and a correction by touches with a changed skin.
 
-Health is read in pieces, so that whoever changes the memory does not wait, and is kept beside the checkpoint. A
-correction rests on what the rows say of the touches before the change; it is a row itself.
+Health is read in pieces, so that whoever changes the memory does not wait. A correction rests on what the rows say of
+the touches before the change; it is a row itself.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,24 +18,20 @@ from scroll_tactile_store import Head, Store, StoreError
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
 from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
-from scroll_tactile.health.watch import Watch, WatchedRow, WatchedRows, WatchRules
+from scroll_tactile.health.watch import WatchedRow, WatchedRows, WatchRules
 from scroll_tactile.matching.likelihood import LEVELS, MISSING
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.observations import is_from
-from scroll_tactile.persistence.open_memory import Derived, OpenMemory
+from scroll_tactile.persistence.open_memory import OpenMemory
 from scroll_tactile.results import Adaptation, Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name
 from scroll_tactile.signals.correction import Correction, corrected_stream
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.validation.gate import WRONG
-from scroll_tactile.validation.stored_watch import NAME, watch_to_arrays, watched_from
 
-__all__ = ["adapt_to", "health_of", "health_to_store", "known_touches"]
-
-logger = logging.getLogger(__name__)
+__all__ = ["adapt_to", "health_of", "known_touches"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -50,17 +45,14 @@ FEWEST_SPREAD = 8  # touches of materials that were touched before, by which it 
 def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
     """The health that the rows chosen by rules tell, in the journal's order; retracted ones are not there.
 
-    It goes on from the rows that were read last by the same rules, here or before the memory was closed. Two threads
-    that ask at once read them both.
+    It goes on from the rows that were read last by the same rules. Two threads that ask at once read them both.
     """
     with ledger.lock:
         ledger.require_store("tell how its sensor is")
         _ = ledger.memory  # which may have lost rows, and says so as it is read
         watched = ledger.watched.pop(rules, None)
         if watched is None or watched.lost != ledger.lost:
-            watched = _stored(ledger, channels, rules) or WatchedRows(
-                rules, Watch(channels, rules.bound), last=rules.after, known=0, lost=ledger.lost
-            )
+            watched = WatchedRows(rules, channels, ledger.lost)
     try:
         while piece := _piece(ledger, watched):
             for row in piece:
@@ -115,25 +107,6 @@ def _row(head: Head, memory: Memory, watched: WatchedRows) -> WatchedRow:
         return WatchedRow(head.sequence)
     numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
     return WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
-
-
-def _stored(ledger: OpenMemory, channels: int, rules: WatchRules) -> WatchedRows | None:
-    """What was kept beside the checkpoint that the memory was loaded from, by the same rules."""
-    try:
-        kept = ledger.derived(NAME)
-        return None if kept is None else watched_from(kept, channels, rules, ledger.lost)
-    except (StoreError, *WRONG) as error:
-        logger.info("the health that was kept is not used: %s", error)
-        return None
-
-
-def health_to_store(ledger: OpenMemory) -> Derived | None:
-    """What was last read, to be kept beside the newest checkpoint; None where nothing was."""
-    store, watched = ledger.store, next(reversed(ledger.watched.values()), None)
-    if store is None or watched is None or watched.lost != ledger.lost:
-        return None
-    _take_back(store, ledger.memory, watched)
-    return watch_to_arrays(watched)
 
 
 def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor: Sensor) -> dict[Stream, str]:

@@ -31,7 +31,6 @@ from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import AxisLedger, Ledger
 from scroll_tactile.persistence.replaying import exemplar_candidates, load
-from scroll_tactile.persistence.sensor_rows import health_to_store
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft, rehearse
@@ -45,7 +44,6 @@ from scroll_tactile.settings import candidates_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.validation.gate import open_memory
-from scroll_tactile.validation.stored_watch import NAME as HEALTH
 
 __all__ = ["LogitsReader", "Predictor", "nothing_known"]
 
@@ -357,7 +355,7 @@ class Predictor:
                 fit, now = predictor._fit, predictor.ledger.memory.retractions
                 if fit is not None and fit.retractions == now and (text := weighing_text(fit.model)):
                     weighings[axis] = text
-            self.ledger.close({HEALTH: partial(health_to_store, self.ledger)}, weighings)
+            self.ledger.close(weighings)
 
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""

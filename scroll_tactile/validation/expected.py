@@ -132,7 +132,7 @@ def array(
     return cast("npt.NDArray[Any]", found)
 
 
-def check_values(values: npt.NDArray[Any] | LateArray, check: Callable[[npt.NDArray[Any]], None]) -> None:
+def check_values(values: npt.NDArray[Any] | LateArray, check: Callable[[npt.NDArray[Any]], object]) -> None:
     """Check values; those that are read later, then."""
     if isinstance(values, LateArray):
         before = values.check

@@ -9,7 +9,6 @@ under another name is, and it fits.
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -55,7 +54,6 @@ __all__ = [
     "misdeclared",
     "open_memory",
     "quantities_of",
-    "require_counted",
     "wrong_retractions",
     "wrong_values",
 ]
@@ -66,13 +64,10 @@ WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionErr
 
 
 class Gate:
-    """What rows and checkpoints in a folder must be, by the identity there, and the plan of windows it is read with.
+    """What rows and checkpoints in a folder must be, by the identity there, and the plan of windows it is read with."""
 
-    thorough: whether second moments are shown to be some; it takes as long as fitting a readout.
-    """
-
-    def __init__(self, path: Path, identity: Identity, plan: WindowPlan, *, thorough: bool = False) -> None:
-        self._path, self.thorough = path, thorough
+    def __init__(self, path: Path, identity: Identity, plan: WindowPlan) -> None:
+        self._path = path
         made_with = identity.sensor, identity.embedding.dimension, plan
         self._rows = RowChecks(*made_with)
         self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.kept_touches))
@@ -90,7 +85,7 @@ class Gate:
             if record.kind == OBSERVE:
                 self._rows.check_observed(record)
             elif record.kind == MERGE:
-                self._checkpoints.check(record.arrays, record.attributes, None, thorough=self.thorough)
+                self._checkpoints.check(record.arrays, record.attributes, None)
         return record
 
     def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
@@ -98,7 +93,7 @@ class Gate:
         with self._refusing(f"checkpoint {checkpoint.number}"):
             arrays, attributes, last_sequence = checkpoint.arrays, checkpoint.attributes, checkpoint.last_sequence
             every: dict[str, Any] = {**arrays, **checkpoint.late}
-            self._checkpoints.check(every, attributes, last_sequence, thorough=self.thorough)
+            self._checkpoints.check(every, attributes, last_sequence)
         for late in checkpoint.late.values():
             late.check = partial(self._late, f"checkpoint {checkpoint.number}", late.check)
         return checkpoint
@@ -154,9 +149,9 @@ class MemoryStore(Store):
         assert self._gate is not None
         return self._gate
 
-    def read_with(self, plan: WindowPlan, *, thorough: bool = False) -> None:
-        """Read with this plan of windows from now on; thorough: see `Gate`."""
-        self._gate = Gate(self.path, Identity.read(self), plan, thorough=thorough)
+    def read_with(self, plan: WindowPlan) -> None:
+        """Read with this plan of windows from now on."""
+        self._gate = Gate(self.path, Identity.read(self), plan)
 
     def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
         """As `Store.heads`."""
@@ -178,7 +173,7 @@ class MemoryStore(Store):
         """As `Store.latest`; what has not all of its arrays is not looked at."""
         if only is not None:
             return super().latest(only=only, late=late)
-        newest = super().latest(late=() if self.gate.thorough else late)
+        newest = super().latest(late=late)
         return None if newest is None else self.gate.checkpoint(newest)
 
     def compaction(self) -> Checkpoint | None:
@@ -234,26 +229,6 @@ def _opened_or_made(
     return MemoryStore.open(path, identity=Identity.of(request.recipe()).to_json(), mode=mode)
 
 
-def require_counted(path: Path, checkpoint: Checkpoint, heads: Sequence[Head]) -> None:
-    """Raise DamageError where a checkpoint counts more touches of a material than the journal's rows name.
-
-    heads: all rows of the journal; where a repair lost some, nobody knows.
-    """
-    if heads and len(heads) < heads[-1].sequence:
-        return
-    named = Counter(
-        head.label for head in heads if head.kind in (OBSERVE, MEMBER) and head.sequence <= checkpoint.last_sequence
-    )
-    touches = checkpoint.arrays["observations"].tolist()
-    for material, count in zip(cast("list[str]", checkpoint.attributes["materials"]), touches, strict=True):
-        if count > named[material]:
-            raise DamageError(
-                f"checkpoint {checkpoint.number} of {path} counts {count} touches of {material!r}, of which its "
-                f"journal names {named[material]}: it was made by another program, or for another journal",
-                path=path,
-            )
-
-
 def check_memory(path: str | os.PathLike[str]) -> list[str]:
     """All that the gate finds in a folder, one sentence each; nothing of a sound memory, and nothing is replayed.
 
@@ -264,7 +239,7 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
         try:
             identity = Identity.read(store)
             plan = window_plan(identity.sensor, AbsentEmbedding(identity, store.path))
-            store.read_with(plan, thorough=True)
+            store.read_with(plan)
             if identity.embedding.configuration is not None:
                 require_configuration(identity.embedding.configuration)
         except (DamageError, EmbeddingError, MismatchError) as error:
@@ -272,14 +247,13 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
         heads, wrong = _in_rows(store)
         passed = [head for head in heads if head.sequence not in wrong]
         retractions = map(str, wrong_retractions(store.path, passed))
-        return [*_in_checkpoints(store, heads), *wrong.values(), *retractions, *_in_values(store, passed)]
+        return [*_in_checkpoints(store), *wrong.values(), *retractions, *_in_values(store, passed)]
 
 
-def _in_checkpoints(store: MemoryStore, heads: list[Head]) -> Iterator[str]:
+def _in_checkpoints(store: MemoryStore) -> Iterator[str]:
     for read in (store.latest, store.compaction):
         try:
-            if (checkpoint := read()) is not None:
-                require_counted(store.path, checkpoint, heads)
+            read()
         except DamageError as damage:
             yield str(damage)
 

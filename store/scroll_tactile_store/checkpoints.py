@@ -11,9 +11,16 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from scroll_tactile_store.archive import Files
-from scroll_tactile_store.checkpoint_files import CheckpointDraft, CheckpointReader, write_checkpoint
-from scroll_tactile_store.derived import read_derived, remove_derived, write_derived
+from scroll_tactile_store.checkpoint_files import (
+    INDEX,
+    CheckpointDraft,
+    CheckpointReader,
+    index_name,
+    write_checkpoint,
+)
 from scroll_tactile_store.encoding import check_arrays
 from scroll_tactile_store.exceptions import DamageError, RecordError, StoreError, reported
 from scroll_tactile_store.files import remove_tree
@@ -32,7 +39,8 @@ from scroll_tactile_store.layout import (
 from scroll_tactile_store.log import LogPlace, LogReader
 from scroll_tactile_store.log_writer import create_log
 from scroll_tactile_store.records import Arrays, Attributes, Checkpoint, to_json
-from scroll_tactile_store.row_encoding import HEAD_BYTES, ROW, row_sequence
+from scroll_tactile_store.row_encoding import ROW
+from scroll_tactile_store.rows import Rows
 
 __all__ = ["Checkpoints", "read_back"]
 
@@ -88,21 +96,6 @@ class Checkpoints:
         arrays = reader.arrays(only, but=late)
         return Checkpoint(named.number, named.last_sequence, reader.attributes, arrays, reader.late(late))
 
-    def derived(self, name: str) -> Checkpoint | None:
-        """Return what was kept of the newest checkpoint under a name; None where there is nothing of it."""
-        newest = self._journal.current().newest
-        if newest is None or self._files.is_packed:
-            return None
-        found = read_derived(self._folder, name, newest.sha256)
-        return None if found is None else Checkpoint(newest.number, newest.last_sequence, *found)
-
-    def keep_derived(self, name: str, draft: CheckpointDraft) -> None:
-        """Keep what follows from the newest checkpoint, which is up to the same row, under a name."""
-        with self._committing, reported(self._folder, f"keeping {name!r}"):
-            newest = self._journal.current().newest
-            if newest is not None and newest.last_sequence == draft.last_sequence:
-                write_derived(self._folder, name, newest.sha256, draft.attributes, draft.arrays)
-
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)
         reader = CheckpointReader(path, self._files)
@@ -117,14 +110,13 @@ class Checkpoints:
         """Write a draft as a checkpoint, have `CURRENT` name it, and return its number."""
         with self._committing:
             current = self._journal.current()
-            named = self._write(draft, self._journal.place(draft.last_sequence))
+            place, table = self._journal.place(draft.last_sequence), self._journal.table(draft.last_sequence)
+            named = self._write(draft, place, current.log_identity, table)
             if current.newest is None or named.last_sequence >= current.newest.last_sequence:
                 # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
                 # be on the disk all the same, and count after a crash.
                 self._journal.commit(replace(current, newest=named, last=self._journal.last()))
-                remove_derived(self._folder)
             self.remove_unnamed()
-            self._journal.keep_index()
             return named.number
 
     def draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int) -> CheckpointDraft:
@@ -138,10 +130,15 @@ class Checkpoints:
                 f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
                 f"there is, not {last_sequence!r}"
             )
+        if reserved := [name for name in arrays if name.startswith(INDEX)]:
+            raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
         return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
 
-    def _write(self, draft: CheckpointDraft, place: LogPlace) -> NamedCheckpoint:
+    def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray | None) -> NamedCheckpoint:
+        """Write a draft, with which rows are where in a log if that is known."""
         number = self._next(numbers(self._folder, unfinished=True))
+        if table is not None:
+            draft = replace(draft, arrays={**draft.arrays, index_name(log): table})
         sha256 = write_checkpoint(self._folder, number, draft, self._journal.identity)
         return NamedCheckpoint(number, draft.last_sequence, sha256, place)
 
@@ -163,8 +160,11 @@ class Checkpoints:
                         path, header, ((ROW, data) for data in self._journal.payloads(draft.last_sequence))
                     )
                     drafts = [draft] if newest is None else [draft, newest]
-                    places = read_back(path, [each.last_sequence for each in drafts])
-                    named = [self._write(each, place) for each, place in zip(drafts, places, strict=True)]
+                    places, rows = read_back(path, [each.last_sequence for each in drafts])
+                    named = [
+                        self._write(each, place, identity, rows.table(each.last_sequence))
+                        for each, place in zip(drafts, places, strict=True)
+                    ]
                     for damage in (damage for one in named for damage in self._verified(one).damage()):
                         raise damage
                 except BaseException:
@@ -172,7 +172,6 @@ class Checkpoints:
                     raise
                 with reported(self._folder, "committing"):
                     write_current(self._folder, Current(number, identity, named[-1], named[0], self._journal.last()))
-            remove_derived(self._folder)
             self.remove_unnamed()
 
     def commit_later(self, draft: CheckpointDraft) -> None:
@@ -227,21 +226,22 @@ class Checkpoints:
             logger.warning("%s: what was replaced could not be removed: %s", self._folder, error)
 
 
-def read_back(path: Path, last_sequences: Sequence[int]) -> list[LogPlace]:
-    """Read a log that was just written; return for each of these rows a place.
+def read_back(path: Path, last_sequences: Sequence[int]) -> tuple[list[LogPlace], Rows]:
+    """Read a log that was just written; return for each of these rows a place, and which rows are where.
 
     All rows behind that row are behind the place. Raises DamageError where the log does not read back whole.
     """
     with LogReader(path) as log:
-        found = [log.place] * len(last_sequences)
-        for batch in log.refresh():
-            last = row_sequence(log.peek(batch[-1].offset, HEAD_BYTES))
-            found = [
-                log.place if last <= last_sequence else place
-                for last_sequence, place in zip(last_sequences, found, strict=True)
+        rows, places = Rows(), [log.place] * len(last_sequences)
+        for behind in rows.take(log):
+            places = [
+                behind if rows.sequences[-1] <= last_sequence else place
+                for last_sequence, place in zip(last_sequences, places, strict=True)
             ]
+        for damage in rows.damage.values():
+            raise damage[0]
         if log.place.offset != path.stat().st_size:
             raise DamageError(
                 f"{path} does not read back as it was just written: its disk cannot be trusted", path=path
             )
-        return found
+        return places, rows

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
+
 from scroll_tactile_store.archive import Files
 from scroll_tactile_store.encoding import check_arrays, encode_payload
 from scroll_tactile_store.exceptions import CompactedError, DamageError, StoreClosedError, StoreError, reported
@@ -259,8 +261,6 @@ class Journal:
                         break
                     head = at.row(index, arrays=arrays)
                 except DamageError as damage:
-                    if at.drop_index():
-                        continue
                     if not chosen:
                         raise
                     logger.warning("%s", damage)
@@ -292,10 +292,10 @@ class Journal:
             except DamageError as damage:
                 logger.warning("%s", damage)
 
-    def keep_index(self) -> None:
-        """Write what is known of the rows beside the log, so that nobody has to read it for that."""
-        with self._using("keeping the index of rows") as at:
-            at.keep_index()
+    def table(self, last_sequence: int) -> np.ndarray | None:
+        """Return which rows up to a sequence are where in the log; None where any is damaged."""
+        with self._using("looking where rows are") as at:
+            return at.table(last_sequence)
 
     def given_up(self, sequence: int) -> CompactedError:
         """Return the error for a row whose arrays a compaction checkpoint stands for."""

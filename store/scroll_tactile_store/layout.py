@@ -21,7 +21,6 @@ __all__ = [
     "CHECKPOINTS",
     "CURRENT_FILE",
     "DAMAGED",
-    "DERIVED",
     "HOLDER_FILE",
     "LOCK_FILE",
     "LOG",
@@ -45,7 +44,7 @@ FORMAT_VERSION = 2
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
-DERIVED = "derived"  # what follows from the rest, and can be deleted
+DERIVED = "derived"  # of release 0.16: it may tell of what was retracted since
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
 LOCK_FILE, HOLDER_FILE = "lock", "holder.json"
 LEGACY_FILE = "journal.sqlite"  # of releases 0.x
@@ -261,7 +260,7 @@ def _was_made_since(folder: Path) -> bool:
             "the store (repair_store), which finds what it named",
             path=folder / CURRENT_FILE,
         )
-    ours = (LOCK_FILE, CHECKPOINTS, DERIVED)
+    ours = (LOCK_FILE, CHECKPOINTS)
     names = sorted(entry.name for entry in folder.iterdir())
     if foreign := [name for name in names if not name.startswith(OURS) and name not in ours]:
         raise NotAStoreError(
@@ -315,7 +314,7 @@ def require_unshared(folder: Path) -> None:
 def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:
     with os.scandir(folder) as entries:
         for entry in entries:
-            if entry.name in (CHECKPOINTS, DERIVED):
+            if entry.name == CHECKPOINTS:
                 yield Path(entry.path), entry.is_dir(follow_symlinks=False)
             elif entry.name.startswith(OURS) or entry.name == LOCK_FILE:
                 yield Path(entry.path), entry.is_file(follow_symlinks=False)
@@ -334,7 +333,8 @@ def remove_unnamed(folder: Path, current: Current) -> None:
     kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
     found = [(log_path(folder, number), NEW) for number in log_numbers(folder, unfinished=True)]
     found += [(checkpoint_path(folder, number), PARTIAL) for number in numbers(folder, unfinished=True)]
-    remove_tree(folder / (CURRENT_FILE + NEW))
+    for name in (CURRENT_FILE + NEW, DERIVED):
+        remove_tree(folder / name)
     for path, suffix in found:
         if path not in kept:
             remove_tree(path)

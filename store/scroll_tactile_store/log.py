@@ -263,13 +263,19 @@ class LogReader:
 
         Raises DamageError where there is none.
         """
+        frame = self.frame(offset, size)
+        with reported(self.path, "reading a frame"):
+            return frame, self._payload(frame)
+
+    def frame(self, offset: int, size: int) -> Frame:
+        """Return the frame at an offset, verified but for its payload of `size` bytes. Raises DamageError."""
         with reported(self.path, "reading a frame"):
             if not 0 <= offset <= offset + FRAME_BYTES + size <= self._file.size():
                 raise self._damage(f"ends before a frame of {size} bytes could", offset, 0)
             frame = read_frame(self._file.read(offset, FRAME_BYTES), offset)
             if frame is None or not self._is_ours(frame) or frame.size != size:
                 raise self._damage(f"holds no frame with a payload of {size} bytes there", offset, 0)
-            return frame, self._payload(frame)
+            return frame
 
     def peek(self, offset: int, size: int) -> bytes:
         """Return `size` bytes of the payload of the frame at an offset, not verified, fewer where the file ends."""
@@ -297,18 +303,9 @@ class LogReader:
         with reported(self.path, "measuring the log"):
             return self._file.size()
 
-    @property
-    def first_place(self) -> LogPlace:
-        """The place of the first frame behind the header."""
-        assert self._first is not None, "its header is damaged"
-        return LogPlace.behind(self._first)
-
-    def reader_at(self, place: LogPlace) -> LogReader:
-        """Return another reader, of heads alone, of the same open file, whatever its path names by now.
-
-        That one is not to be closed.
-        """
-        return LogReader(self.path, place=place, payloads=False, file=self._file)
+    def reader_of_heads(self) -> LogReader:
+        """Return another reader of the same open file, of heads alone, from its beginning; it is not to be closed."""
+        return LogReader(self.path, payloads=False, file=self._file)
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""

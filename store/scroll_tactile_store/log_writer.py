@@ -179,6 +179,12 @@ class LogWriter(LogReader):
                 # The caller has to learn what ended the batch; the next one settles it, or is refused.
                 logger.warning("%s: a batch could not be taken back yet: %s", self.path, error)
 
+    def frame(self, offset: int, size: int) -> Frame:
+        """As a reader's; a staged frame can be read, too."""
+        with self._writing:
+            is_staged = 0 <= offset - self._written < len(self._staged)
+            return self.read(offset, size)[0] if is_staged else super().frame(offset, size)
+
     def read(self, offset: int, size: int) -> tuple[Frame, bytes]:
         """As a reader's; a staged frame can be read, too."""
         with self._writing:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import logging
 from bisect import bisect_right
 
+import numpy as np
+
 from scroll_tactile_store.archive import Files
+from scroll_tactile_store.checkpoint_files import CheckpointReader, index_name
 from scroll_tactile_store.encoding import decode_payload
-from scroll_tactile_store.exceptions import CompactedError, DamageError
+from scroll_tactile_store.exceptions import CompactedError, DamageError, StoreError
 from scroll_tactile_store.files import sync_folder
-from scroll_tactile_store.layout import Current, log_path
+from scroll_tactile_store.layout import Current, checkpoint_path, log_path
 from scroll_tactile_store.log import LogPlace, LogReader
 from scroll_tactile_store.log_writer import LogWriter
 from scroll_tactile_store.records import JSON, Head, Record, from_json
 from scroll_tactile_store.row_encoding import decode_head, decode_row
-from scroll_tactile_store.rows import EVERY, Index, Rows, head_bytes
+from scroll_tactile_store.rows import Rows, head_bytes
 
 __all__ = ["OpenLog"]
 
@@ -39,7 +42,6 @@ class OpenLog:
             if self.log.identity != current.log_identity:
                 raise DamageError(f"{self.path} is the log of another store, or of another time", path=self.path)
             self.identity = self._read_identity()
-            self.index = Index(files.folder, current.log_identity, self.log.first_place)
             if named is not None and self.log.place == named.place:
                 self.first = named.last_sequence
             self.read_all = self.first == 0
@@ -115,17 +117,31 @@ class OpenLog:
         return bisect_right(self.rows.sequences, after)
 
     def _read_before(self) -> None:
-        earlier = self._rows_until(self.places[0][1].offset, indexed=not self._files.is_packed)
+        until = self.places[0][1].offset
+        earlier = self._indexed(until)
+        if earlier is None:
+            earlier = Rows()
+            for _ in earlier.take(self.log.reader_of_heads(), until):
+                pass
         earlier.extend(self.rows)
         self.rows, self.read_all = earlier, True
 
-    def _rows_until(self, until: int, *, indexed: bool) -> Rows:
-        """Return all rows before an offset, by the index as far as it goes and is of this log, if it may be used."""
-        self.index = Index(self._files.folder, self.current.log_identity, self.log.first_place)
-        rows = self.index.read(self.log, until) if indexed else Rows()
-        for _ in rows.take(self.log.reader_at(self.index.end), until):
-            pass
-        return rows
+    def _indexed(self, until: int) -> Rows | None:
+        """Return the rows before an offset as the newest checkpoint has them; None where it has none of this log."""
+        named, name = self.current.newest, index_name(self.current.log_identity)
+        try:
+            if named is not None and self.log.has_place(named.place):
+                reader = CheckpointReader(checkpoint_path(self._files.folder, named.number), self._files)
+                if reader.sha256 == named.sha256 and (found := reader.arrays([name])):
+                    return Rows.of_table(found[name], until)
+        except (StoreError, ValueError) as error:
+            logger.warning("%s: rows are looked for in the log itself: %s", self.path, error)
+        return None
+
+    def table(self, last_sequence: int) -> np.ndarray | None:
+        """Return which rows up to a sequence are where; None where any is damaged."""
+        self.find(0)
+        return None if self.rows.damage else self.rows.table(last_sequence)
 
     def warn_of_damage(self) -> None:
         """Log a warning, once, for all that is damaged among the rows that are known."""
@@ -134,28 +150,6 @@ class OpenLog:
                 "%s; what was there is passed over where rows of one kind, name or key are asked for", damage[0]
             )
         self._warned = len(self.rows.damage)
-
-    def drop_index(self) -> bool:
-        """Read the log itself where an index was used, which may be wrong; whether one was."""
-        if not self.index.count:
-            return False
-        end, staged = self.log.place.offset, Rows()
-        for row in zip(self.rows.sequences, self.rows.offsets, self.rows.sizes, self.rows.keys, strict=True):
-            if row[1] >= end:
-                staged.append(*row)
-        self.rows, self.first, self.read_all = self._rows_until(end, indexed=False), 0, True
-        self.rows.extend(staged)
-        self._note_lost_end()
-        return True
-
-    def keep_index(self) -> None:
-        """Have the files of the index say what is known, where that is much more than they do."""
-        if len(self.rows) >= EVERY:
-            self.find(0)
-            try:
-                self.index.write(self.rows, self.log.place)
-            except OSError as error:
-                logger.warning("%s: the index of rows could not be written: %s", self.path, error)
 
     def data(self, index: int) -> bytes:
         """Return the bytes of a row, verified. Raises DamageError."""
@@ -171,6 +165,7 @@ class OpenLog:
             if arrays:
                 head, payload = decode_row(self.log.read(self.rows.offsets[index], size)[1])
             else:
+                self.log.frame(self.rows.offsets[index], size)
                 head, payload = decode_head(head_bytes(self.log, self.rows.offsets[index], size), size), None
             if head.sequence != sequence:
                 raise ValueError(f"it has the number {head.sequence}")

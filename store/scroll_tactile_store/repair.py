@@ -208,7 +208,7 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
 def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
     """Return the newest and the compaction checkpoint, with places in the new log, which is read back."""
     found = [plan.start, plan.stand_in]
-    places = read_back(path, [0 if each is None else each.last_sequence for each in found])
+    places, _ = read_back(path, [0 if each is None else each.last_sequence for each in found])
     newest, compaction = (
         None if each is None or each.named is None else replace(each.named, place=place)
         for each, place in zip(found, places, strict=True)

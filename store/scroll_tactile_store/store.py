@@ -217,23 +217,6 @@ class Store:
         self._check_open()
         return self._checkpoints.latest(only, late)
 
-    def derived(self, name: str) -> Checkpoint | None:
-        """Return what `keep_derived` kept of the newest checkpoint, None where there is nothing of it.
-
-        Its number and last row are that checkpoint's. Wrong, damaged or of another checkpoint it counts as missing; a
-        digest that is right says nothing of who wrote it.
-        """
-        self._check_open()
-        return self._checkpoints.derived(name)
-
-    def keep_derived(self, name: str, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
-        """Keep under a name what follows from the newest checkpoint; nothing where that is not up to the same row.
-
-        It takes the place of what was kept before, is not made durable, and is not part of copies. Raises
-        StoreFullError, ReadOnlyError or another StoreError.
-        """
-        self._checkpoints.keep_derived(name, self._draft(arrays, last_sequence, attributes))
-
     @property
     def newest(self) -> int | None:
         """The number of the newest committed checkpoint, None when there is none; `latest` may pass it over."""

@@ -173,6 +173,9 @@ class Survey:
                     "than was written there",
                     path=path / "zarr.json",
                 )
+            if self.current is not None:  # the log itself has what an index says
+                index = reader.damage(self.current.log_identity)
+                self.damage += [Problem(each.path, str(each), "spare") for each in index]
             return FoundCheckpoint(number, path, expected, is_compaction, list(reader.damage()), dict(reader.identity))
         except DamageError as wrong:
             return FoundCheckpoint(number, path, named, is_compaction, [wrong], None)

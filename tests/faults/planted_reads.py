@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile_store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair, rows
+from scroll_tactile_store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair
 
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
@@ -84,16 +84,13 @@ def _other_log_not_noticed(_: Any, self: Any, at: Any) -> Any:
     return at
 
 
-@bug("an index of another log is believed", rows.Index, "_decoded")
-def _index_believed(decoded: Any, self: Any, path: Path, data: bytes) -> Any:
-    self._identity = rows.HEADER.unpack_from(data)[1]
-    segment, found = decoded(self, path, data)
-    return dataclasses.replace(segment, begin=self.end), found
-
-
-@bug("an index of another log is believed", rows.Index, "read")
-def _any_place_is_of_this_log(read: Any, self: Any, log: Any, until: Any) -> Any:
-    return read(self, SimpleNamespace(has_place=lambda _: True), until)
+@bug("an index of another log is believed", checkpoint_files.CheckpointReader, "arrays")
+def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None, but: Any = ()) -> Any:
+    found = arrays(self, names, but)
+    if not found and names and next(iter(names)).startswith(checkpoint_files.INDEX):
+        own = [name for name in self._described if name.startswith(checkpoint_files.INDEX)]
+        found = dict.fromkeys(names, *arrays(self, own).values()) if own else {}
+    return found
 
 
 @bug("a backup does not look at CURRENT again", backup, "_copy")

@@ -51,7 +51,6 @@ WEIGHTS = {
     "collect": 5,
     "merge": 3,
     "rot": 3.5,
-    "derived": 4,
     "quiet": 3,
 }
 QUICK_SEEDS = 6

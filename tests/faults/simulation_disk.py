@@ -15,8 +15,6 @@ from typing import Any
 import scroll_tactile_store.checkpoint_files
 import scroll_tactile_store.checkpoints
 import scroll_tactile_store.log_writer
-import scroll_tactile_store.open_log
-import scroll_tactile_store.rows
 from quick_checkpoints import write_zarr
 
 from faults import shim as watch
@@ -24,7 +22,6 @@ from faults.disks import STYLES, Disk, Event, File, Folder, Style, events, rebui
 from faults.shim import Shim
 
 AHEAD = 4096  # zeros that the log is filled with, so that rebuilding a disk is quick
-EVERY = 4  # rows that are put into an index
 LAST_BYTES = 600
 NUMBER = re.compile(rb"(?<=[ \[])\d+(?=[,\]}])")
 
@@ -124,7 +121,6 @@ class Held:
 def prepare() -> None:
     """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
     scroll_tactile_store.log_writer.AHEAD = AHEAD
-    scroll_tactile_store.rows.EVERY = scroll_tactile_store.open_log.EVERY = EVERY
     scroll_tactile_store.checkpoint_files._write_zarr = partial(write_zarr, indent=None)  # numbers stand between commas
     scroll_tactile_store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
     scroll_tactile_store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]

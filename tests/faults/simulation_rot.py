@@ -1,4 +1,4 @@
-"""Files at rest: a bit of one is another, and what is derived is of another time."""
+"""Files at rest: a bit of one is another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from scroll_tactile_store import StoreError, repair_store
-from scroll_tactile_store.layout import DERIVED, read_current
+from scroll_tactile_store.layout import read_current
 
 from faults.cases import Wrong
 from faults.learners import KIT, perform
@@ -169,21 +169,3 @@ class Rotting(OneMemory):
         self.disks.settle(machine.name)
         machine.candidates, machine.copies, machine.made, machine.begins = [State()], {}, False, []
         self.counts["disks replaced"] += 1
-
-    def _derived(self, machine: Machine, rng: random.Random) -> None:
-        """What follows from the rest is of another time, or of another memory: it is not believed."""
-        folder = machine.path / DERIVED
-        if not folder.exists():
-            return
-        self.derived.append({one.name: one.read_bytes() for one in folder.iterdir()})
-        if rng.random() < 0.5:
-            return
-        self.shut(machine)
-        self.drop(machine)
-        shutil.rmtree(folder)
-        folder.mkdir()
-        for name, data in rng.choice(self.derived[-6:]).items():
-            (folder / name).write_bytes(data)
-        self.disks.settle(machine.name)
-        self.say(f"  {machine.name}: derived files of another time")
-        self.counts["derived files of another time"] += 1

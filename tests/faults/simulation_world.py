@@ -77,7 +77,6 @@ class World:
         self.machines = [Machine(name, self.root / name / "memory") for name in MACHINES]
         self.bucket: dict[str, list[tuple[bytes, State]]] = {}
         self.flying: list[tuple[int, str, tuple[bytes, State]]] = []
-        self.derived: list[dict[str, bytes]] = []
         self.step, self.counts = 0, counts
         self.warned: list[str] = []
         self.told: list[str] = []

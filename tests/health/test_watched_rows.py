@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scroll_tactile_store import Checkpoint, StoreError, StoreFullError
+from scroll_tactile_store import StoreError, StoreFullError
 from scroll_tactile_store.log_writer import LogWriter
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
 from scroll_tactile.health.watch import EVERY, Watch, WatchedRow, WatchedRows, WatchRules
-from scroll_tactile.validation import stored_watch
-from scroll_tactile.validation.expected import Unexpected
 
 PAD = Sensor(name="pad", channels=4, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)
@@ -24,7 +22,7 @@ RULES = WatchRules(0.01)
 
 
 def empty() -> WatchedRows:
-    return WatchedRows(RULES, Watch(2, RULES.bound), last=0, known=0, lost=0)
+    return WatchedRows(RULES, 2)
 
 
 def row(sequence: int, seed: int, shift: int) -> WatchedRow:
@@ -211,7 +209,7 @@ def test_rows_that_others_ask_about_are_not_read_again_and_nobody_takes_those_th
 def test_a_change_is_told_by_the_rows_that_show_it_however_many_of_the_other_kind_came_since(first: str) -> None:
     """Touches near the bound, then many rests, which carry it over the bound; and the other way round."""
     random, second = np.random.default_rng(0), "" if first else "a"
-    watched = WatchedRows(RULES, Watch(4, RULES.bound), last=0, known=0, lost=0)
+    watched = WatchedRows(RULES, 4)
 
     def take(material: str, shift: float = 0.0) -> None:
         assert watched.last < 2000
@@ -232,75 +230,11 @@ def test_a_change_is_told_by_the_rows_that_show_it_however_many_of_the_other_kin
     assert watched.watch.change is not None and 0 in watched.watch.change.channels
 
 
-def test_what_was_read_is_kept_over_restarts(memory: Path, counted: Counted) -> None:
-    with TactileLearner.open(memory) as learner:
-        found = learner.health()
-    with TactileLearner.open(memory, mode="read") as learner:
-        assert counted.rows(learner.health) == (found, 0)
-        assert counted.rows(lambda: learner.health(source="robot-0"))[1] == 75  # other rules, other rows
+def test_an_opened_memory_reads_its_rows_once_and_says_the_same(memory: Path, counted: Counted) -> None:
     with TactileLearner.open(memory) as learner:
         learner.retract(149)
-        learner.sense(SCENE.touch(NAMES[0], 99))
-        _, count = counted.rows(learner.health)
-        assert count == 150  # what is kept has no copies of before
-        learner.retract(3)  # not read again before it is kept
-    with TactileLearner.open(memory) as learner:
-        found, count = counted.rows(learner.health)
-        assert count == 149
-        learner.sense(SCENE.touch(NAMES[1], 99), NAMES[1])
-    with TactileLearner.open(memory, mode="read") as learner:
-        last, count = counted.rows(learner.health)
-        assert (last.touches, count) == (found.touches + 1, 1)
-    for kept in (memory / "derived").glob(stored_watch.NAME):
-        kept.unlink()
-    assert fresh(memory) == last
-
-
-def kept_of(rows: list[WatchedRow]) -> Checkpoint:
-    watched = taken(rows, empty())
-    arrays, attributes = stored_watch.watch_to_arrays(watched)
-    return Checkpoint(1, watched.last, attributes, arrays)
-
-
-CHANGED = [row(sequence, 1, 0 if sequence < 150 else 400) for sequence in range(1, 250)]
-
-
-def test_a_kept_watch_is_the_same_to_the_bit_and_an_alarm_is_kept() -> None:
-    whole = taken(CHANGED, empty())
-    assert whole.watch.change is not None
-    for count in (0, 1, 40, 249):
-        kept = stored_watch.watched_from(kept_of(CHANGED[:count]), 2, RULES, 0)
-        assert kept is not None
-        assert state(taken(CHANGED, kept)) == state(whole)
-    assert stored_watch.watched_from(kept_of(CHANGED), 2, WatchRules(0.1), 0) is None
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("inverse", np.full((7, 7), np.nan)),
-        ("cells", np.array([[9, 1, 1, 1]])),
-        ("recent", np.zeros((0, 3), np.int64)),  # of whom a change is to be told
-        ("last", 10**6),
-        ("made_by", "0.0.0, 1"),
-        ("change", None),
-    ],
-)
-def test_what_is_no_watch_is_refused(field: str, value: Any) -> None:
-    kept = kept_of(CHANGED)
-    arrays, about = dict(kept.arrays), dict(kept.attributes)
-    (arrays if field in arrays else about)[field] = value
-    with pytest.raises(Unexpected):
-        stored_watch.watched_from(Checkpoint(1, kept.last_sequence, about, arrays), 2, RULES, 0)
-
-
-def test_a_wrong_file_is_passed_over(memory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with TactileLearner.open(memory) as learner:
         found = learner.health()
-        to_arrays = stored_watch.watch_to_arrays
-        wrong = {"inverse": np.zeros((3, 3))}
-        monkeypatch.setattr(
-            "scroll_tactile.persistence.sensor_rows.watch_to_arrays",
-            lambda watched: (to_arrays(watched)[0] | wrong, to_arrays(watched)[1]),
-        )
-    assert fresh(memory) == found
+    with TactileLearner.open(memory, mode="read") as learner:
+        assert counted.rows(learner.health) == (found, 149)
+        assert counted.rows(learner.health) == (found, 0)
+        assert counted.rows(lambda: learner.health(source="robot-0"))[1] == 75  # other rules, other rows

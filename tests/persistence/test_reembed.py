@@ -5,8 +5,7 @@ import threading
 import numpy as np
 import pytest
 from commands import refused, run
-from forging import put_row
-from scroll_tactile_store import DamageError, LockedError, Store, StoreFullError
+from scroll_tactile_store import LockedError, Store, StoreFullError
 from touches import OBSERVED, SETTINGS, SMALL, contents, fed, filled, held, stream, without
 
 from examples.paper.transfer.maps import Maps
@@ -139,18 +138,6 @@ def test_what_is_observed_meanwhile_is_in_it(path, monkeypatch):
         kept = len(learner.observations())
         assert 8 <= kept <= 9
         assert learner.digest() == fed(OBSERVED[:kept], embedding=other).digest()
-
-
-def test_rows_that_are_not_those_of_the_checkpoint_are_not_carried_over(path):
-    filled(path)[0].close()
-    put_row(path, kind="describe", label="a", attributes={"constituents": {"wool": 1.0}}, sequence=3)
-    before = rows(path)
-    with TactileLearner.open(path) as learner:
-        whole = held(learner)
-        with pytest.raises(DamageError, match="counts"):
-            learner.reembed(OTHER["exact"]())
-        assert held(learner) == whole
-    assert rows(path) == before
 
 
 class TestRefused:

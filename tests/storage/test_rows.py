@@ -1,45 +1,23 @@
-"""Where rows are is known from the index's files, or from the log where they are wrong or lost, and always the same."""
+"""Where rows are is known from the checkpoint's index, or from the log where that is missing or another's."""
 
 import random
 import shutil
-import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import scroll_tactile_store.open_log
-import scroll_tactile_store.rows
-from scroll_tactile_store import Store, check_store
-from scroll_tactile_store.derived import HEADER as DERIVED
-from scroll_tactile_store.derived import MARK, read_derived, write_derived
-from scroll_tactile_store.encoding import encode_payload
-from scroll_tactile_store.records import payload_digest
-from scroll_tactile_store.rows import HEADER
+from scroll_tactile_store import RecordError, Store, check_store, repair_store
+from scroll_tactile_store.archive import write_archive
+from scroll_tactile_store.checkpoint_files import INDEX
+from scroll_tactile_store.layout import read_current, write_current
+from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.rows import Rows
 
-
-@pytest.fixture(scope="module", autouse=True)
-def small():
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (scroll_tactile_store.rows, scroll_tactile_store.open_log):
-            patch.setattr(module, "EVERY", 8)
-        yield
-
-
-@pytest.fixture(scope="module")
-def whole(small, tmp_path_factory):
-    """A store, not to be changed, and its keys."""
-    path = tmp_path_factory.mktemp("whole") / "s"
-    return path, made(path)
-
-
-@pytest.fixture
-def keys(whole, tmp_path):
-    """The keys of the copy of it in tmp_path / "s"."""
-    shutil.copytree(whole[0], tmp_path / "s")
-    return dict(whole[1])
+SUM = {"sum": np.arange(4)}
 
 
 def made(path, rows=100, seed=0):
-    """A store with rows of a few keys, checkpoints and several files of the index; its keys by sequence."""
+    """A store with rows of a few keys and checkpoints; its keys by sequence."""
     draw, keys = random.Random(seed), {}
     with Store.open(path, identity={"of": "rows"}) as kept:
         for _ in range(rows):
@@ -47,13 +25,21 @@ def made(path, rows=100, seed=0):
             head = kept.append("observe", "a", key, arrays={"x": np.arange(3)})
             keys[head.sequence] = key
             if draw.random() < 0.2:
-                kept.commit({"sum": np.arange(4)}, last_sequence=head.sequence)
-        kept.commit({"sum": np.arange(4)}, last_sequence=kept.last)
+                kept.commit(SUM, last_sequence=head.sequence)
+        kept.commit(SUM, last_sequence=90)
+        for sequence in (rows + 1, rows + 2):
+            keys[sequence] = kept.append("observe", "b", b"new").key
     return keys
 
 
-def files(path):
-    return sorted((path / "derived").iterdir())
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "s"
+
+
+@pytest.fixture
+def keys(path):
+    return made(path)
 
 
 def require_all(path, keys):
@@ -63,97 +49,102 @@ def require_all(path, keys):
             assert [head.sequence for head in kept.with_key(key)] == [n for n, own in keys.items() if own == key]
         assert list(kept.with_key(b"never")) == []
         assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
-        assert kept.record(1).key == keys[1]
+        newest = kept.latest()
+        assert newest is None or list(newest.arrays) == ["sum"]
 
 
-def test_it_is_the_log_that_counts_whatever_the_files_say(tmp_path, keys):
-    assert len(files(tmp_path / "s")) > 1
-    require_all(tmp_path / "s", keys)
-    for file in files(tmp_path / "s"):
-        whole = file.read_bytes()
-        for place in (0, 20, HEADER.size + 3, -1):
-            harmed = bytearray(whole)
-            harmed[place] ^= 1
-            file.write_bytes(harmed)
-            require_all(tmp_path / "s", keys)
-        file.write_bytes(whole[:-40])
-        require_all(tmp_path / "s", keys)
-        file.write_bytes(whole)
-    shutil.rmtree(tmp_path / "s" / "derived")
-    require_all(tmp_path / "s", keys)
+def scans(path, keys, monkeypatch):
+    """Whether the log is read for where rows are, which are all found."""
+    read, calls = LogReader.reader_of_heads, []
+    with monkeypatch.context() as patch:
+        patch.setattr(LogReader, "reader_of_heads", lambda log: [calls.append(log), read(log)][1])
+        require_all(path, keys)
+    return bool(calls)
 
 
-@pytest.mark.parametrize("column", [0, 1, 2])
-def test_a_forged_file_is_dropped_where_it_is_found_out(tmp_path, keys, column):
-    file = files(tmp_path / "s")[0]
-    data = bytearray(file.read_bytes()[:-16])
-    count = HEADER.unpack_from(data)[-1]
-    at = HEADER.size + 8 * count * column + 8 * (count // 2)
-    struct.pack_into("<Q", data, at, struct.unpack_from("<Q", data, at)[0] + 1)
-    file.write_bytes(bytes(data) + payload_digest(bytes(data)))
-    with Store.open(tmp_path / "s", mode="read") as kept:
-        assert [(head.sequence, head.key) for head in kept.heads()] == list(keys.items())
+def index_of(path):
+    return next((path / "checkpoints").glob(f"*/{INDEX}*"))
 
 
-@pytest.mark.parametrize("field", [5, 6, 7])
-def test_a_forged_end_is_found_out_and_the_log_read_again(tmp_path, keys, field):
-    file = files(tmp_path / "s")[-1]
-    data = file.read_bytes()[:-16]
-    head = list(HEADER.unpack_from(data))
-    head[field] = bytes(16) if field == 7 else head[field] - 1
-    data = HEADER.pack(*head) + data[HEADER.size :]
-    file.write_bytes(data + payload_digest(data))
-    require_all(tmp_path / "s", keys)
+def test_a_row_is_looked_up_without_the_log_being_read_also_in_a_copy_and_a_packed_store(
+    tmp_path, path, keys, monkeypatch
+):
+    with Store.open(path) as kept:
+        kept.backup(tmp_path / "copy")
+    write_archive(path, tmp_path / "packed")
+    for each in (path, tmp_path / "copy", tmp_path / "packed"):
+        assert not scans(each, keys, monkeypatch)
 
 
-def test_a_new_log_has_files_of_its_own(tmp_path, keys):
-    with Store.open(tmp_path / "s") as kept:
-        kept.compact({"sum": np.arange(4)}, last_sequence=60)
-        for _ in range(20):
-            head = kept.append("observe", "b", b"new")
-            keys[head.sequence] = b"new"
-        kept.commit({"sum": np.arange(4)}, last_sequence=kept.last)
-    with Store.open(tmp_path / "s", mode="read") as kept:
-        assert [head.sequence for head in kept.with_key(b"new")] == list(range(101, 121))
-        assert [head.sequence for head in kept.heads()] == list(keys)
-    assert len(files(tmp_path / "s")) == 1
+def test_the_index_of_a_compacted_log_is_of_that_log(path, keys, monkeypatch):
+    with Store.open(path) as kept:
+        kept.compact(SUM, last_sequence=60, newest=(SUM, {}))
+    assert not scans(path, keys, monkeypatch)
+    with Store.open(path) as kept:
+        keys[103] = kept.append("observe", "b", b"new").key
+        kept.compact(SUM, last_sequence=70)
+    assert not scans(path, keys, monkeypatch)
 
 
-def test_there_are_few_files_however_many_rows(tmp_path):
-    keys = made(tmp_path / "s", rows=150)
-    assert len(files(tmp_path / "s")) <= 8
-    require_all(tmp_path / "s", keys)
+@pytest.mark.parametrize("lost", ["flipped", "missing", "no checkpoint"])
+def test_without_its_index_a_log_is_read(path, keys, monkeypatch, lost):
+    if lost == "no checkpoint":
+        write_current(path, replace(read_current(path / "CURRENT"), newest=None))
+    elif lost == "flipped":
+        file = next(each for each in index_of(path).rglob("*") if each.is_file() and each.name != "zarr.json")
+        file.write_bytes(bytes([file.read_bytes()[0] ^ 1]) + file.read_bytes()[1:])
+        assert [problem.kind for problem in check_store(path)] == ["spare"]
+        repair_store(shutil.copytree(path, path.with_name("again")))
+        with Store.open(path.with_name("again"), mode="read") as again:
+            assert again.latest().last_sequence == read_current(path / "CURRENT").newest.last_sequence
+        assert {problem.kind for problem in check_store(again.path)} == {"leftover"}
+    else:
+        shutil.rmtree(index_of(path))
+    assert lost == "no checkpoint" or scans(path, keys, monkeypatch)
+    require_all(path, keys)
 
 
 @pytest.mark.parametrize("mode", ["read", "write"])
-def test_files_of_another_time_are_not_believed(tmp_path, keys, mode):
-    """A copy was put back over the folder, file by file, and then went another way."""
-    path, copy = tmp_path / "s", tmp_path / "copy"
+def test_a_repaired_log_is_not_read_by_the_index_of_the_one_before(path, keys, mode):
+    log = path / "log-00000001"
+    data = bytearray(log.read_bytes())
+    place = read_current(path / "CURRENT").newest.place.offset
+    data[place // 2] ^= 1
+    log.write_bytes(data)
+    assert repair_store(path).kept == 102
+    with Store.open(path, mode=mode) as kept:
+        for sequence in (1, 88, 101):
+            (head,) = (head for head in kept.with_key(keys[sequence]) if head.sequence == sequence)
+            assert head.key == keys[sequence]
+        assert len(list(kept.heads())) in (101, 102)
+
+
+def test_an_index_that_is_none_is_refused_and_rows_beyond_the_log_are_not_taken():
+    for wrong in (np.zeros((4, 2)), np.zeros(4, np.uint64), np.zeros((3, 2), np.uint64)):
+        with pytest.raises(ValueError, match="no array of"):
+            Rows.of_table(wrong, 100)
+    assert len(Rows.of_table(np.array([[1, 2], [88, 2**64 - 1], [9, 9], [0, 0]], np.uint64), 100)) == 1
+
+
+def test_a_name_of_the_stores_own_is_refused(path, keys):
+    with Store.open(path) as kept, pytest.raises(RecordError, match="no array may be called 'log-x'"):
+        kept.commit({"log-x": np.arange(2)}, last_sequence=kept.last)
+
+
+@pytest.mark.parametrize("mode", ["read", "write"])
+def test_a_copy_put_back_over_the_folder_that_went_another_way_is_read_as_it_is(tmp_path, path, keys, mode):
+    copy = tmp_path / "copy"
     with Store.open(path) as kept:
         kept.backup(copy)
         for _ in range(9):
-            kept.append("then", "a", b"new")
+            kept.append("then", "a", b"now")
         kept.commit({}, last_sequence=kept.last)
     shutil.copytree(copy, path, dirs_exist_ok=True)
     with Store.open(path) as kept:
-        for number in range(6):  # too few for a file of their own
-            kept.append("otherwise", "a", b"new", arrays={"x": np.arange(number + 500)})
+        for number in range(6):
+            kept.append("otherwise", "a", b"now", arrays={"x": np.arange(number + 500)})
         kept.commit({}, last_sequence=kept.last)
     assert [problem for problem in check_store(path) if problem.kind != "leftover"] == []
     with Store.open(path, mode=mode) as kept:
-        assert [head.kind for head in kept.with_key(b"new")] == ["otherwise"] * 6
+        assert [head.kind for head in kept.with_key(b"now")] == ["otherwise"] * 6
         assert len(list(kept.heads())) == len(list(kept.records())) == len(keys) + 6
-
-
-FOLLOWS = "ab" * 32
-
-
-@pytest.mark.parametrize("sizes", [None, (2**63, 0), (0, 2**40), (3, 3), (2, 2**31)])
-def test_a_forged_file_stands_for_no_more_than_it_has(tmp_path, sizes):
-    write_derived(tmp_path, "watch", FOLLOWS, '{"a":1}', {"x": np.arange(5)})
-    about, arrays = read_derived(tmp_path, "watch", FOLLOWS)
-    assert about == {"a": 1} and arrays["x"].tolist() == [0, 1, 2, 3, 4]
-    parts = [b"[", encode_payload({})]
-    data = b"".join([DERIVED.pack(MARK, bytes.fromhex(FOLLOWS), *(sizes or map(len, parts))), *parts])
-    (tmp_path / "derived" / "watch").write_bytes(data + payload_digest(data))
-    assert read_derived(tmp_path, "watch", FOLLOWS) is None

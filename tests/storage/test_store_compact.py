@@ -50,7 +50,7 @@ def test_a_flipped_bit_in_a_log_that_nothing_was_appended_to_is_damage(opened, l
     opened.close()
     flip_row(opened.path, LAST - 1)
     assert damage(opened.path)
-    with Store.open(opened.path, mode="read") as reader, pytest.raises(DamageError, match=f"row {LAST - 1} is missing"):
+    with Store.open(opened.path, mode="read") as reader, pytest.raises(DamageError, match=f"row {LAST - 1} is"):
         list(reader.heads(LAST - 2))
 
 
@@ -61,7 +61,7 @@ def test_a_damaged_row_keeps_all_from_being_given_up(opened, row, arrays):
     flip_row(opened.path, row, arrays=arrays)
     before = log_of(opened.path).read_bytes()
     with Store.open(opened.path) as again:
-        with pytest.raises(DamageError, match=r"row 7 is not as it was written|repair the store"):
+        with pytest.raises(DamageError, match=f"row {row} is not as it was written"):
             compact(again, 5)
         assert (again.compacted, folders(again.path)) == (0, ["00000002"])
         assert log_of(again.path).read_bytes() == before

@@ -369,13 +369,11 @@ class Destination:
         begun, processor = time.perf_counter(), time.process_time()
         try:
             ledger = self.learner._ledger
-            # What our own workers made is taken as what this memory holds itself.
             rules = MergeRules(
                 one_name=True,
                 descriptions=self._descriptions,
                 clipped=clipped,
                 default_source=source,
-                thorough=source is not None,
             )
             merged, refused = ledger.merge(path, rules, progress)
             ledger.checkpoint_in_background(SAVED_EVERY)

@@ -30,8 +30,7 @@ from scroll_tactile.persistence.replaying import ranked_exemplars
 from scroll_tactile.persistence.sensor_rows import adapt_to, health_of, known_touches
 from scroll_tactile.prediction.features import Readings
 from scroll_tactile.prediction.model import Model
-from scroll_tactile.prediction.predictor import Predictor
-from scroll_tactile.prediction.reembedding import embed_again
+from scroll_tactile.prediction.predictor import Predictor, embed_again
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.results import (

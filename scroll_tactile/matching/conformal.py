@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.matching.kept_arrays import KeptArrays, log_steps
-from scroll_tactile.matching.likelihood import LevelArray
+from scroll_tactile.signals.levels import LevelArray
 
 __all__ = ["Conformal"]
 

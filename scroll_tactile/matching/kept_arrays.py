@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from scroll_tactile import native
 from scroll_tactile.errors import InputError
-from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray, Table
+from scroll_tactile.matching.likelihood import Table
+from scroll_tactile.signals.levels import LEVELS, MISSING, LevelArray
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 
 __all__ = ["Blocks", "KeptArrays", "KeptTouch", "at_places", "first_changes", "mean_distances"]

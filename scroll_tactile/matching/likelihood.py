@@ -1,8 +1,7 @@
 """How likely a reading is, given the reading of a kept touch and the noise that came over it.
 
-A level is a reading in 255 steps of its channel's range. A touch of the same material reads x + v where a kept one
-reads x: v is normal, with the spread that touches of the set have among themselves. Noise is added to that, and what
-leaves the range is clipped to it:
+A touch of the same material reads the level x + v where a kept one reads x (see `signals.levels`): v is normal, with
+the spread that touches of the set have among themselves. Noise is added to that, and what leaves the range is clipped:
 
     L[y, x] = log((1 − ε) P(clip(x + v + u) = y) + ε / 255),    u uniform in ± a, or normal with a's energy.
 
@@ -12,7 +11,6 @@ Rounded to 2⁻¹⁰ the logarithms are integers: sums of them are the same byte
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 
@@ -20,12 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile import native
-from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.levels import LEVELS, MISSING, LevelArray
 
-__all__ = ["CLEAN", "LEVELS", "MISSING", "NOISES", "UNIT", "Likelihood", "Noise", "Table", "levels_of"]
+__all__ = ["CLEAN", "NOISES", "UNIT", "Likelihood", "Noise", "Table"]
 
-LEVELS = 255
-MISSING = 255  # the level of a value that was not read; it has a likelihood of 1 beside any other
 UNIT = 1024  # of the tables, in a natural logarithm's 1
 
 FLOOR = 1e-3  # ε: a share of readings that nothing explains, such as glitches
@@ -34,19 +30,10 @@ LEAST, STEP, AMPLITUDES = 0.01, 1.01, 464  # amplitudes from LEAST, below which 
 BLUR = 0.006  # of an amplitude: what a step of the amplitudes leaves unsaid of where the noise ends
 MOST_TABLES = 96  # of 128 kB
 
-LevelArray = npt.NDArray[np.uint8]
 FloatArray = npt.NDArray[np.float64]
 
 _LEVELS = np.arange(float(LEVELS))
 _DISTANCE = _LEVELS[None, :] + 0.5 - _LEVELS[:, None]  # of the upper end of level y from x, [x, y]
-
-
-def levels_of(readings: npt.NDArray[np.floating], sensor: Sensor) -> LevelArray:
-    """Readings in the sensor's unit, shape (T, C), as levels, shape (C, T); NaN is MISSING, the rest is clipped."""
-    low, high = (limit.astype(np.float64) for limit in sensor.limits)
-    share = np.clip((np.asarray(readings, dtype=np.float64) - low) / (high - low), 0.0, 1.0)
-    levels = np.where(np.isnan(share), MISSING, np.rint(share * (LEVELS - 1)))
-    return np.ascontiguousarray(levels.T.astype(np.uint8))
 
 
 @dataclass(frozen=True)
@@ -102,6 +89,7 @@ class Table:
         return np.asarray(sums * (np.count_nonzero(seen) / np.maximum(both, 1)))
 
 
+@dataclass(eq=False)
 class Likelihood:
     """The tables of one set of touches, for any number of threads.
 
@@ -109,9 +97,12 @@ class Likelihood:
     weights: the share of readings at each level, shape (255,). table: of a kind of noise; the latest are kept.
     """
 
-    def __init__(self, spread: FloatArray, weights: FloatArray) -> None:
-        self.spread, self.weights = np.maximum(spread, NARROWEST), weights
-        self.table: Callable[[Noise], Table] = lru_cache(MOST_TABLES)(partial(_table, self.spread, weights))
+    spread: FloatArray
+    weights: FloatArray
+
+    def __post_init__(self) -> None:
+        self.spread = np.maximum(self.spread, NARROWEST)
+        self.table = lru_cache(MOST_TABLES)(partial(_table, self.spread, self.weights))
 
     @cached_property
     def by_amplitude(self) -> npt.NDArray[np.float32]:

@@ -22,8 +22,9 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.conformal import Conformal
 from scroll_tactile.matching.kept_arrays import Blocks, KeptArrays, KeptTouch, first_changes
-from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, NOISES, LevelArray, Likelihood, Noise, Table
+from scroll_tactile.matching.likelihood import CLEAN, NOISES, Likelihood, Noise, Table
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.levels import LEVELS, MISSING, LevelArray
 
 __all__ = ["Beside", "Match", "NaturalDeviation", "Query", "TouchMatcher", "independent"]
 

@@ -15,7 +15,6 @@ from scroll_tactile_store import Head, Record
 from scroll_tactile_store.records import LateArray
 
 from scroll_tactile.matching.kept_arrays import KeptTouch
-from scroll_tactile.matching.likelihood import LevelArray, levels_of
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
 from scroll_tactile.memory.touch_rows import (
@@ -35,6 +34,7 @@ from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.correction import Correction
+from scroll_tactile.signals.levels import LevelArray, levels_of
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, TargetSums
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
 from scroll_tactile.statistics.statistics import SECOND, Statistics

@@ -19,7 +19,6 @@ from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
 from scroll_tactile.health.skin_fit import Fitted, Reference, fitted, guess_of_lost
 from scroll_tactile.health.watch import WatchedRow, WatchedRows, WatchRules
-from scroll_tactile.matching.likelihood import LEVELS, MISSING
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
@@ -29,6 +28,7 @@ from scroll_tactile.results import Adaptation, Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name
 from scroll_tactile.signals.correction import Correction, corrected_stream
+from scroll_tactile.signals.levels import LEVELS, MISSING
 from scroll_tactile.signals.stream import Stream, validate
 
 __all__ = ["adapt_to", "health_of", "known_touches"]

@@ -17,7 +17,6 @@ from scroll_tactile.embeddings.protocol import (
     require_features,
     require_rest,
 )
-from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
@@ -28,7 +27,7 @@ from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scal
 from scroll_tactile.statistics.grid import in_units, to_codes
 from scroll_tactile.statistics.sample import stage_rows
 
-__all__ = ["Encoded", "FeatureExtractor", "Readings", "WindowCache", "stream_of"]
+__all__ = ["Encoded", "FeatureExtractor", "Readings", "WindowCache"]
 
 Readings = npt.ArrayLike | Iterable[npt.ArrayLike] | Stream
 Image = npt.NDArray[np.float32]
@@ -229,20 +228,3 @@ class FeatureExtractor:
         frame = self._plan.widths[0] if self.sensor.camera else 1
         before = 1 if isinstance(self._rest, str) else 0  # the resting image is not in the tactile image
         return stream.first((longest // frame + before) / self.sensor.rate)
-
-
-def stream_of(levels: LevelArray, sensor: Sensor) -> Stream:
-    """The readings that kept levels stand for.
-
-    A missing value repeats the last one before it, or where there is none the first that was read; a channel without
-    any lies at the low end of its range.
-    """
-    low, high = sensor.limits
-    lacking = levels == MISSING
-    if lacking.any():
-        last = np.maximum.accumulate(np.where(lacking, -1, np.arange(levels.shape[1])), axis=1)
-        first = lacking.argmin(axis=1)[:, None]  # 0 of a channel without any
-        levels = np.take_along_axis(levels, np.where(last < 0, first, last), axis=1)
-        levels[lacking.all(axis=1)] = 0
-    readings = low + (high - low) * (levels.T.astype(np.float32) / np.float32(LEVELS - 1))
-    return validate(readings.clip(low, high), sensor)

@@ -21,7 +21,7 @@ from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.matcher import Match, TouchMatcher, independent
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
-from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import (
     WITHIN,
     HeldOut,
@@ -38,6 +38,7 @@ from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
 from scroll_tactile.readouts.novelty import FEWEST
 from scroll_tactile.readouts.readout import ReadoutName
 from scroll_tactile.readouts.task import Task
+from scroll_tactile.signals.levels import stream_of
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch

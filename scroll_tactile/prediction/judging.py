@@ -27,15 +27,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.matching.likelihood import CLEAN, LevelArray, levels_of
+from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.matcher import Match
-from scroll_tactile.prediction.features import Encoded, FeatureExtractor, stream_of
+from scroll_tactile.prediction.features import Encoded, FeatureExtractor
 from scroll_tactile.prediction.fitting import paces_of
 from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, softmax, tempered
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.novelty import NoveltyThresholds
 from scroll_tactile.results import Estimate, Prediction, Unusual
+from scroll_tactile.signals.levels import LevelArray, levels_of, stream_of
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.moments import one_thread
 
 __all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged"]
@@ -210,7 +212,7 @@ def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encod
 
 def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     """The judgement by the readouts. For a novel touch its match names how it differs."""
-    unusual = _of_length(model, encoded)
+    unusual = _unusual(model, encoded)
     if model.matcher is not None and alone.novelty > alone.row.calibration.thresholds.above("", 1 - WITHIN):
         match = model.matcher.match(_levels_of(encoded.stream), noise=None)
         unusual = _unusual(model, encoded, match, _own_hypothesis(model, encoded))
@@ -227,23 +229,18 @@ def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: M
     return replace(alone, probability=tempered(softmax(logits), alone.row.outliers), novelty=novelty)
 
 
-def _unusual(model: Model, encoded: Encoded, match: Match, hypothesis: Hypothesis) -> tuple[Unusual, ...]:
-    """How a touch differs from the learned ones, by its length and its match with kept touches."""
-    found: list[Unusual] = list(_of_length(model, encoded))
-    if found and hypothesis == "paced":
-        found = ["faster" if found == ["shorter"] else "slower"]
-    marks: tuple[tuple[Unusual, bool], ...] = (
-        ("noisy", match.noise_share > 0.5),
-        ("zero moved", match.moved),
-        ("channels dead", bool(match.stuck.any())),
-    )
-    return (*found, *(mark for mark, holds in marks if holds))
-
-
-def _of_length(model: Model, encoded: Encoded) -> tuple[Unusual, ...]:
-    if encoded.steps < model.fitted.least:
-        return ("shorter",)
-    return ("longer",) if encoded.seconds < encoded.stream.seconds else ()
+def _unusual(
+    model: Model, encoded: Encoded, match: Match | None = None, hypothesis: Hypothesis = "complete"
+) -> tuple[Unusual, ...]:
+    """How a touch differs from the learned ones, by its length and, where it was matched, by its kept neighbours."""
+    short, long = encoded.steps < model.fitted.least, encoded.seconds < encoded.stream.seconds
+    paced = hypothesis == "paced"
+    marks: list[tuple[Unusual, bool]] = [("faster" if paced else "shorter", short)]
+    marks.append(("slower" if paced else "longer", long and not short))
+    if match is not None:
+        marks += [("noisy", match.noise_share > 0.5), ("zero moved", match.moved)]
+        marks.append(("channels dead", bool(match.stuck.any())))
+    return tuple(mark for mark, holds in marks if holds)
 
 
 def _levels_of(stream: Stream) -> LevelArray:
@@ -316,15 +313,13 @@ def estimates_of(
     that is None they are those for a new one.
     """
     as_known = prediction.known is True if known is None else known
-    unusual = set(prediction.unusual)
-    if encoded is not None and estimator.stage(encoded.steps) < estimator.last:
-        unusual.discard("shorter")  # than complete ones: earlier heads are of touches cut at a milestone
+    steps, means, unusual = 0, dict[Scale, FloatArray](), set(prediction.unusual)
+    if encoded is not None:
+        steps, means = encoded.steps, encoded.means
+        if estimator.stage(steps) < estimator.last:
+            unusual.discard("shorter")  # than complete ones: earlier heads are of touches cut at a milestone
+        if (length := estimator.length(steps)) < steps:
+            means = extractor.means(encoded.image[:, :length], estimator.scales_for(steps))
+    found = estimator.estimate(wanted, means, steps, risk, known=as_known)
     inside = prediction.known is not False and not unusual
-    if encoded is None:
-        found = estimator.estimate(wanted, {}, 0, risk, known=as_known)
-    else:
-        length, means = estimator.length(encoded.steps), encoded.means
-        if length < encoded.steps:
-            means = extractor.means(encoded.image[:, :length], estimator.scales_for(encoded.steps))
-        found = estimator.estimate(wanted, means, encoded.steps, risk, known=as_known)
     return {name: replace(own, inside=inside, seconds=prediction.seconds) for name, own in found.items()}

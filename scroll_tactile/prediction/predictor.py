@@ -16,20 +16,23 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
+from scroll_tactile_store import Store
 
-from scroll_tactile.embeddings.protocol import capabilities_of
+from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
-from scroll_tactile.memory.identity import FingerprintCheck
+from scroll_tactile.memory.identity import FingerprintCheck, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.persistence.contents import ListedContents
 from scroll_tactile.persistence.ledger import AxisLedger, Ledger
+from scroll_tactile.persistence.reembed import Reembedding
 from scroll_tactile.persistence.replaying import exemplar_candidates, load
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
@@ -38,14 +41,14 @@ from scroll_tactile.prediction.judging import answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.stored import read_weighing, weighing_text
 from scroll_tactile.readouts.estimation import Estimator
-from scroll_tactile.recipe import Recipe, RecipeRequest
+from scroll_tactile.recipe import Recipe, RecipeRequest, default_kept_touches
 from scroll_tactile.results import Composition, Constituent, Estimate, Prediction
-from scroll_tactile.settings import candidates_of
+from scroll_tactile.settings import Settings, candidates_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.validation.gate import open_memory
+from scroll_tactile.validation.gate import MemoryStore, finish_interrupted, open_memory
 
-__all__ = ["LogitsReader", "Predictor", "nothing_known"]
+__all__ = ["LogitsReader", "Predictor", "embed_again", "nothing_known", "reembed_memory"]
 
 logger = logging.getLogger(__name__)
 
@@ -370,6 +373,61 @@ def _followed(fit: _Fit, memory: Memory) -> Model | None:
     if model.touches <= FEW:
         outgrown = abs(now - model.touches) >= min(LEAST, model.touches + 1)
     return None if outgrown or fit.changed is None else model.followed(memory, fit.changed)
+
+
+def reembed_memory(
+    path: str | os.PathLike[str],
+    embedding: Embedding | None = None,
+    *,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Path:
+    """As `TactileLearner.reembed`, with the memory in a folder, also where its own embedding is not at hand."""
+    finish_interrupted(Path(path))
+    with MemoryStore.open(path) as store:
+        carried = _reembedding(store, embedding)
+        try:
+            carried.copy(progress or (lambda what, done, of: None))
+            return carried.put_in_place()
+        finally:
+            carried.close()
+
+
+def embed_again(
+    predictor: Predictor, embedding: Embedding | None, progress: Callable[[str, int, int], object]
+) -> tuple[Path, Predictor]:
+    """As `TactileLearner.reembed`; also returns the predictor of the new memory."""
+    ledger = predictor.ledger
+    with ledger.lock:  # not in the midst of another thread's batch
+        store = ledger.require_store("be embedded again")
+        ledger.require_writing()
+    carried = _reembedding(store, embedding)
+    try:
+        carried.copy(progress)
+        with ledger.lock:
+            ledger.require_writing()
+            carried.copy(progress)
+            ledger.saves = False  # nothing more is written to the old one, which a full disk could stop half-way
+            predictor.close()
+            before = carried.put_in_place()
+            predictor.replace()
+            kept = {"exemplars": None, "kept_touches": None}  # those of the new one
+            settings = predictor.recipe.settings.model_copy(update=kept)
+            return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, settings))
+    finally:
+        carried.close()
+
+
+def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
+    """The re-embedding of the memory in a store. embedding: None for its own, made again."""
+    made = Identity.read(store)
+    chosen = made.own_embedding(store.path) if embedding is None else embedding
+    # As many kept touches as the memory was made with, also none; if that was the default, the default of the new
+    # recipe.
+    default = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
+    kept = Settings(exemplars=made.exemplars, kept_touches=None if default else made.kept_touches)
+    recipe = Recipe.of(made.sensor, chosen, kept)
+    extractor = _extractor(recipe)
+    return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))
 
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:

@@ -15,26 +15,21 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 
 from scroll_tactile import __version__
-from scroll_tactile.matching.likelihood import Likelihood
 from scroll_tactile.matching.matcher import NaturalDeviation
 from scroll_tactile.prediction.model import Model, Weighing
 from scroll_tactile.signals.windows import Scale
 
 __all__ = ["read_weighing", "weighing_text"]
 
-MADE_BY = f"{__version__}, 3"  # the release, in which judging may differ, and the version of these fields
+MADE_BY = f"{__version__}, 4"  # the release, in which judging may differ, and the version of these fields
 
 
 def weighing_text(model: Model) -> str | None:
     """The weighing of a model as JSON; None where it has none."""
     if model.weighing is None:
         return None
-    found = {"made_by": MADE_BY, "kind": model.kind, "weighing": _plain(model.weighing), "kept": None}
-    if model.matcher is not None:
-        own = model.matcher.deviation
-        tables = [own.likelihood.spread.tolist(), own.likelihood.weights.tolist()]
-        found["kept"] = [*tables, own.coherence, own.energy, own.most]
-    return json.dumps(found)
+    found = {"made_by": MADE_BY, "kind": model.kind, "weighing": _plain(model.weighing)}
+    return json.dumps(found | ({} if model.matcher is None else {"deviation": _plain(model.matcher.deviation)}))
 
 
 def read_weighing(text: str, model: Model) -> Model:
@@ -49,9 +44,7 @@ def read_weighing(text: str, model: Model) -> Model:
                 raise ValueError(f"expected rows of the scales {sorted(model.readouts)}; came {row.scales}")
         matcher = model.matcher
         if matcher is not None:
-            spread, weights, *natural = found["kept"]
-            likelihood = Likelihood(np.array(spread), np.array(weights))
-            matcher = replace(matcher, deviation=NaturalDeviation(likelihood, *natural))
+            matcher = replace(matcher, deviation=_made(NaturalDeviation, found["deviation"]))
     except (KeyError, TypeError, IndexError, RecursionError) as error:
         raise ValueError(f"it is no weighing ({type(error).__name__}: {error})") from error
     return replace(model, weighing=weighing, matcher=matcher)

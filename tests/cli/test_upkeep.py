@@ -22,7 +22,7 @@ from scroll_tactile import ModuleEmbedding, Quantity, TactileLearner
 from scroll_tactile.clients.cli.terminal import opened_for_upkeep
 from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.prediction.reembedding import reembed_memory
+from scroll_tactile.prediction.predictor import reembed_memory
 
 OBSERVED = [(name, (seed, 60)) for seed in range(4) for name in ("a", "b/ü", "c")]
 

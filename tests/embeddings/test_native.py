@@ -28,7 +28,8 @@ from scroll_tactile.embeddings.convolution import (
     count_by_numpy,
 )
 from scroll_tactile.matching.kept_arrays import mean_distances
-from scroll_tactile.matching.likelihood import CLEAN, MISSING, Table
+from scroll_tactile.matching.likelihood import CLEAN, Table
+from scroll_tactile.signals.levels import MISSING
 
 SOURCES = Path(native.__file__).parent
 compiled = pytest.mark.skipif(not native.available, reason=f"the compiled kernels are not at work: {native.reason}")

@@ -50,8 +50,9 @@ from faults.common import folder, parser, progress, run
 from faults.truth import LENGTH, SETTINGS, SKIN, Array, Learned, LiveTold, Told, Truth, learned_of
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import DescriptionError, InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.matching.likelihood import LEVELS, Likelihood
+from scroll_tactile.matching.likelihood import Likelihood
 from scroll_tactile.results import Prediction
+from scroll_tactile.signals.levels import LEVELS
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.sample import TouchSample
 

@@ -7,7 +7,7 @@ import pytest
 
 from scroll_tactile.matching.conformal import OTHER_WEIGHT, Conformal
 from scroll_tactile.matching.kept_arrays import KeptArrays, KeptTouch, log_steps
-from scroll_tactile.matching.likelihood import MISSING
+from scroll_tactile.signals.levels import MISSING
 
 CHANNELS, COLUMNS = 3, 40
 Typicality = namedtuple("Typicality", "share least of_all least_of_all")

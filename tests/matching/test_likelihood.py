@@ -3,20 +3,9 @@
 import numpy as np
 import pytest
 
-from scroll_tactile.matching.likelihood import (
-    AMPLITUDES,
-    CLEAN,
-    LEVELS,
-    MISSING,
-    MOST_TABLES,
-    NOISES,
-    UNIT,
-    Likelihood,
-    Noise,
-    _table,
-    levels_of,
-)
+from scroll_tactile.matching.likelihood import AMPLITUDES, CLEAN, MOST_TABLES, NOISES, UNIT, Likelihood, Noise, _table
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.levels import LEVELS, MISSING, levels_of
 
 SOME = [CLEAN, *(Noise(step) for step in (200, 393, 461)), Noise(137, True), Noise(387, True)]
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.matching.kept_arrays import KeptTouch
-from scroll_tactile.matching.likelihood import CLEAN, LEVELS, MISSING, UNIT
+from scroll_tactile.matching.likelihood import CLEAN, UNIT
 from scroll_tactile.matching.matcher import TouchMatcher
 from scroll_tactile.sensors import Sensor
+from scroll_tactile.signals.levels import LEVELS, MISSING
 
 CHANNELS, READINGS, MATERIALS = 8, 120, 5
 

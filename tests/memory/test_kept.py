@@ -9,11 +9,11 @@ from touches import OBSERVED, PAD, Windowed, fed, filled, held, kept_of, require
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.matching.likelihood import levels_of
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import KeptTouches
 from scroll_tactile.recipe import default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT
+from scroll_tactile.signals.levels import levels_of
 
 FEW = 5
 SPARE = [("d", (40 + i, 60)) for i in range(3)]

@@ -12,7 +12,7 @@ from examples.paper.transfer.maps import Maps
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchError
 from scroll_tactile.persistence import reembed
-from scroll_tactile.prediction.reembedding import reembed_memory
+from scroll_tactile.prediction.predictor import reembed_memory
 
 OTHER = {
     "exact": lambda: Kernels(seed=3, dimension=128),

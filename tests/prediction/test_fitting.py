@@ -6,9 +6,10 @@ from live_touches import touched
 
 from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
 from scroll_tactile.clients.report.facts import _without
-from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.judging import held_out_touches, judged
+from scroll_tactile.signals.levels import stream_of
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import one_thread
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from scroll_tactile import Kernels, Sensor, TactileLearner
-from scroll_tactile.matching.likelihood import MISSING
-from scroll_tactile.prediction.features import stream_of
+from scroll_tactile.signals.levels import MISSING, stream_of
 from scroll_tactile.simulation.scene import Scene
 
 SKIN = Sensor(name="skin", channels=8, rate=50.0, low=0.0, high=100.0, unit="N", duration=1.6, non_finite="missing")

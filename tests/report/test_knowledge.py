@@ -21,11 +21,11 @@ from scroll_tactile.clients.report.facts import (
     unknown_by,
 )
 from scroll_tactile.live.decision import DecisionRule, decision_rule
-from scroll_tactile.matching.likelihood import levels_of
-from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import HeldOutTouch, held_out_touches
 from scroll_tactile.results import Prediction
+from scroll_tactile.signals.levels import levels_of, stream_of
 from scroll_tactile.simulation.scene import Scene
 
 SENSOR = known.BIOTAC

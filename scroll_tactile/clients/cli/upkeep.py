@@ -54,7 +54,7 @@ def reembed(
     Interrupted, start it again to go on.
     """
     from scroll_tactile.memory.identity import Identity
-    from scroll_tactile.prediction.reembedding import reembed_memory
+    from scroll_tactile.prediction.predictor import reembed_memory
     from scroll_tactile.recipe import default_embedding
     from scroll_tactile.validation.gate import finish_interrupted
 

@@ -22,7 +22,7 @@ from scroll_tactile.clients.firmware.exported_judge import ANGLES, CHANCES, Expo
 from scroll_tactile.embeddings.convolution import compiled_bank
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.features import stream_of
+from scroll_tactile.signals.levels import stream_of
 
 __all__ = ["flash_bytes", "kept_levels", "tables_of", "touches_to_check", "write_firmware"]
 

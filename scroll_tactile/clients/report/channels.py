@@ -14,11 +14,11 @@ from scroll_tactile.clients.report.drawing import as_counted, brief, clipped_nam
 from scroll_tactile.clients.report.page import Card, State, figure, name_of, note, table
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.matching.kept_arrays import KeptTouch
-from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.results import Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.image import scaled_down
+from scroll_tactile.signals.levels import LEVELS, MISSING, LevelArray
 
 FloatArray = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]

@@ -30,7 +30,7 @@ from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.exemplars import Exemplar
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.prediction.features import FeatureExtractor, stream_of
+from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import rehearse
 from scroll_tactile.prediction.judging import HeldOutTouch, answer, held_out_touches
 from scroll_tactile.prediction.model import Model
@@ -38,6 +38,7 @@ from scroll_tactile.readouts.leave_one_out import rows_at
 from scroll_tactile.readouts.novelty import FEWEST
 from scroll_tactile.readouts.task import Task
 from scroll_tactile.results import Observation, Prediction
+from scroll_tactile.signals.levels import stream_of
 from scroll_tactile.signals.stream import Stream, fewest_readings, validate
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.statistics import Statistics

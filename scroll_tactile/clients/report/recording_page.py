@@ -27,10 +27,10 @@ from scroll_tactile.clients.report.drawing import FIRST_DATE, MOST_TRACES, count
 from scroll_tactile.clients.report.page import Card, State, cards, figure, lines, note, page, side_by_side, table
 from scroll_tactile.errors import FieldError, InputError, printable
 from scroll_tactile.live.detector import contact_spans
-from scroll_tactile.matching.likelihood import LEVELS, MISSING, LevelArray
 from scroll_tactile.recordings import PRESETS, Contents, Interval, Recording, Touch, describe, read, touches
 from scroll_tactile.recordings.presets import find, names_for
 from scroll_tactile.sensors import Sensor, known
+from scroll_tactile.signals.levels import LEVELS, MISSING, LevelArray
 
 __all__ = ["recording_page"]
 

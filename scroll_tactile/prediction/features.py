@@ -89,11 +89,7 @@ class FeatureExtractor:
     """
 
     def __init__(
-        self,
-        sensor: Sensor,
-        embedding: Embedding,
-        plan: WindowPlan,
-        check: FingerprintCheck | None = None,
+        self, sensor: Sensor, embedding: Embedding, plan: WindowPlan, check: FingerprintCheck | None = None
     ) -> None:
         self.sensor, self.embedding, self._plan, self.check = sensor, embedding, plan, check
         require_rest(embedding, sensor)

@@ -45,13 +45,8 @@ __all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged
 FloatArray = npt.NDArray[np.float64]
 
 
-class Matched(NamedTuple):
-    """A touch beside kept ones under a hypothesis. clean: its excess loss where no noise came over it."""
-
-    hypothesis: Hypothesis
-    match: Match
-    clean: float
-
+Matched = tuple[Hypothesis, Match, float]
+"""A touch beside kept ones under a hypothesis, and its excess loss where no noise came over it."""
 
 COUNTED = 30.0  # the effective number of independent values in a touch: neighbouring values are correlated
 LEAST_SHARE = 1e-5  # a hypothesis of less weight is not judged
@@ -138,19 +133,19 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     if model.views and not learned and shortest <= length <= longest:
         hypotheses.append("paced")
     matches = _matches(model, levels, hypotheses, alone)
-    gains = np.array([each.match.log_likelihood_gain for each in matches])
-    best = matches[int(gains.argmax())]
-    filled = encoded if best.hypothesis != own else _filled(model, extractor, encoded, best.match)
+    gains = np.array([match.log_likelihood_gain for _, match, _ in matches])
+    likeliest, best, _ = matches[int(gains.argmax())]
+    filled = encoded if likeliest != own else _filled(model, extractor, encoded, best)
     answers = []
-    for each in matches:
-        if each.hypothesis == "paced":
-            judgement = _paced(model, extractor, candidates, filled.stream, each)
+    for hypothesis, match, clean in matches:
+        if hypothesis == "paced":
+            judgement = _paced(model, extractor, candidates, filled.stream, clean)
         else:
             judgement = alone if filled is encoded else model.judge(candidates, filled.means, encoded.steps, own)
-        answers.append(_fused(model, candidates, judgement, each))
+        answers.append(_fused(model, candidates, judgement, hypothesis, match))
     weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
-    unusual = _unusual(model, encoded, best.match, best.hypothesis)
+    unusual = _unusual(model, encoded, best, likeliest)
     return replace(answers[int(weights.argmax())], probability=probability / probability.sum(), unusual=unusual)
 
 
@@ -159,11 +154,7 @@ def _own_hypothesis(model: Model, encoded: Encoded) -> Hypothesis:
 
 
 def _matches(
-    model: Model,
-    levels: LevelArray,
-    hypotheses: Sequence[Hypothesis],
-    alone: Judgement,
-    held_out: int | None = None,
+    model: Model, levels: LevelArray, hypotheses: Sequence[Hypothesis], alone: Judgement, held_out: int | None = None
 ) -> list[Matched]:
     """The matches of a touch by each hypothesis that is likely enough to be judged.
 
@@ -179,22 +170,22 @@ def _matches(
         found = [matcher.beside(query, None) for query in queries]
     most, span = max(each.gain for each in found), -math.log(LEAST_SHARE) / COUNTED
     return [
-        Matched(hypothesis, matcher.result(each), without.excess)
+        (hypothesis, matcher.result(each), without.excess)
         for hypothesis, each, without in zip(hypotheses, found, clean, strict=True)
         if each.gain > most - span
     ]
 
 
 def _paced(
-    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], stream: Stream, matched: Matched
+    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], stream: Stream, clean: float
 ) -> Judgement:
-    """The judgement by the readouts of a touch as a whole one at another pace; novel as such touches are not."""
+    """The judgement by the readouts of a touch as a whole one at another pace. clean: see `Matched`."""
     means = extractor.means(extractor.image(stream_of(_levels_of(stream), extractor.sensor)), model.views)
     judgement, kept = model.judge(candidates, means, len(stream), "paced"), model.matcher
     assert kept is not None
     if (paces := paces_of(model, extractor)) is None:
         return judgement
-    values = np.append(model.distances(judgement.row.scales, means, candidates), matched.clean)
+    values = np.append(model.distances(judgement.row.scales, means, candidates), clean)
     pace = float(np.median(kept.kept.columns)) / len(stream)
     return replace(judgement, novelty=paces.novelty(values, pace))
 
@@ -219,14 +210,16 @@ def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
 
 
-def _fused(model: Model, candidates: Sequence[str], alone: Judgement, matched: Matched) -> Judgement:
+def _fused(
+    model: Model, candidates: Sequence[str], alone: Judgement, hypothesis: Hypothesis, match: Match
+) -> Judgement:
     """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts."""
     assert model.matcher is not None
-    match = matched.match
     scores = model.matcher.scores_of(candidates, match)
-    logits = model.fitted.logits(matched.hypothesis, alone.probability, match, scores, alone.distance)
-    novelty = (1 - match.noise_share) * alone.novelty  # what noise hides is not told
-    return replace(alone, probability=tempered(softmax(logits), alone.row.outliers), novelty=novelty)
+    logits = model.fitted.logits(hypothesis, alone.probability, match, scores, alone.distance)
+    share, (mean, spread) = match.noise_share, alone.row.excess  # of touches without noise: it hides how new one is
+    novelty = (1 - share) * alone.novelty + share * (match.excess_loss - mean) / spread
+    return replace(alone, probability=tempered(softmax(logits), alone.row.outliers), novelty=float(novelty))
 
 
 def _unusual(
@@ -288,8 +281,8 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
             chances = np.exp(logs[i])
             alone = Judgement(chances, float(novelties[i]), row, float(distances[i]))
             if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):
-                [matched] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
-                result = _fused(model, found.names, alone, matched)
+                [(_, match, _)] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
+                result = _fused(model, found.names, alone, "complete", match)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
             thresholds = [row.calibration.thresholds]

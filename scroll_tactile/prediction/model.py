@@ -323,11 +323,7 @@ class Model:
         return sorted({scale for stage, _ in decided for scale in self.stages[stage]}.union(views))
 
     def judge(
-        self,
-        candidates: Sequence[str],
-        means: Mapping[Scale, FloatArray],
-        steps: int,
-        hypothesis: Hypothesis,
+        self, candidates: Sequence[str], means: Mapping[Scale, FloatArray], steps: int, hypothesis: Hypothesis
     ) -> Judgement:
         """Weigh the candidates for a touch by the readouts alone.
 

@@ -113,12 +113,14 @@ class Predictor:
         """Of the memory in a folder. Raises as `TactileLearner.open`."""
         store, identity, recipe = open_memory(path, request, mode)
         try:
-            extractor = _extractor(
-                recipe, FingerprintCheck(identity, store.path) if request.embedding is None else None
-            )
-            bare = identity.embedding.bare
-            encode = partial(_codes_of, extractor) if bare or capabilities_of(recipe.embedding).exact else None
-            return cls(recipe, extractor, Ledger(partial(load, Memory(recipe, encode), store), store, bare))
+            check = FingerprintCheck(identity, store.path) if request.embedding is None else None
+            extractor, bare = _extractor(recipe, check), identity.embedding.bare
+
+            def encode(readings: npt.NDArray[np.float32]) -> Codes:
+                return extractor.learned(Stream(recipe.sensor, readings))[1]
+
+            encodes = encode if bare or capabilities_of(recipe.embedding).exact else None
+            return cls(recipe, extractor, Ledger(partial(load, Memory(recipe, encodes), store), store, bare))
         except BaseException:
             store.close()
             raise
@@ -153,11 +155,6 @@ class Predictor:
             if axis not in self._axes:
                 self._axes[axis] = Predictor(self.recipe, self.extractor, AxisLedger(self.ledger, axis))
             return self._axes[axis]
-
-    def replace(self) -> None:
-        """Note that the memory was embedded again, and another predictor has it."""
-        for predictor in (self, *self._axes.values()):
-            predictor.replaced = True
 
     def stream(self, readings: Readings) -> Stream:
         """The validated stream of some readings, read through the correction of the memory, if its skin changed.
@@ -409,7 +406,8 @@ def embed_again(
             ledger.saves = False  # nothing more is written to the old one, which a full disk could stop half-way
             predictor.close()
             before = carried.put_in_place()
-            predictor.replace()
+            for each in (predictor, *predictor._axes.values()):
+                each.replaced = True
             kept = {"exemplars": None, "kept_touches": None}  # those of the new one
             settings = predictor.recipe.settings.model_copy(update=kept)
             return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, settings))
@@ -432,11 +430,6 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
 
 def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:
     return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, check)
-
-
-def _codes_of(extractor: FeatureExtractor, readings: npt.NDArray[np.float32]) -> Codes:
-    """The rows of codes of a touch, from readings that the memory stored."""
-    return extractor.learned(Stream(extractor.sensor, readings))[1]
 
 
 def nothing_known(seconds: float) -> Prediction:

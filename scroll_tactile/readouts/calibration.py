@@ -45,7 +45,6 @@ MOST_STEPS = 100
 PRIOR_TOUCHES = 0.5  # the prior counts as so many touches
 COMMON_TOUCHES = 2.0  # the common weight counts as so many, as the prior of each scale's
 LEAST_COMMON = 1e-3  # of the prior
-SURER = 0.75
 CORRELATION = 0.25  # ρ and ρ' where nothing is measured: about that of prefixes of BioTac's touches
 PRIOR_PAIRS = 2.0  # the prior of ρ counts as so many
 
@@ -67,13 +66,6 @@ class Calibration:
     def weights_at(self, distances: FloatArray) -> FloatArray:
         """The weights of the scales for touches at some diagonal distances, both of shape (…, S)."""
         return np.asarray(self.weights * np.minimum(1.0, self.median_distances / np.maximum(distances, TINY)))
-
-    def with_all_touches(self, touches: float) -> Calibration:
-        """How touches to come are read: more surely than held-out ones, by means of one touch more.
-
-        touches: k, the median number of those materials that have two or more. The power was best on sixteen sets.
-        """
-        return replace(self, weights=self.weights * (touches / (touches - 1)) ** SURER) if touches > 1 else self
 
     def relative(self, distances: FloatArray) -> FloatArray:
         """Diagonal distances in units of the median of known touches, both of shape (…, S)."""

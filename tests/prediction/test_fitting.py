@@ -9,6 +9,7 @@ from scroll_tactile.clients.report.facts import _without
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.fitting import Draft, rehearse
 from scroll_tactile.prediction.judging import held_out_touches, judged
+from scroll_tactile.readouts.calibration import calibrate_stage
 from scroll_tactile.signals.levels import stream_of
 from scroll_tactile.simulation.scene import Scene
 from scroll_tactile.statistics.moments import one_thread
@@ -85,6 +86,14 @@ def test_a_touch_at_another_pace_is_known_and_right(learner, times):
     said = [(learner.predict(faster(touch.readings, times)), name) for name, touch in LATER]
     assert np.mean([now.material == name for now, name in said]) >= 0.9
     assert np.mean([now.known is not False for now, _ in said]) >= 0.85  # eight of each were held out
+
+
+def test_new_touches_are_scored_more_surely_than_held_out_ones_were(model):
+    """Each material has eight touches, and one that is held out seven others."""
+    row = model.fitted.complete
+    found, readouts = model.held_out.at(row.stage, row.scales), [model.readouts[scale] for scale in row.scales]
+    held_out = calibrate_stage(found, readouts, "lda", viewed=True).weights
+    np.testing.assert_allclose(row.calibration.weights, (8 / 7) ** 0.75 * held_out)
 
 
 def test_beginnings_are_right_sooner_than_later_and_no_surer_than_that(model):

@@ -88,13 +88,15 @@ def test_what_is_known_without_kept_touches_stays_known(matching, alone, kind):
     assert right(matching, HELD[kind]) >= max(0.9, right(alone, HELD[kind]) - 1 / len(ASKED))
 
 
-def test_noise_alone_and_what_was_never_touched_is_unknown(matching):
-    rng = np.random.default_rng(0)
-    alone = [matching.predict(rng.uniform(0, REACH, (80, CHANNELS))).known for _ in range(10)]
-    strange = [matching.predict(SCENE.touch(SCENE.materials[10], i)).known for i in range(10)]
-    usual = [matching.predict(values).known for _, values in ASKED]
-    assert sum(alone) == sum(strange) == 0
-    assert np.mean(usual) >= 0.9
+def test_what_was_never_touched_is_unknown_and_through_noise_nothing_is_known(matching):
+    rng, strange = np.random.default_rng(0), [SCENE.touch(SCENE.materials[10], i).readings for i in range(10)]
+    usual = [values for _, values in ASKED]
+    assert [matching.predict(values).known for values in strange] == [False] * 10
+    assert np.mean([matching.predict(values).known is True for values in usual]) >= 0.9
+    for values in (*(uniform(values, rng) for values in (*strange, *usual)), rng.uniform(0, REACH, (80, CHANNELS))):
+        said = matching.predict(values)
+        assert said.known is not True
+        assert "noisy" in said.unusual
 
 
 def test_a_touch_that_the_model_is_sure_of_is_its_alone(matching, alone):

@@ -346,13 +346,6 @@ def test_a_touch_is_known_where_hardly_any_new_one_is_as_near():
     assert told_of(NoveltyThresholds(), 4.9) is None
 
 
-@pytest.mark.parametrize("touches", [1.0, 2.0, 5.0, 1000.0])
-def test_new_touches_are_scored_more_surely_than_held_out_ones_were(touches):
-    found = Calibration(np.array([0.2, 0.0]), np.zeros((1, 2)), np.ones(2)).with_all_touches(touches)
-    times = 1.0 if touches == 1 else (touches / (touches - 1)) ** 0.75
-    np.testing.assert_allclose(found.weights, [0.2 * times, 0.0])
-
-
 @pytest.mark.parametrize("touches", [6, 60])
 def test_a_stage_with_neighbours_measures_novelty_by_both(touches):
     """But with distances alone where too few touches are held out to know how either spreads."""

@@ -9,14 +9,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from scroll_tactile.embeddings.protocol import (
-    Embedding,
-    capabilities_of,
-    embed_competing,
-    embed_windows,
-    require_features,
-    require_rest,
-)
+from scroll_tactile.embeddings import protocol
 from scroll_tactile.memory.identity import FingerprintCheck
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
@@ -89,11 +82,11 @@ class FeatureExtractor:
     """
 
     def __init__(
-        self, sensor: Sensor, embedding: Embedding, plan: WindowPlan, check: FingerprintCheck | None = None
+        self, sensor: Sensor, embedding: protocol.Embedding, plan: WindowPlan, check: FingerprintCheck | None = None
     ) -> None:
         self.sensor, self.embedding, self._plan, self.check = sensor, embedding, plan, check
-        require_rest(embedding, sensor)
-        self._rest: Rest = capabilities_of(embedding).rest
+        protocol.require_rest(embedding, sensor)
+        self._rest: Rest = protocol.capabilities_of(embedding).rest
 
     def verified(self) -> FeatureExtractor:
         """This extractor, whose embedding is the memory's. Raises EmbeddingMismatchError."""
@@ -196,13 +189,13 @@ class FeatureExtractor:
         if not self._plan.competes:
             embedded = self._embedded(image, every)
             return embedded, {WHOLE: embedded.pop(width)}
-        features, competing = embed_competing(self.embedding, image, every, width)
+        features, competing = protocol.embed_competing(self.embedding, image, every, width)
         embedded = self._sound(image, features, every)
         self._require(image, competing, (), "all, by competing kernels,")
         return embedded, {WHOLE: embedded.pop(width), COMPETING: competing[None]}
 
     def _embedded(self, image: Image, windows: Extent) -> Features:
-        return self._sound(image, embed_windows(self.embedding, image, windows), windows)
+        return self._sound(image, protocol.embed_windows(self.embedding, image, windows), windows)
 
     def _sound(self, image: Image, embedded: Features, windows: Extent) -> Features:
         """The features of windows. All features that are learned or judged by pass here, and are checked here."""
@@ -213,7 +206,7 @@ class FeatureExtractor:
     def _require(self, image: Image, features: npt.NDArray[np.floating], rows: tuple[int, ...], what: str) -> None:
         channels, steps = image.shape
         touch = f"{what} of a touch of {channels} × {steps}"
-        require_features(self.embedding, features, (*rows, self.embedding.dimension), touch)
+        protocol.require_features(self.embedding, features, (*rows, self.embedding.dimension), touch)
 
     def _within(self, stream: Stream, longest: int) -> Stream:
         """The part of a touch that lies within the longest one learned.

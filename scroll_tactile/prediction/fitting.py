@@ -1,9 +1,8 @@
 """Fitting a model to the present memory: its readouts are solved, then weighed by held-out touches.
 
 Each sampled touch is scored by readouts without it, and some kept touches are matched with the others: once each,
-complete and without noise. The calibrations (`readouts.calibration`), τ and the excess loss of known touches rest on
-these; those of prefixes on the same neighbours. A prediction fits nothing, and the model is a function of the set of
-touches.
+complete and without noise. The calibrations, τ and the excess loss of known touches rest on these; those of prefixes on
+the same neighbours. The model is a function of the set of touches.
 """
 
 from __future__ import annotations
@@ -22,18 +21,8 @@ from scroll_tactile.matching.matcher import Match, TouchMatcher, independent
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.persistence.open_memory import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor
-from scroll_tactile.prediction.model import (
-    WITHIN,
-    HeldOut,
-    Model,
-    Paces,
-    Row,
-    Trajectories,
-    Weighing,
-    softmax,
-    tempered,
-)
-from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, dependence_of, fit_weights
+from scroll_tactile.prediction.model import WITHIN, HeldOut, Model, Paces, Row, Trajectories, Weighing
+from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, dependence_of, fit_weights, softmax, tempered
 from scroll_tactile.readouts.leave_one_out import StageScores, held_out_scores
 from scroll_tactile.readouts.novelty import FEWEST
 from scroll_tactile.readouts.readout import ReadoutName
@@ -199,7 +188,9 @@ def _by_kept_touches(model: Model, matcher: TouchMatcher) -> Model:
     def weighed(row: Row, loss: FloatArray) -> Row:
         loss = loss[np.isfinite(loss)]
         row = replace(row, outliers=max(row.readout_outliers, PRIOR_OUTLIERS / (len(chosen) + 1)))
-        return row if len(loss) < FEWEST else replace(row, excess=_mean_and_spread(loss))
+        if len(loss) < FEWEST:
+            return row
+        return replace(row, excess=(float(loss.mean()), max(float(loss.std()), LEAST_SPREAD)))
 
     rows = [weighed(row, losses[:, i] if i < len(early) else whole) for i, row in enumerate(weighing.rows)]
     fitted = replace(
@@ -210,10 +201,6 @@ def _by_kept_touches(model: Model, matcher: TouchMatcher) -> Model:
         tau=_tau(matches, kept.labels[list(chosen)].tolist()),
     )
     return replace(model, weighing=fitted, matcher=_natural(matcher, matches))
-
-
-def _mean_and_spread(values: FloatArray) -> tuple[float, float]:
-    return float(values.mean()), max(float(values.std()), LEAST_SPREAD)
 
 
 def _tau(matches: Sequence[Match], targets: Sequence[int]) -> float:

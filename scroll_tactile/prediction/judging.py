@@ -13,8 +13,7 @@ the kept touches, c the information of these values and h = (1 − t) w:
 
     q_y ∝ exp(h log d_y + (b h + 1 − h) β S_y),    β = 1 / (1 + (1/τ − 1) c),    p_y = (1 − ε) q_y + ε / C.
 
-A log-likelihood counts by its share of a whole touch's information, so one τ serves all lengths, paces and noises. It
-is the only number fitted to kept touches; b is `BESIDE`.
+b is BESIDE. A log-likelihood counts by its share of a whole touch's information: one τ serves all lengths and noises.
 """
 
 from __future__ import annotations
@@ -31,7 +30,8 @@ from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.matcher import Match
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor
 from scroll_tactile.prediction.fitting import paces_of
-from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model, softmax, tempered
+from scroll_tactile.prediction.model import WITHIN, Hypothesis, Judgement, Model
+from scroll_tactile.readouts.calibration import softmax, tempered
 from scroll_tactile.readouts.estimation import Estimator
 from scroll_tactile.readouts.novelty import NoveltyThresholds
 from scroll_tactile.results import Estimate, Prediction, Unusual
@@ -43,8 +43,6 @@ from scroll_tactile.statistics.moments import one_thread
 __all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged"]
 
 FloatArray = npt.NDArray[np.float64]
-
-
 Matched = tuple[Hypothesis, Match, float]
 """A touch beside kept ones under a hypothesis, and its excess loss where no noise came over it."""
 
@@ -70,10 +68,7 @@ def answer(
     typicality is twice the mean of theirs, a bound that holds whatever the dependence between them (Vovk and Wang
     2020).
     """
-    own = [*touches]
-    if len(own) > 1:
-        once = {touch.stream.key: touch for touch in own}
-        own = [once[key] for key in sorted(once)]
+    own = [touch for _, touch in sorted({touch.stream.key: touch for touch in touches}.items())]
     with one_thread():
         judgements = [judged(model, extractor, candidates, touch) for touch in own]
         typical = _typicality(model, candidates, own)
@@ -122,7 +117,8 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         row = model.fitted.row("complete", len(model.fitted.rows) - 1)
         chances = softmax(np.array([logits[name] for name in candidates]))
         return Judgement(chances, model.novelty(row, encoded.means, candidates), row)
-    weighing, own = model.fitted, _own_hypothesis(model, encoded)
+    weighing = model.fitted
+    own: Hypothesis = "complete" if encoded.steps >= weighing.least else "prefix"
     alone = model.judge(candidates, encoded.means, encoded.steps, own)
     length, matcher = len(encoded.stream), model.matcher
     learned = weighing.least <= length <= model.longest
@@ -147,10 +143,6 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     probability = weights @ np.array([answer.probability for answer in answers])
     unusual = _unusual(model, encoded, best, likeliest)
     return replace(answers[int(weights.argmax())], probability=probability / probability.sum(), unusual=unusual)
-
-
-def _own_hypothesis(model: Model, encoded: Encoded) -> Hypothesis:
-    return "complete" if encoded.steps >= model.fitted.least else "prefix"
 
 
 def _matches(
@@ -206,7 +198,7 @@ def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     unusual = _unusual(model, encoded)
     if model.matcher is not None and alone.novelty > alone.row.calibration.thresholds.above("", 1 - WITHIN):
         match = model.matcher.match(_levels_of(encoded.stream), noise=None)
-        unusual = _unusual(model, encoded, match, _own_hypothesis(model, encoded))
+        unusual = _unusual(model, encoded, match)
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
 
 
@@ -249,8 +241,7 @@ def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: 
     if np.array_equal(levels_of(readings, stream.sensor), levels_of(stream.readings, stream.sensor)):
         return encoded
     readings.setflags(write=False)
-    scales = [*encoded.means]
-    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda steps: scales)
+    return extractor.encode(Stream(stream.sensor, readings), model.longest, lambda steps: [*encoded.means])
 
 
 class HeldOutTouch(NamedTuple):

@@ -1,8 +1,8 @@
 """The model: all that answers need of a memory. `prediction.fitting` fits it; its means follow each touch.
 
 What was fitted is a `Weighing`: how far readouts and kept touches are to be believed at each length of a touch. Models
-of later states of the memory share it: their class means, kept touches and materials are those of now, the scatter and
-the weighing those of the last fit. Nothing of a model changes, so any thread may use it as long as it likes.
+of later states share it: their class means, kept touches and materials are those of now, scatter and weighing those of
+the last fit. A model never changes, so any thread may use it as long as it likes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scroll_tactile.errors import CapacityError, ScrollTactileError
 from scroll_tactile.matching.matcher import Match, TouchMatcher
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.readouts.calibration import Calibration, Dependence
+from scroll_tactile.readouts.calibration import Calibration, Dependence, softmax
 from scroll_tactile.readouts.leave_one_out import HeldOutScores, StageScores, held_out_scores
 from scroll_tactile.readouts.novelty import TINY, Neighbours, novelty_measures
 from scroll_tactile.readouts.readout import Readout, ReadoutName
@@ -29,20 +29,7 @@ from scroll_tactile.signals.windows import Scale, WindowPlan, measuring
 from scroll_tactile.statistics.moments import one_thread
 from scroll_tactile.statistics.sample import SampledTouch
 
-__all__ = [
-    "BESIDE",
-    "HeldOut",
-    "Hypothesis",
-    "Judgement",
-    "Model",
-    "Paces",
-    "Row",
-    "Trajectories",
-    "Weighing",
-    "enough_memory",
-    "softmax",
-    "tempered",
-]
+__all__ = ["HeldOut", "Hypothesis", "Judgement", "Model", "Paces", "Row", "Trajectories", "Weighing", "enough_memory"]
 
 FloatArray = npt.NDArray[np.float64]
 Hypothesis = Literal["prefix", "complete", "paced"]
@@ -138,8 +125,8 @@ class Weighing:
 
     rows: by stage, as far as any touch reached them. complete, paced: of complete touches, in their own time and at
     another pace. tau: τ, the weight of kept touches' log-likelihoods by themselves, at an information of 1. dependence:
-    of touches of one thing. least: the 5th percentile of the lengths of touches, in steps. touches: that it was fitted
-    to. paces: measured when they are first asked for, see `fitting.paces_of`.
+    of touches of one thing. least: the 5th percentile of lengths, in steps. touches: that it was fitted to. paces: see
+    `fitting.paces_of`.
     """
 
     rows: tuple[Row, ...]
@@ -281,10 +268,6 @@ class Model:
         """The materials, as a set."""
         return frozenset(self.names)
 
-    @cached_property
-    def _sampled_are_known(self) -> bool:
-        return {material for material, *_ in self.held_out.sample} <= self.known
-
     def followed(self, memory: Memory, changed: Collection[str]) -> Model | None:
         """The model of the memory as it is now, some materials of which have changed; None where one must be fitted.
 
@@ -380,7 +363,8 @@ class Model:
 
     def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch judged by a row, among these materials."""
-        among = None if len(names) == len(self.names) and self._sampled_are_known else set(names)
+        everyone = len(names) == len(self.names) and {material for material, *_ in self.held_out.sample} <= self.known
+        among = None if everyone else set(names)
         windows = (scale for scale in row.scales if scale.width)
         local = [own.novelty(means[scale], among) for own, scale in zip(self._near(row), windows, strict=False)]
         return float(row.calibration.novelty(np.array([*self.distances(row.scales, means, names), *local])))
@@ -398,14 +382,3 @@ class Model:
         """The relative Mahalanobis distance at each scale that measures novelty, (S',)."""
         novel = [scales[place] for place in measuring(scales)]
         return np.array([self.readouts[scale].novelty(means[scale], self._places(scale, names)) for scale in novel])
-
-
-def tempered(chances: FloatArray, outliers: float) -> FloatArray:
-    """Probabilities (…, C) mixed with a uniform share, the rate of outliers."""
-    return np.asarray((1 - outliers) * chances + outliers / chances.shape[-1])
-
-
-def softmax(logits: FloatArray) -> FloatArray:
-    """Probabilities (…, C) of logits."""
-    chances = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    return np.asarray(chances / chances.sum(axis=-1, keepdims=True))

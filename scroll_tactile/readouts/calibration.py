@@ -33,7 +33,16 @@ from scroll_tactile.readouts.novelty import FEWEST, TINY, UNMEASURED, Neighbours
 from scroll_tactile.readouts.readout import Readout, ReadoutName
 from scroll_tactile.signals.windows import Scale, measuring
 
-__all__ = ["AHEAD", "Calibration", "Dependence", "calibrate_stage", "dependence_of", "fit_weights", "scale_weights"]
+__all__ = [
+    "AHEAD",
+    "Calibration",
+    "Dependence",
+    "calibrate_stage",
+    "dependence_of",
+    "fit_weights",
+    "softmax",
+    "tempered",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -207,8 +216,7 @@ class Dependence:
         # math.fsum is exact before it rounds: any order of the touches gives the same bits.
         logs = np.log(np.maximum(np.array(chances), TINY))
         logits = np.array([math.fsum(column) for column in logs.T]) / (1 + (len(logs) - 1) * self.log_probability)
-        together = np.exp(logits - logits.max())
-        return np.asarray(together / together.sum())
+        return softmax(logits)
 
     def standard(self, novelties: Sequence[float]) -> float:
         """The novelty of all together, in standard deviations of that of known materials' touches."""
@@ -243,3 +251,14 @@ def _intraclass(groups: Sequence[FloatArray]) -> float:
     size = (len(values) - float(np.square(counts).sum()) / len(values)) / others
     share = (between - within) / max(between + (size - 1) * within, TINY)
     return float(np.clip(share, 0.0, 1.0))
+
+
+def tempered(chances: FloatArray, outliers: float) -> FloatArray:
+    """Probabilities (…, C) mixed with a uniform share, the rate of outliers."""
+    return np.asarray((1 - outliers) * chances + outliers / chances.shape[-1])
+
+
+def softmax(logits: FloatArray) -> FloatArray:
+    """Probabilities (…, C) of logits."""
+    chances = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return np.asarray(chances / chances.sum(axis=-1, keepdims=True))

@@ -297,8 +297,7 @@ def growing(
 
 def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
     """The model as if it had never observed a touch, nor kept it, but for how it is weighed."""
-    own = touch.material, touch.key
-    sampled = next(item for *which, item in model.held_out.sample if tuple(which) == own)
+    sampled = next(each[2] for each in model.held_out.sample if each[:2] == touch[:2])
     statistics, codes = deepcopy(memory.statistics), {}
     for scale in model.readouts:
         if rows := rows_at(sampled, model.held_out.stages, scale):
@@ -310,7 +309,7 @@ def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
     for scale in codes:
         readouts[scale] = Task.of(statistics, scale, readouts[scale].reference, model.plan.shrinkage).solve()
     if matcher is not None and memory.kept is not None:
-        kept = [each for each in memory.kept.touches() if (each.material, each.key) != own]
+        kept = [each for each in memory.kept.touches() if (each.material, each.key) != touch[:2]]
         matcher = matcher.followed(kept) if kept else None
     return replace(model, readouts=readouts, matcher=matcher)
 

@@ -64,8 +64,9 @@ class _Parts(NamedTuple):
     @classmethod
     def of(cls, levels: LevelArray, fine: Rows, wide: Rows, early: Rows) -> _Parts:
         """Those of touches of one length, (touches, C, T): together they take a third of the time of one by one."""
-        columns = levels.shape[2]
-        blocks = _coded(levels, fine), _coded(levels, wide), _coded(levels, wide * columns // wide[-1])
+        columns, coarse = levels.shape[2], _coded(levels, wide)
+        relative = coarse if columns == wide[-1] else _coded(levels, wide * columns // wide[-1])
+        blocks = _coded(levels, fine), coarse, relative
         return cls(*blocks, *log_steps(levels, early), np.full(len(levels), columns), first_changes(levels))
 
 

@@ -167,7 +167,7 @@ OTHERS = [
     *({"made_by": value} for value in (1, None, "another")),
     {"kind": "ridge"},
     *({"weighing": value} for value in (None, [], {}, 3, "x")),
-    *({"kept": value} for value in (None, [], {}, 1)),
+    *({"deviation": value} for value in (None, [], {}, 1)),
 ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel
 from scroll_tactile_store import Checkpoint, Head, Record, Store
@@ -32,12 +32,8 @@ from scroll_tactile.persistence.contents import ListedContents, Rows, StoredCont
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import apply_description, replay
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.validation.gate import (
-    MemoryStore,
-    quantities_of,
-    wrong_retractions,
-    wrong_values,
-)
+from scroll_tactile.validation.expected import quantities_of
+from scroll_tactile.validation.gate import MemoryStore, wrong_retractions, wrong_values
 
 __all__ = ["Choice", "MergePlan", "MergeRules"]
 
@@ -196,7 +192,7 @@ def _quantities(
     ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, heads: Sequence[Head]
 ) -> list[Quantity]:
     """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
-    declared = quantities_of(compaction)
+    declared = quantities_of({} if compaction is None else compaction.attributes)
     for wrong in wrong_values(theirs.path, (head for head in heads if head.sequence > theirs.compacted), declared):
         raise wrong
     both = dict(memory.quantities)
@@ -264,7 +260,8 @@ def _descriptions(
     ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
     """Their descriptions that are taken over."""
-    theirs_now = dict(cast(dict[str, Description], {} if compaction is None else compaction.attributes["descriptions"]))
+    told: Mapping[str, Any] = {} if compaction is None else compaction.attributes
+    theirs_now: dict[str, Description] = dict(told.get("descriptions", {}))
     for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
         apply_description(theirs_now, head)
     ours_now = memory.descriptions

@@ -317,7 +317,8 @@ class Expected:
             self._check_statistics(axis_arrays(arrays, number), len(labels), shared=True)
         for which in ANNOTATED:
             noted = told.get(which, [])
-            expect(len(noted) in (0, len(told[which.partition("-")[0]])), which, "one of each touch", noted)
+            if noted:
+                expect(len(noted) == len(told[which.partition("-")[0]]), which, "one of each touch", noted)
             for attributes in noted:
                 values, labels = _check_annotation(attributes)
                 known = all(name in quantities and steps <= quantities[name].steps for name, steps in values.items())

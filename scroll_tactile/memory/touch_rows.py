@@ -18,6 +18,7 @@ from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
 __all__ = [
     "ADAPT",
     "CHANNELS",
+    "CODES",
     "CORRECTION",
     "DECLARE",
     "DESCRIBE",
@@ -27,6 +28,7 @@ __all__ = [
     "MERGE",
     "MOST_BYTES",
     "OBSERVE",
+    "PACKED_SHAPE",
     "RETRACT",
     "RETRACTS",
     "SENSE",

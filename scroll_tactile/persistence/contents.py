@@ -10,12 +10,13 @@ import logging
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import takewhile
 
-from scroll_tactile_store import DamageError, Head, Store
+from scroll_tactile_store import Head, Store
 
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, annotation_of
 from scroll_tactile.signals.ranges import CURE
 from scroll_tactile.statistics.annotations import Annotation
+from scroll_tactile.validation.gate import sound_rows
 
 __all__ = ["ListedContents", "Rows", "StoredContents", "refusal"]
 
@@ -80,7 +81,7 @@ class StoredContents:
 
     def copy(self) -> ListedContents:
         """A copy in memory that changes independently, without damaged rows."""
-        heads = self._active(_sound(self._store))
+        heads = self._active(sound_rows(self._store.heads, logger.warning))
         return ListedContents((head.label, head.key, head.sequence, annotation_of(head.attributes)) for head in heads)
 
     def rows(self, key: bytes) -> Rows:
@@ -89,19 +90,3 @@ class StoredContents:
         for head in self._active(self._store.with_key(key)):
             found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
         return found
-
-
-def _sound(store: Store) -> Iterator[Head]:
-    """The heads of a journal, without the damaged ones, whose content nobody knows."""
-    after = 0
-    while True:
-        try:
-            for head in store.heads(after):
-                yield head
-                after = head.sequence
-            return
-        except DamageError as damage:
-            logger.warning("%s", damage)
-            if damage.sequence is None or damage.sequence <= after:
-                return
-            after = damage.sequence

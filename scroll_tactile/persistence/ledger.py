@@ -5,16 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from scroll_tactile_store import Head, Record, Store
 
-from scroll_tactile.errors import AnnotationError, FineTuneError, InputError, ObservationError
+from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.memory.axes import axis_memory
-from scroll_tactile.memory.descriptions import Description, describe, require_units
+from scroll_tactile.memory.descriptions import Description, require_units
 from scroll_tactile.memory.exemplars import Exemplar
-from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
+from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
     CHANNELS,
@@ -47,11 +48,10 @@ from scroll_tactile.persistence.observations import (
 )
 from scroll_tactile.persistence.open_memory import OpenMemory, give_back_scratch
 from scroll_tactile.persistence.replaying import (
-    apply_correction,
-    apply_description,
+    append_row,
+    apply_note,
     exemplar_candidates,
     refill,
-    replay,
     until,
 )
 from scroll_tactile.quantities import Quantity, require_declarable
@@ -161,9 +161,20 @@ class Ledger(OpenMemory):
         if (numbers := channel_numbers(stream)) is not None:
             attributes[CHANNELS] = to_text(numbers)
         arrays = packed if self._bare else packed | pack_codes(codes)
-        head = self.store.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays)
-        replay(memory, Record(**vars(head), arrays=arrays), self.store, codes)
-        return head.sequence
+        return append_row(
+            memory, self.store, OBSERVE, material, stream.key, attributes=attributes, arrays=arrays, codes=codes
+        )[0]
+
+    def _note(self, kind: str, label: str, attributes: dict[str, Any]) -> int:
+        """Append a row that has no arrays, and apply it; without a journal that is one change of a mapping."""
+        memory, store = self.memory, self.store
+        if store is None:
+            apply_note(memory, Head(memory.sequence, kind, label, b"", 0.0, attributes, 0), Path())
+            return memory.sequence
+        with self._mutation(_nothing):
+            sequence, _ = append_row(memory, store, kind, label, attributes=attributes)
+        self._checkpoint_if_due()
+        return sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
         """As `TactileLearner.describe`, for a description that was checked."""
@@ -173,37 +184,15 @@ class Ledger(OpenMemory):
             if repr(memory.descriptions.get(material)) == repr(constituents):  # 1.0 == True, but means another thing
                 return
             require_units(memory.descriptions, material, constituents or {})
-            before = dict(memory.descriptions)
-
-            def undo() -> None:
-                memory.descriptions = before
-
-            with self._mutation(_nothing, undo if self.store is None else None):
-                if self.store is not None:
-                    attributes = {"constituents": constituents}
-                    memory.sequence = self.store.append(DESCRIBE, material, b"", attributes=attributes).sequence
-                describe(memory.descriptions, material, constituents)
-                self.described += 1
-            self._checkpoint_if_due()
+            self.described += 1
+            self._note(DESCRIBE, material, {"constituents": constituents})
 
     def declare(self, quantity: Quantity) -> None:
         """As `TactileLearner.declare`."""
         with self.lock:
             self.require_open()
-            memory = self.memory
-            if not require_declarable(memory.quantities, quantity):
-                return
-            before = dict(memory.quantities)
-
-            def undo() -> None:
-                memory.quantities = before
-
-            with self._mutation(_nothing, undo if self.store is None else None):
-                if self.store is not None:
-                    head = self.store.append(DECLARE, quantity.name, b"", attributes=declaration(quantity))
-                    memory.sequence = head.sequence
-                memory.quantities[quantity.name] = quantity
-            self._checkpoint_if_due()
+            if require_declarable(self.memory.quantities, quantity):
+                self._note(DECLARE, quantity.name, declaration(quantity))
 
     def sense(self, material: str, stream: Stream) -> None:
         """As `TactileLearner.sense`; material "" for the sensor at rest."""
@@ -214,11 +203,8 @@ class Ledger(OpenMemory):
                 f"came {len(stream)} readings of {stream.sensor.name!r}"
             )
         with self.lock:
-            store, memory = self.require_store("tell how its sensor is"), self.memory
-            with self._mutation(_nothing):
-                attributes: dict[str, Any] = {"columns": len(stream), CHANNELS: to_text(numbers)}
-                memory.sequence = store.append(SENSE, material, b"", attributes=attributes).sequence
-            self._checkpoint_if_due()
+            self.require_store("tell how its sensor is")
+            self._note(SENSE, material, {"columns": len(stream), CHANNELS: to_text(numbers)})
 
     @property
     def correction(self) -> Correction | None:
@@ -233,35 +219,17 @@ class Ledger(OpenMemory):
         """
         text = correction.to_text()
         with self.lock:
-            store, memory = self.require_store("be adapted"), self.memory
-            Correction.from_text(text, memory.recipe.sensor)  # what replay would refuse must not come into the journal
-            with self._mutation(_nothing):
-                head = store.append(ADAPT, "", b"", attributes={CORRECTION: text})
-                apply_correction(memory, head)
-                memory.sequence = head.sequence
-            self._checkpoint_if_due()
-            return head.sequence
-
-    def _take_back(self, store: Store, adaptation: Head) -> None:
-        """Have an adaptation count no more; the one before it does again, if there is one."""
-        memory, sequence = self.memory, adaptation.sequence
-        if sequence not in memory.corrections:
-            raise ObservationError(
-                f"row {sequence} of {store.path} is no adaptation that counts: it was retracted already, or "
-                f"{MOST_CORRECTIONS} came after it"
-            )
-        with self._mutation(_nothing):
-            head = store.append(ADAPT, "", b"", attributes={RETRACTS: sequence})
-            apply_correction(memory, head)
-            memory.sequence = head.sequence
-        self._checkpoint_if_due()
+            self.require_store("be adapted")
+            # What replay would refuse must not come into the journal.
+            Correction.from_text(text, self.memory.recipe.sensor)
+            return self._note(ADAPT, "", {CORRECTION: text})
 
     def retract(self, receipt: Receipt | Adaptation | int) -> None:
         """As `TactileLearner.retract`."""
         with self.lock:
             store = self.require_store("retract anything")
-            if (adaptation := adaptation_of(store, receipt)) is not None:
-                self._take_back(store, adaptation)
+            if (adaptation := adaptation_of(store, self.memory, receipt)) is not None:
+                self._note(ADAPT, "", {RETRACTS: adaptation})  # the one before it counts again, if there is one
                 return
             assert not isinstance(receipt, Adaptation)
             self._retract(store, [observation_of(store, self.memory, receipt)], "")
@@ -294,7 +262,7 @@ class Ledger(OpenMemory):
             refill(memory, store)
             head = store.append(RETRACT, material, b"", attributes={"sequences": sequences})
             memory.sequence = head.sequence
-            apply_description(memory.descriptions, head)
+            apply_note(memory, head, store.path)
             self._changed(retracted)
         self._checkpoint_if_due()
 
@@ -315,11 +283,11 @@ class Ledger(OpenMemory):
                 removed = memory.retract(record)
                 refill(memory, store)
                 store.append(RETRACT, "", b"", attributes={"sequences": spans([record.sequence])})
-                attributes, arrays, time = record.attributes, dict(record.arrays), record.time
-                head = store.append(OBSERVE, material, record.key, attributes=attributes, arrays=arrays, time=time)
-                self._changed([removed, *(replay(memory, Record(**vars(head), arrays=arrays), store) or ())])
+                kept: Any = {"attributes": record.attributes, "arrays": record.arrays, "time": record.time}
+                sequence, added = append_row(memory, store, OBSERVE, material, record.key, **kept)
+                self._changed([removed, *(added or ())])
             self._checkpoint_if_due()
-            return head.sequence
+            return sequence
 
     def _require_no_batch(self, what: str) -> None:
         if self._batching:

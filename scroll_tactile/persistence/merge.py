@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel
-from scroll_tactile_store import Checkpoint, Head, Record, Store
+from scroll_tactile_store import Checkpoint, Head, Store
 from scroll_tactile_store.files import same_folder
 
 from scroll_tactile.errors import AnnotationError, DescriptionError, MismatchError, ObservationError
-from scroll_tactile.memory.descriptions import Description, require_units
+from scroll_tactile.memory.descriptions import Description, describe, require_units
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -22,6 +22,7 @@ from scroll_tactile.memory.touch_rows import (
     MEMBER,
     MERGE,
     OBSERVE,
+    RETRACT,
     SOURCE,
     VALUES,
     active_rows,
@@ -30,14 +31,10 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.persistence.contents import ListedContents, Rows, StoredContents, refusal
 from scroll_tactile.persistence.packing import sums_without
-from scroll_tactile.persistence.replaying import apply_description, replay
+from scroll_tactile.persistence.replaying import append_row
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.validation.gate import (
-    MemoryStore,
-    quantities_of,
-    wrong_retractions,
-    wrong_values,
-)
+from scroll_tactile.validation.expected import quantities_of
+from scroll_tactile.validation.gate import MemoryStore, wrong_retractions, wrong_values
 
 __all__ = ["Choice", "MergePlan", "MergeRules"]
 
@@ -142,19 +139,18 @@ class MergePlan:
         )
         total = len(self.rows) - part
         for quantity in self.quantities:
-            head = ours.append(DECLARE, quantity.name, b"", attributes=declaration(quantity))
-            replay(memory, Record(**vars(head), arrays={}), ours)
+            append_row(memory, ours, DECLARE, quantity.name, attributes=declaration(quantity))
         for material, description in self.descriptions.items():
-            head = ours.append(DESCRIBE, material, b"", attributes={"constituents": description})
-            replay(memory, Record(**vars(head), arrays={}), ours)
+            append_row(memory, ours, DESCRIBE, material, attributes={"constituents": description})
         sums = self._sums(memory)
         for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(compaction), start=1):
-            head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
-            if kind != MEMBER and sums is None:
-                replay(memory, Record(**vars(head), arrays=arrays), ours)
-            elif memory.exemplars is not None and "nbytes" in attributes:
-                memory.exemplars.add(label, key, head.sequence)
-            memory.sequence = head.sequence
+            if sums is None:
+                append_row(memory, ours, kind, label, key, attributes=attributes, arrays=arrays, time=time)
+            else:
+                head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
+                if memory.exemplars is not None and "nbytes" in attributes:
+                    memory.exemplars.add(label, key, head.sequence)
+                memory.sequence = head.sequence
             progress(done, total)
         if sums is not None:
             memory.join(sums, exemplars=False)
@@ -196,7 +192,7 @@ def _quantities(
     ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, heads: Sequence[Head]
 ) -> list[Quantity]:
     """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
-    declared = quantities_of(compaction)
+    declared = quantities_of({} if compaction is None else compaction.attributes)
     for wrong in wrong_values(theirs.path, (head for head in heads if head.sequence > theirs.compacted), declared):
         raise wrong
     both = dict(memory.quantities)
@@ -264,9 +260,11 @@ def _descriptions(
     ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
 ) -> dict[str, Description]:
     """Their descriptions that are taken over."""
-    theirs_now = dict(cast(dict[str, Description], {} if compaction is None else compaction.attributes["descriptions"]))
+    told: Mapping[str, Any] = {} if compaction is None else compaction.attributes
+    theirs_now: dict[str, Description] = dict(told.get("descriptions", {}))
     for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
-        apply_description(theirs_now, head)
+        if head.kind in (DESCRIBE, RETRACT):
+            describe(theirs_now, head.label, head.attributes.get("constituents"))
     ours_now = memory.descriptions
     new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}
     differing = [name for name in new if name in ours_now]

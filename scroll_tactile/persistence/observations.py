@@ -7,7 +7,7 @@ from typing import Literal, cast
 from scroll_tactile_store import Head, Record, Store
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
-from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
     DECLARE,
@@ -59,10 +59,10 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
     return record
 
 
-def adaptation_of(store: Store, receipt: Receipt | Adaptation | int) -> Head | None:
-    """The row of an adaptation; None where the receipt is of anything else.
+def adaptation_of(store: Store, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
+    """The row of an adaptation that counts; None where the receipt is of anything else.
 
-    Raises ObservationError for an adaptation that was not kept, and for one of another memory.
+    Raises ObservationError for an adaptation that was not kept, counts no more, or is one of another memory.
     """
     if isinstance(receipt, Adaptation) and receipt.sequence is None:
         raise ObservationError("this adaptation was not kept: there is nothing to retract")
@@ -70,11 +70,16 @@ def adaptation_of(store: Store, receipt: Receipt | Adaptation | int) -> Head | N
     if isinstance(sequence, bool) or not isinstance(sequence, int):
         return None  # a receipt of an observation, or nothing at all: `observation_of` says what was expected
     head = next(store.heads(sequence - 1), None) if 1 <= sequence <= store.last else None
-    if head is not None and head.sequence == sequence and head.kind == ADAPT and RETRACTS not in head.attributes:
-        return head
-    if isinstance(receipt, Adaptation):
-        raise ObservationError(f"row {sequence} of {store.path} is no adaptation: it is one of another memory")
-    return None
+    if head is None or head.sequence != sequence or head.kind != ADAPT or RETRACTS in head.attributes:
+        if isinstance(receipt, Adaptation):
+            raise ObservationError(f"row {sequence} of {store.path} is no adaptation: it is one of another memory")
+        return None
+    if sequence not in memory.corrections:
+        raise ObservationError(
+            f"row {sequence} of {store.path} is no adaptation that counts: it was retracted already, or "
+            f"{MOST_CORRECTIONS} came after it"
+        )
+    return sequence
 
 
 def observations_of(store: Store, memory: Memory, material: str) -> list[int]:

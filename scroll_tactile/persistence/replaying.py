@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from scroll_tactile_store import CompactedError, DamageError, Head, Record, Store
 
 from scroll_tactile.errors import UnknownMaterialError
-from scroll_tactile.memory.descriptions import Description, describe
+from scroll_tactile.memory.descriptions import describe
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
 from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from scroll_tactile.memory.touch_rows import (
@@ -26,6 +27,7 @@ from scroll_tactile.memory.touch_rows import (
     RETRACT,
     RETRACTS,
     SENSE,
+    Arrays,
     Changed,
     Codes,
     active_rows,
@@ -35,17 +37,15 @@ from scroll_tactile.memory.touch_rows import (
     unpack_readings,
     unspanned,
 )
-from scroll_tactile.quantities import Quantity
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
 from scroll_tactile.validation.gate import misdeclared, wrong_values
 
 __all__ = [
+    "append_row",
     "apply_appended",
-    "apply_correction",
-    "apply_declaration",
-    "apply_description",
+    "apply_note",
     "exemplar_candidates",
     "load",
     "ranked_exemplars",
@@ -100,7 +100,7 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
     CapacityError before anything is added.
     """
     changed: list[Changed] | None = []
-    apply_declaration(memory.quantities, record, store)
+    apply_note(memory, record, store.path)
     if record.kind == OBSERVE:
         steps = cast(int, record.attributes["columns"])
         codes = memory.codes(record)[1] if codes is None else codes
@@ -126,10 +126,25 @@ def replay(memory: Memory, record: Record, store: Store, codes: Codes | None = N
         changed = None
     else:
         assert record.kind in (MEMBER, DESCRIBE, DECLARE, SENSE, ADAPT), "the gate lets no other row through"
-    apply_description(memory.descriptions, record)
-    apply_correction(memory, record)
     memory.sequence = record.sequence
     return changed
+
+
+def append_row(
+    memory: Memory,
+    store: Store,
+    kind: str,
+    label: str,
+    key: bytes = b"",
+    *,
+    attributes: Mapping[str, Any],
+    arrays: Arrays | None = None,
+    time: float | None = None,
+    codes: Codes | None = None,
+) -> tuple[int, list[Changed] | None]:
+    """Append a row to the journal, then apply it; return its number, and what `replay` returns."""
+    head = store.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
+    return head.sequence, replay(memory, Record(**vars(head), arrays=arrays or {}), store, codes)
 
 
 def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> Changed:
@@ -157,24 +172,19 @@ def _join(memory: Memory, record: Record, store: Store) -> None:
     memory.join(other, exemplars="exemplar-readings" in record.arrays)
 
 
-def apply_description(descriptions: dict[str, Description], row: Head | Record) -> None:
-    """Apply a journal row to descriptions; a forgotten material loses its description."""
+def apply_note(memory: Memory, row: Head, path: Path) -> None:
+    """Apply what a row of the journal at a path says of quantities, descriptions and the skin, if anything.
+
+    A forgotten material loses its description. Raises DamageError for a value or a quantity that cannot be.
+    """
+    for wrong in wrong_values(path, [row], memory.quantities):
+        raise wrong
     if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
-        describe(descriptions, row.label, row.attributes.get("constituents"))
-
-
-def apply_correction(memory: Memory, row: Head | Record) -> None:
-    """Apply a journal row to the corrections of a changed skin."""
-    if row.kind == ADAPT and RETRACTS in row.attributes:
+        describe(memory.descriptions, row.label, row.attributes.get("constituents"))
+    elif row.kind == ADAPT and RETRACTS in row.attributes:
         memory.corrections.pop(cast(int, row.attributes[RETRACTS]), None)
     elif row.kind == ADAPT:
         memory.correct(row.sequence, Correction.from_text(row.attributes[CORRECTION], memory.recipe.sensor))
-
-
-def apply_declaration(quantities: dict[str, Quantity], row: Head, store: Store) -> None:
-    """Apply a journal row to the declared quantities. Raises DamageError for a value or a quantity that cannot be."""
-    for wrong in wrong_values(store.path, [row], quantities):
-        raise wrong
 
 
 def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> list[Changed] | None:
@@ -203,22 +213,18 @@ def until(memory: Memory, store: Store, last_sequence: int) -> Memory:
     """The memory of all observations up to a row, without retracted ones: a compaction at that row keeps it."""
     made, later = _chosen(memory, store, last_sequence), memory.empty_like()
     later.quantities = dict(memory.quantities)
-    for head in store.heads(memory.compacted):  # whoever compacts has read all
-        if head.sequence <= last_sequence:
-            apply_description(made.descriptions, head)
-            apply_correction(made, head)
-            apply_declaration(made.quantities, head, store)
-        elif head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
+    for head in store.heads(last_sequence):  # whoever compacts has read all
+        if head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             replay(later, store.record(head.sequence), store)
     made.take_sums(memory, later, last_sequence)
     return made
 
 
 def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
-    """A memory with the sample and the exemplars of the observations up to a row that are not retracted."""
+    """A memory with what was chosen and noted up to a row, without the retracted observations."""
     fresh, heads = _compaction_samples(memory, store), _behind_compaction(memory, store, last_sequence)
     for head in heads:
-        apply_declaration(fresh.quantities, head, store)
+        apply_note(fresh, head, store.path)
         if head.kind == MERGE:
             _join(fresh, store.record(head.sequence), store)
     observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]

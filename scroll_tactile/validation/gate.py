@@ -1,7 +1,7 @@
 """The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
-gate takes every row and checkpoint for what it must be (see `expected`, `checkpoint_checks`), and raises DamageError
+gate takes every row and checkpoint for what it must be (see `expected`), and raises DamageError
 with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
 under another name is, and it fits.
 """
@@ -11,8 +11,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import replace
 from functools import partial
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -30,7 +31,6 @@ from scroll_tactile.memory.touch_rows import (
     ADAPT,
     DECLARE,
     MEMBER,
-    MERGE,
     OBSERVE,
     RETRACT,
     RETRACTS,
@@ -41,8 +41,7 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.signals.windows import WindowPlan
-from scroll_tactile.validation.checkpoint_checks import CheckpointChecks
-from scroll_tactile.validation.expected import RowChecks, Unexpected
+from scroll_tactile.validation.expected import Expected, Unexpected, quantities_of
 
 __all__ = [
     "WRONG",
@@ -53,7 +52,7 @@ __all__ = [
     "finish_interrupted",
     "misdeclared",
     "open_memory",
-    "quantities_of",
+    "sound_rows",
     "wrong_retractions",
     "wrong_values",
 ]
@@ -67,35 +66,28 @@ class Gate:
     """What rows and checkpoints in a folder must be, by the identity there, and the plan of windows it is read with."""
 
     def __init__(self, path: Path, identity: Identity, plan: WindowPlan) -> None:
-        self._path = path
-        made_with = identity.sensor, identity.embedding.dimension, plan
-        self._rows = RowChecks(*made_with)
-        self._checkpoints = CheckpointChecks(*made_with, keeps=bool(identity.kept_touches))
+        self._path, self._expected = path, Expected(identity, plan)
 
     def head(self, head: Head) -> Head:
         """This row, which is what its kind must be but for its arrays. Raises as `record`."""
         with self._refusing(f"row {head.sequence}", head.sequence):
-            self._rows.check_head(head, self._most_rows)
+            self._expected.head(head, self._most_rows)
         return head
 
     def record(self, record: Record) -> Record:
         """This row with its arrays. Raises DamageError; MismatchError for what this version does not know."""
         self.head(record)
         with self._refusing(f"row {record.sequence}", record.sequence):
-            if record.kind == OBSERVE:
-                self._rows.check_observed(record)
-            elif record.kind == MERGE:
-                self._checkpoints.check(record.arrays, record.attributes, None)
+            self._expected.record(record)
         return record
 
     def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
         """This checkpoint. Raises DamageError."""
-        with self._refusing(f"checkpoint {checkpoint.number}"):
-            arrays, attributes, last_sequence = checkpoint.arrays, checkpoint.attributes, checkpoint.last_sequence
-            every: dict[str, Any] = {**arrays, **checkpoint.late}
-            self._checkpoints.check(every, attributes, last_sequence)
+        what = f"checkpoint {checkpoint.number}"
+        with self._refusing(what):
+            self._expected.checkpoint(checkpoint)
         for late in checkpoint.late.values():
-            late.check = partial(self._late, f"checkpoint {checkpoint.number}", late.check)
+            late.check = partial(self._late, what, late.check)
         return checkpoint
 
     def _late(self, what: str, check: Callable[[npt.NDArray[Any]], None] | None, values: npt.NDArray[Any]) -> None:
@@ -117,7 +109,8 @@ class Gate:
 
     def _damage(self, what: str, error: Exception, sequence: int | None = None) -> DamageError:
         """The error for what is Unexpected and, as a last net, for what a check itself did not expect."""
-        came = str(error) if isinstance(error, Unexpected) else f"{type(error).__name__}: {error!s:.200}"
+        ours = isinstance(error, Unexpected | InputError)
+        came = str(error) if ours else f"{type(error).__name__}: {error!s:.200}"
         return DamageError(
             f"{what} of {self._path} is not what is written there: {came}. It is damaged, or was made by another "
             "program: use none of this memory before you know who made it (scroll-tactile memory check)",
@@ -237,47 +230,50 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
     """
     with MemoryStore.open(path, mode="read") as store:
         try:
-            identity = Identity.read(store)
-            plan = window_plan(identity.sensor, AbsentEmbedding(identity, store.path))
-            store.read_with(plan)
-            if identity.embedding.configuration is not None:
-                require_configuration(identity.embedding.configuration)
+            gate, configuration = store.gate, Identity.read(store).embedding.configuration
+            if configuration is not None:
+                require_configuration(configuration)
         except (DamageError, EmbeddingError, MismatchError) as error:
             return [str(error)]
-        heads, wrong = _in_rows(store)
-        passed = [head for head in heads if head.sequence not in wrong]
-        retractions = map(str, wrong_retractions(store.path, passed))
-        return [*_in_checkpoints(store), *wrong.values(), *retractions, *_in_values(store, passed)]
+        found, heads, compaction = list[str](), list[Head](), None
+        for read in (store.latest, store.compaction):
+            try:
+                compaction = read()
+            except DamageError as damage:
+                found.append(str(damage))
+        declared = None if found else quantities_of({} if compaction is None else compaction.attributes)
+        for row in sound_rows(partial(_rows, store), lambda damage: None):
+            try:
+                gate.record(row) if isinstance(row, Record) else gate.head(row)
+            except (DamageError, MismatchError) as error:
+                found.append(str(error))
+            else:
+                heads.append(replace(row, arrays={}) if isinstance(row, Record) else row)
+        later = (head for head in heads if head.sequence > store.compacted)
+        wrong = () if declared is None else wrong_values(store.path, later, declared)
+        return [*found, *map(str, wrong_retractions(store.path, heads)), *map(str, wrong)]
 
 
-def _in_checkpoints(store: MemoryStore) -> Iterator[str]:
-    for read in (store.latest, store.compaction):
+def _rows(store: MemoryStore, after: int) -> Iterator[Head]:
+    """The rows after one, with their arrays where they were not compacted; they do not pass the gate."""
+    compacted = takewhile(lambda head: head.sequence <= store.compacted, Store.heads(store, after))
+    return chain(compacted, Store.records(store, max(after, store.compacted)))
+
+
+def sound_rows(read: Callable[[int], Iterator[Head]], tell: Callable[[DamageError], object]) -> Iterator[Head]:
+    """The rows of a journal without the damaged ones. read: reads those after one. tell: is called with each damage."""
+    after = 0
+    while True:
         try:
-            read()
+            for row in read(after):
+                yield row
+                after = row.sequence
+            return
         except DamageError as damage:
-            yield str(damage)
-
-
-def _in_values(store: MemoryStore, heads: list[Head]) -> list[str]:
-    try:
-        quantities = quantities_of(store.compaction())
-    except DamageError:  # it is told of already, and what was declared is not known
-        return []
-    later = (head for head in heads if head.sequence > store.compacted)
-    return [str(wrong) for wrong in wrong_values(store.path, later, quantities)]
-
-
-def _in_rows(store: MemoryStore) -> tuple[list[Head], dict[int, str]]:
-    """The heads of the rows that verify, and by their sequence what is wrong with them."""
-    heads: list[Head] = []
-    wrong: dict[int, str] = {}
-    for row in _rows(store):
-        try:
-            store.gate.record(row) if isinstance(row, Record) else store.gate.head(row)
-        except (DamageError, MismatchError) as error:
-            wrong[row.sequence] = str(error)
-        heads.append(Head(**{field.name: getattr(row, field.name) for field in fields(Head)}))  # without arrays
-    return heads, wrong
+            tell(damage)
+            if damage.sequence is None or damage.sequence <= after:
+                return
+            after = damage.sequence
 
 
 def wrong_retractions(path: Path, heads: Sequence[Head]) -> Iterator[DamageError]:
@@ -323,27 +319,3 @@ def misdeclared(path: Path, row: Head, what: str) -> DamageError:
         path=path,
         sequence=row.sequence,
     )
-
-
-def quantities_of(compaction: Checkpoint | None) -> dict[str, Quantity]:
-    """The quantities that were declared up to a compaction checkpoint; none without one."""
-    declared = {} if compaction is None else cast("dict[str, Any]", compaction.attributes.get("quantities", {}))
-    return {name: Quantity(name=name, **fields) for name, fields in declared.items()}
-
-
-def _rows(store: MemoryStore) -> Iterator[Head]:
-    """The rows whose checksums hold, with their arrays where they were not compacted; they do not pass the gate."""
-    compacted, last, after = store.compacted, store.last, 0
-    while after < last:
-        try:
-            for row in Store.heads(store, after) if after < compacted else Store.records(store, after):
-                after = row.sequence
-                yield row
-                if after == compacted:
-                    break
-            else:
-                return
-        except DamageError as damage:
-            if damage.sequence is None or damage.sequence <= after:
-                return
-            after = damage.sequence

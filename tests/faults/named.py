@@ -140,7 +140,7 @@ FOLDERS: dict[str, Folder] = {
         for pipe in (False, True)
     },
     # Rows that a merge took in.
-    **{f"D4: {name}": row(**ROWS[name][1]) for name in ("out of range", "an escape for a name", "a short key")},
+    **{f"D4: {name}": row(**ROWS[name]) for name in ("out of range", "an escape for a name", "a short key")},
     # A `CURRENT` that verifies, and says what cannot be.
     "D5: a checkpoint of another number": lambda path: set_current(path, newest=newest_is(path, number=7)),
     "D5: no checkpoint": lambda path: set_current(path, newest=None),

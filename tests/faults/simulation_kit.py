@@ -66,7 +66,7 @@ def prepare() -> None:
     worked, known = FeatureExtractor.codes, dict[Any, Any]()
 
     def codes(self: FeatureExtractor, image: Any) -> Any:
-        about = getattr(self._embedding, "fingerprint", ""), image.shape, image.tobytes()
+        about = getattr(self.embedding, "fingerprint", ""), image.shape, image.tobytes()
         if about not in known:
             known[about] = worked(self, image)
         return known[about]

@@ -208,17 +208,25 @@ class TouchMatcher:
         if levels.ndim != 2 or len(levels) != kept.channels:
             raise InputError(f"expected levels of shape ({kept.channels}, T); came {levels.shape}")
         step = max(1, -(-levels.shape[1] // kept.longest)) if whole else 1
-        own = levels[:, ::step][:, : kept.longest].copy()
+        own = levels[:, ::step][:, : kept.longest]
         rows = np.delete(np.arange(len(kept)), [] if held_out is None else held_out)
         until = kept.columns[rows] if whole else np.minimum(own.shape[1], kept.columns[rows])
-        still = np.count_nonzero(kept.parts.first[rows] >= until[:, None], axis=0)
-        stuck = (first_changes(own) == own.shape[1]) & (RARELY * still < max(len(rows), 1))
-        own[stuck] = MISSING
-        counts = np.bincount(own.ravel(), minlength=LEVELS + 1)[:LEVELS]
-        values, shares = int(counts.sum()), counts[counts > 0] / max(counts.sum(), 1)
-        entropy = -float((shares * np.log(shares)).sum())
-        blocks = kept.blocks(own, whole)
-        return Query(own, levels.shape[1], step, whole, stuck, own != MISSING, values, entropy, blocks, rows)
+        rare = RARELY * np.count_nonzero(kept.parts.first[rows] >= until[:, None], axis=0) < max(len(rows), 1)
+        still = first_changes(own) == own.shape[1]
+
+        def without(stuck: Known) -> Query:
+            mine = np.where(stuck[:, None], np.uint8(MISSING), own)
+            counts = np.bincount(mine.ravel(), minlength=LEVELS + 1)[:LEVELS]
+            values, shares = int(counts.sum()), counts[counts > 0] / max(counts.sum(), 1)
+            entropy, seen = -float((shares * np.log(shares)).sum()), mine != MISSING
+            blocks = kept.blocks(mine, whole)
+            return Query(mine, levels.shape[1], step, whole, stuck, seen, values, entropy, blocks, rows)
+
+        found = without(still & rare)
+        if held_out is not None or not len(rows) or not (still & ~rare).any():
+            return found
+        # Channels that are often still are so here, too, or dead: as a value is the likelier.
+        return max(found, without(still), key=lambda each: self.beside(each, CLEAN).logs.max() / max(each.values, 1))
 
     def beside(self, query: Query, noise: Noise | None) -> Beside:
         """The touch beside the nearest kept ones under a noise; None: under the likeliest."""

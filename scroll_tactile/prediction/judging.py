@@ -119,7 +119,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         return Judgement(chances, model.novelty(row, encoded.means, candidates), row)
     weighing = model.fitted
     own: Hypothesis = "complete" if encoded.steps >= weighing.least else "prefix"
-    alone = model.judge(candidates, encoded.means, encoded.steps, own)
+    alone = _alone(model, extractor, candidates, encoded, own)
     length, matcher = len(encoded.stream), model.matcher
     learned = weighing.least <= length <= model.longest
     if matcher is None or (learned and alone.row.suffices(float(alone.probability.max()), alone.distance)):
@@ -137,12 +137,25 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         if hypothesis == "paced":
             judgement = _paced(model, extractor, candidates, filled.stream, clean)
         else:
-            judgement = alone if filled is encoded else model.judge(candidates, filled.means, encoded.steps, own)
+            judgement = alone if filled is encoded else _alone(model, extractor, candidates, filled, own)
         answers.append(_fused(model, candidates, judgement, hypothesis, match))
     weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
     unusual = _unusual(model, encoded, best, likeliest)
     return replace(answers[int(weights.argmax())], probability=probability / probability.sum(), unusual=unusual)
+
+
+def _alone(
+    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded, own: Hypothesis
+) -> Judgement:
+    """The judgement by the readouts. How new a beginning is, is told by its last milestone: sampled touches went on."""
+    found, (*earlier, last) = model.judge(candidates, encoded.means, encoded.steps, own), model.fitted.rows
+    if own == "complete" or found.row is not last or not earlier:
+        return found
+    means = extractor.means(encoded.image[:, : earlier[-1].steps], earlier[-1].scales)
+    calibration = replace(last.calibration, thresholds=earlier[-1].calibration.thresholds)
+    novelty = model.novelty(earlier[-1], means, candidates)
+    return replace(found, novelty=novelty, row=replace(last, calibration=calibration))
 
 
 def _matches(

@@ -267,3 +267,19 @@ def test_the_only_kept_touch_held_out_leaves_nothing_to_compare_with(noise, whol
     assert found.scores.tolist() == [0.0]
     assert np.isnan(found.expected).all()
     assert (found.noise_share, found.log_likelihood_gain, found.excess_loss, found.moved) == (0.0, 0.0, 0.0, False)
+
+
+def test_a_channel_that_is_often_still_is_quiet_or_dead_as_is_the_likelier():
+    """The touches of one material of five leave a channel still, and a dead one reads as it does there."""
+
+    def still(material, seed):
+        levels = touch(material, seed)
+        levels[0] = 0
+        return levels
+
+    known = [replace(one, levels=still(0, one.key[1])) if one.material == "m0" else one for one in kept()]
+    matcher = matcher_of(known)
+    for material in range(MATERIALS):
+        found = [matcher.match(still(material, seed)) for seed in range(50, 55)]
+        assert [int(match.scores.argmax()) for match in found] == [material] * 5
+        assert [bool(match.stuck[0]) for match in found] == [material != 0] * 5

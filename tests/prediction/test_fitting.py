@@ -196,3 +196,11 @@ def test_what_was_fitted_to_single_touches_takes_in_second_ones_after_opening(tm
     with TactileLearner.open(tmp_path) as writer:
         writer.observe(names[0], SCENE.touch(names[0], 1))
         assert writer.predict(SCENE.touch(names[0], 2)).material == names[0]
+
+
+@pytest.mark.parametrize("seconds", [0.62, 0.8, 1.0])
+def test_a_beginning_of_a_known_touch_is_known_wherever_it_ends(learner, seconds):
+    """Between the last milestone and the end of a touch no sampled touch ever ended."""
+    said = [learner.predict(touch.first(seconds)) for _, touch in LATER]
+    assert np.mean([one.known is not False for one in said]) >= 0.85
+    assert np.mean([one.material == name for one, (name, _) in zip(said, LATER, strict=True)]) >= 0.9

@@ -92,9 +92,9 @@ class Blocks:
 class KeptArrays:
     """Kept touches of one number of channels, in the order of their keys; lengths may differ.
 
-    touches: material and key of each → its row. longest: columns of the longest. materials: in alphabetical order;
-    labels: the place of each row's material among them. parts: what was made of each; columns: its length. early:
-    edges of the blocks of its steps. Nothing changes, and all is a function of the set of touches, to the bit.
+    touches: material and key of each → its row. levels: of each, (C, T). longest: columns of the longest. materials: in
+    alphabetical order; labels: the place of each row's material among them. parts: what was made of each; columns: its
+    length. early: edges of the blocks of its steps. All is a function of the set of touches, to the bit.
     """
 
     def __init__(self, touches: Iterable[KeptTouch], before: KeptArrays | None = None) -> None:
@@ -105,17 +105,17 @@ class KeptArrays:
         kept = sorted(touches, key=lambda touch: (touch.key, touch.material))
         if len({len(touch.levels) for touch in kept}) != 1:
             raise InputError("expected kept touches, one or more, all of the same number of channels")
-        names, self._levels = [(touch.material, touch.key) for touch in kept], [touch.levels for touch in kept]
+        names, self.levels = [(touch.material, touch.key) for touch in kept], [touch.levels for touch in kept]
         self.touches = {name: row for row, name in enumerate(names)}
-        lengths = [levels.shape[1] for levels in self._levels]
-        self.channels, self.longest = len(self._levels[0]), max(lengths)
+        lengths = [levels.shape[1] for levels in self.levels]
+        self.channels, self.longest = len(self.levels[0]), max(lengths)
         self._fine, self._wide, self.early = edges = _edges(self.longest, self.channels)
         made, parts = dict[tuple[str, bytes], int](), list[_Parts]()
         if before is not None and before.longest == self.longest:
             made, parts = dict(before.touches), [before.parts]
         new = sorted((row for row, name in enumerate(names) if name not in made), key=lengths.__getitem__)
         for _, rows in groupby(new, lengths.__getitem__):
-            parts.append(_Parts.of(np.stack([self._levels[row] for row in rows]), *edges))
+            parts.append(_Parts.of(np.stack([self.levels[row] for row in rows]), *edges))
         made |= {names[row]: len(made) + i for i, row in enumerate(new)}
         order = np.array([made[name] for name in names])
         self.parts: _Parts = _Parts(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
@@ -126,10 +126,6 @@ class KeptArrays:
 
     def __len__(self) -> int:
         return len(self.touches)
-
-    def levels(self, row: int) -> LevelArray:
-        """The levels of a kept touch, (C, T), as many columns as were kept."""
-        return self._levels[row]
 
     def rows(self) -> dict[bytes, int]:
         """Key → row of what is kept."""
@@ -152,7 +148,7 @@ class KeptArrays:
         """The levels of some touches up to a column one below the other, (rows, C, columns)."""
         found = np.full((len(rows), self.channels, columns), MISSING, dtype=np.uint8)
         for row, into in zip(rows, found, strict=True):
-            into[:, : self.columns[row]] = self._levels[row][:, :columns]
+            into[:, : self.columns[row]] = self.levels[row][:, :columns]
         return found
 
     def at_shares(self, rows: Rows, shares: FloatArray) -> LevelArray:

@@ -225,8 +225,9 @@ class TouchMatcher:
         found = without(still & rare)
         if held_out is not None or not len(rows) or not (still & ~rare).any():
             return found
-        # Channels that are often still are so here, too, or dead: as a value is the likelier.
-        return max(found, without(still), key=lambda each: self.beside(each, CLEAN).logs.max() / max(each.values, 1))
+        dead = without(still)  # channels that are often still are so here, too, or dead: as a value is the likelier
+        either = [self.beside(each, CLEAN).logs.max() / max(each.values, 1) for each in (found, dead)]
+        return dead if dead.values and either[1] > either[0] else found
 
     def beside(self, query: Query, noise: Noise | None) -> Beside:
         """The touch beside the nearest kept ones under a noise; None: under the likeliest."""

@@ -130,11 +130,9 @@ class FeatureExtractor:
         scales_for: Callable[[int], Sequence[Scale]],
         cache: WindowCache | None = None,
     ) -> Encoded:
-        """The features to predict a `stream` by: windows within the length of the longest learned touch, views of all
-        of it.
+        """The features to predict a `stream` by: windows within the longest learned touch, and views of all of it.
 
-        longest: that length in steps. scales_for: steps → the scales to be read. cache: of the same touch when it was
-        shorter.
+        longest: its length in steps. scales_for: steps → the scales to be read. cache: of the touch when shorter.
         """
         within = self._within(stream, longest)
         image = self.image(within)

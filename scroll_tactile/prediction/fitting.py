@@ -179,7 +179,7 @@ def _by_kept_touches(model: Model, matcher: TouchMatcher) -> Model:
     early, matches = [row.steps for row in weighing.early], list[Match]()
     losses = np.full((len(chosen), len(early)), np.nan)
     for loss, row in zip(losses, chosen, strict=True):
-        beside = matcher.beside(matcher.query(kept.levels(row), held_out=row), CLEAN)
+        beside = matcher.beside(matcher.query(kept.levels[row], held_out=row), CLEAN)
         reached = [steps for steps in early if steps < beside.query.columns]
         loss[: len(reached)] = beside.excess_at(reached)
         matches.append(matcher.result(beside))
@@ -226,14 +226,14 @@ def _natural(matcher: TouchMatcher, matches: Sequence[Match]) -> TouchMatcher:
     return matcher.measured(coherence, max(even, ROUNDING), max(float(np.quantile(energies, WITHIN)), ROUNDING))
 
 
-def rehearse(model: Model) -> None:
-    """Find how held-out kept touches are answered at the length of each row before they were complete.
+def rehearse(model: Model) -> Model:
+    """The model, which knows then how held-out touches are answered at each row's length before they were complete.
 
-    Each prefix is matched with those of the other kept touches; where none are kept the readouts answer alone.
+    Prefixes are matched with those of the other kept touches; where none are kept the readouts answer alone.
     """
     weighing, held_out, matcher = model.weighing, model.held_out, model.matcher
     if weighing is None or held_out.trajectories is not None:
-        return
+        return model
     chosen = None if matcher is None else {place: row for row, place in _chosen(model, matcher).items()}
     names = held_out.at(0, weighing.rows[0].scales).names
     shape = len(held_out.sample), len(weighing.early)
@@ -248,7 +248,7 @@ def rehearse(model: Model) -> None:
                     answered = tempered(own, row.readout_outliers)
                 elif place in chosen:
                     kept = chosen[place]
-                    match = matcher.match(matcher.kept.levels(kept)[:, : row.steps], held_out=kept, noise=CLEAN)
+                    match = matcher.match(matcher.kept.levels[kept][:, : row.steps], held_out=kept, noise=CLEAN)
                     logits = weighing.logits("prefix", own, match, matcher.scores_of(names, match), 0.0)
                     answered = tempered(softmax(logits), row.outliers)
                 else:
@@ -257,6 +257,7 @@ def rehearse(model: Model) -> None:
                 targets[place] = found.targets[i]
     reached = np.isfinite(novelty).any(axis=1)
     held_out.trajectories = Trajectories(chances[reached], novelty[reached], targets[reached])
+    return model
 
 
 def paces_of(model: Model, extractor: FeatureExtractor) -> Paces | None:
@@ -282,7 +283,7 @@ def _measured_paces(
     queries: dict[Scale, dict[int, dict[int, FloatArray]]] = {view: {} for view in model.views}
     matches: dict[tuple[int, int], Match] = {}
     for kept, place in chosen.items():
-        levels = matcher.kept.levels(kept)
+        levels = matcher.kept.levels[kept]
         for number, pace in enumerate(PACES):
             columns = max(2, round(levels.shape[1] / pace))
             other = at_places(levels, np.linspace(0, levels.shape[1] - 1, columns))

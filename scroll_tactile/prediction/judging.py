@@ -43,6 +43,7 @@ from scroll_tactile.statistics.moments import one_thread
 __all__ = ["HeldOutTouch", "answer", "estimates_of", "held_out_touches", "judged"]
 
 FloatArray = npt.NDArray[np.float64]
+Names = Sequence[str]
 Matched = tuple[Hypothesis, Match, float]
 """A touch beside kept ones under a hypothesis, and its excess loss where no noise came over it."""
 
@@ -55,18 +56,15 @@ PACES = 0.4, 2.5  # times the median length of kept touches: what another pace c
 def answer(
     model: Model,
     extractor: FeatureExtractor,
-    candidates: Sequence[str],
+    candidates: Names,
     touches: Sequence[Encoded],
     false_alarms: float,
 ) -> Prediction:
-    """The prediction for touches of one thing, which is one of the candidates; one touch or more.
+    """The prediction for touches of one thing, which is one of the candidates. false_alarms: as in `Settings`.
 
-    false_alarms: as in `Settings`.
-
-    Probabilities and novelties of several touches add up as far as the touches are independent (see
-    `readouts.calibration`), in any order to the same bits; a touch that comes twice counts once. The p of their
-    typicality is twice the mean of theirs, a bound that holds whatever the dependence between them (Vovk and Wang
-    2020).
+    Probabilities and novelties of several touches add up as far as the touches are independent (see `Dependence`), in
+    any order to the same bits; a touch that comes twice counts once. The p of their typicality is twice the mean of
+    theirs, a bound that holds whatever the dependence between them (Vovk and Wang 2020).
     """
     own = [touch for _, touch in sorted({touch.stream.key: touch for touch in touches}.items())]
     with one_thread():
@@ -94,11 +92,7 @@ def answer(
 
 
 def _prediction(
-    names: Sequence[str],
-    probability: FloatArray,
-    novelty: float,
-    thresholds: Sequence[NoveltyThresholds],
-    false_alarms: float,
+    names: Names, probability: FloatArray, novelty: float, thresholds: Sequence[NoveltyThresholds], false_alarms: float
 ) -> Prediction:
     """What is said of touches of one thing. names: in alphabetical order. thresholds: of each touch."""
     order = np.argsort(-probability, kind="stable").tolist()
@@ -111,7 +105,7 @@ def _prediction(
     return Prediction(*ranking[0], ranking, novelty, known, seconds=0.0)
 
 
-def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded) -> Judgement:
+def judged(model: Model, extractor: FeatureExtractor, candidates: Names, encoded: Encoded) -> Judgement:
     """The judgement of a touch by a model, or by the logits of f*."""
     if (logits := encoded.logits) is not None:
         row = model.fitted.row("complete", len(model.fitted.rows) - 1)
@@ -119,7 +113,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         return Judgement(chances, model.novelty(row, encoded.means, candidates), row)
     weighing = model.fitted
     own: Hypothesis = "complete" if encoded.steps >= weighing.least else "prefix"
-    alone = _alone(model, extractor, candidates, encoded, own)
+    alone = _alone(model, extractor, candidates, encoded)
     length, matcher = len(encoded.stream), model.matcher
     learned = weighing.least <= length <= model.longest
     if matcher is None or (learned and alone.row.suffices(float(alone.probability.max()), alone.distance)):
@@ -137,7 +131,7 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
         if hypothesis == "paced":
             judgement = _paced(model, extractor, candidates, filled.stream, clean)
         else:
-            judgement = alone if filled is encoded else _alone(model, extractor, candidates, filled, own)
+            judgement = alone if filled is encoded else _alone(model, extractor, candidates, filled)
         answers.append(_fused(model, candidates, judgement, hypothesis, match))
     weights = np.exp(COUNTED * (gains - gains.max()))
     probability = weights @ np.array([answer.probability for answer in answers])
@@ -145,12 +139,11 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Sequence[str],
     return replace(answers[int(weights.argmax())], probability=probability / probability.sum(), unusual=unusual)
 
 
-def _alone(
-    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], encoded: Encoded, own: Hypothesis
-) -> Judgement:
+def _alone(model: Model, extractor: FeatureExtractor, candidates: Names, encoded: Encoded) -> Judgement:
     """The judgement by the readouts. How new a beginning is, is told by its last milestone: sampled touches went on."""
-    found, (*earlier, last) = model.judge(candidates, encoded.means, encoded.steps, own), model.fitted.rows
-    if own == "complete" or found.row is not last or not earlier:
+    (*earlier, last), complete = model.fitted.rows, encoded.steps >= model.fitted.least
+    found = model.judge(candidates, encoded.means, encoded.steps, "complete" if complete else "prefix")
+    if complete or found.row is not last or not earlier:
         return found
     means = extractor.means(encoded.image[:, : earlier[-1].steps], earlier[-1].scales)
     calibration = replace(last.calibration, thresholds=earlier[-1].calibration.thresholds)
@@ -181,9 +174,7 @@ def _matches(
     ]
 
 
-def _paced(
-    model: Model, extractor: FeatureExtractor, candidates: Sequence[str], stream: Stream, clean: float
-) -> Judgement:
+def _paced(model: Model, extractor: FeatureExtractor, candidates: Names, stream: Stream, clean: float) -> Judgement:
     """The judgement by the readouts of a touch as a whole one at another pace. clean: see `Matched`."""
     means = extractor.means(extractor.image(stream_of(_levels_of(stream), extractor.sensor)), model.views)
     judgement, kept = model.judge(candidates, means, len(stream), "paced"), model.matcher
@@ -195,7 +186,7 @@ def _paced(
     return replace(judgement, novelty=paces.novelty(values, pace))
 
 
-def _typicality(model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> FloatArray:
+def _typicality(model: Model, candidates: Names, touches: Sequence[Encoded]) -> FloatArray:
     """How typical touches are of each candidate, shape (C, 4); see `Conformal.p_rows`."""
     if model.matcher is None:
         return np.ones((len(candidates), 4))
@@ -215,9 +206,7 @@ def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
 
 
-def _fused(
-    model: Model, candidates: Sequence[str], alone: Judgement, hypothesis: Hypothesis, match: Match
-) -> Judgement:
+def _fused(model: Model, candidates: Names, alone: Judgement, hypothesis: Hypothesis, match: Match) -> Judgement:
     """The judgement of a touch by the readouts and the kept touches together. alone: that by the readouts."""
     assert model.matcher is not None
     scores = model.matcher.scores_of(candidates, match)
@@ -285,7 +274,7 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
             chances = np.exp(logs[i])
             alone = Judgement(chances, float(novelties[i]), row, float(distances[i]))
             if matcher is not None and key in rows and not row.suffices(float(chances.max()), alone.distance):
-                [(_, match, _)] = _matches(model, matcher.kept.levels(rows[key]), ["complete"], alone, rows[key])
+                [(_, match, _)] = _matches(model, matcher.kept.levels[rows[key]], ["complete"], alone, rows[key])
                 result = _fused(model, found.names, alone, "complete", match)
             else:
                 result = replace(alone, probability=tempered(chances, row.readout_outliers))
@@ -297,7 +286,7 @@ def held_out_touches(model: Model, false_alarms: float) -> list[HeldOutTouch]:
 
 def estimates_of(
     estimator: Estimator,
-    wanted: Sequence[str],
+    wanted: Names,
     encoded: Encoded | None,
     extractor: FeatureExtractor,
     prediction: Prediction,

@@ -64,10 +64,9 @@ class Row:
     """How touches are judged from a length on, by readouts and kept touches.
 
     steps: that length; of a complete touch, that of most. stage: that it belongs to. scales: that judge. calibration:
-    of their scores. readout_outliers: ε of the readouts' own probabilities, the share of touches unlike all others of
-    their material; outliers: ε where kept touches judge beside them. distance_limit: the relative distance that 19 of
-    20 complete touches stay below; infinite in the rows of prefixes. excess: mean and spread of the excess loss of
-    known touches beside the kept ones.
+    of their scores. readout_outliers: ε of the readouts alone, the share of touches unlike all others of their
+    material; outliers: ε where kept touches judge beside them. distance_limit: the relative distance that 19 of 20
+    complete touches stay below, infinite for prefixes. excess: mean and spread of known touches' excess loss.
     """
 
     steps: int
@@ -257,11 +256,6 @@ class Model:
         """The weighing, where something was learned."""
         assert self.weighing is not None
         return self.weighing
-
-    @property
-    def touches(self) -> int:
-        """The touches that it was fitted to."""
-        return 0 if self.weighing is None else self.weighing.touches
 
     @cached_property
     def known(self) -> frozenset[str]:

@@ -1,9 +1,8 @@
 """The predictor: it answers from one open memory, which other threads may change meanwhile.
 
-After a fit the class means, the kept touches and the materials follow at once, while the scatter and the weighing stay
-as they were fitted: measured right as often as a fit of all touches. When the memory has grown or shrunk by an eighth,
-a thread fits again, from a copy of the sums; its model is taken as soon as it is there, and follows what came since. In
-memories of at most FEW touches, and where touches came much faster than fits, a call waits.
+After a fit class means, kept touches and materials follow at once; scatter and weighing stay as they were: measured
+right as often as a fit of all touches. When the memory has changed by an eighth, a thread fits again, from a copy of
+the sums. In memories of at most FEW touches, and where touches came much faster than fits, a call waits.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ from scroll_tactile.persistence.reembed import Reembedding
 from scroll_tactile.persistence.replaying import exemplar_candidates, load
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
-from scroll_tactile.prediction.fitting import Draft, rehearse
+from scroll_tactile.prediction.fitting import Draft
 from scroll_tactile.prediction.judging import answer, estimates_of
 from scroll_tactile.prediction.model import Model, enough_memory
 from scroll_tactile.prediction.stored import read_weighing, weighing_text
@@ -137,9 +136,8 @@ class Predictor:
         with self.ledger.lock:
             memory = self.ledger.memory
             arrays, attributes = memory.to_arrays(candidates=exemplar_candidates(memory, self.ledger.store))
-            held = arrays, attributes, memory.sequence
-            made_with = {"recipe": self.recipe, "check": self.extractor.check}
-            return made_with | {"held": held, "contents": self.ledger.copied_contents()}
+            found = {"held": (arrays, attributes, memory.sequence), "contents": self.ledger.copied_contents()}
+            return found | {"recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:
         """The predictor of an axis of labels, made when it is first asked for.
@@ -256,12 +254,6 @@ class Predictor:
             self._begin_fit()
             return model
 
-    def rehearsed(self) -> Model:
-        """As `present`, for live sessions: with what `fitting.rehearse` finds, as later fits will have it."""
-        with self.ledger.lock, enough_memory():
-            rehearse(model := self.present())
-        return model
-
     def answer_of(self, model: Model, candidates: Sequence[str], touches: Sequence[Encoded]) -> Prediction:
         """The prediction of a model for touches of one thing."""
         with enough_memory():
@@ -304,7 +296,8 @@ class Predictor:
         if self._fit is None or self._job is not None:
             return
         model, memory = self._fit.model, self.ledger.memory
-        if abs(memory.statistics.touches - model.touches) < max(LEAST, model.touches // GROWTH):
+        fitted = 0 if model.weighing is None else model.weighing.touches
+        if abs(memory.statistics.touches - fitted) < max(LEAST, fitted // GROWTH):
             return
         # Lack of memory or threads, or too many materials for the ridge: the next prediction raises the error.
         with suppress(MemoryError, InputError, RuntimeError):
@@ -365,11 +358,12 @@ class Predictor:
 
 def _followed(fit: _Fit, memory: Memory) -> Model | None:
     """A fit's model with what changed since; None where a call waits for another fit."""
-    model, now = fit.model, memory.statistics.touches
-    outgrown = not model.touches <= FASTER * now <= FASTER * FASTER * model.touches
-    if model.touches <= FEW:
-        outgrown = abs(now - model.touches) >= min(LEAST, model.touches + 1)
-    return None if outgrown or fit.changed is None else model.followed(memory, fit.changed)
+    weighing, now = fit.model.weighing, memory.statistics.touches
+    fitted = 0 if weighing is None else weighing.touches
+    outgrown = not fitted <= FASTER * now <= FASTER * FASTER * fitted
+    if fitted <= FEW:
+        outgrown = abs(now - fitted) >= min(LEAST, fitted + 1)
+    return None if outgrown or fit.changed is None else fit.model.followed(memory, fit.changed)
 
 
 def reembed_memory(

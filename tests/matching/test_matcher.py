@@ -110,7 +110,7 @@ def test_whatever_comes_and_goes_it_holds_what_a_set_would(toggled, rng):
     for row, (material, key) in enumerate(matcher.kept.touches):
         mine = next(stay for stay in stays if (stay.material, stay.key) == (material, key))
         assert matcher.kept.rows()[key] == row
-        assert matcher.kept.levels(row).tobytes() == mine.levels.tobytes()
+        assert matcher.kept.levels[row].tobytes() == mine.levels.tobytes()
 
 
 def test_a_touch_left_out_is_as_if_it_were_not_kept():
@@ -118,7 +118,7 @@ def test_a_touch_left_out_is_as_if_it_were_not_kept():
     matcher = matcher_of(touches)
     row = matcher.kept.rows()[touches[6].key]
     without = matcher.followed([stays for stays in touches if stays is not touches[6]])
-    asked = matcher.kept.levels(row)
+    asked = matcher.kept.levels[row]
     left_out = matcher.match(asked, held_out=row)
     assert same(left_out, without.match(asked))
     assert left_out.scores.max() < matcher.match(asked).scores.max()
@@ -263,7 +263,7 @@ def test_touches_of_other_lengths_and_one_touch_alone():
 def test_the_only_kept_touch_held_out_leaves_nothing_to_compare_with(noise, whole):
     """As where one kept touch alone has a label of an axis (`predict(of=)`): every answer is the same."""
     single = matcher_of(kept(each=1)[:1])
-    found = single.match(single.kept.levels(0), whole=whole, held_out=0, noise=noise)
+    found = single.match(single.kept.levels[0], whole=whole, held_out=0, noise=noise)
     assert found.scores.tolist() == [0.0]
     assert np.isnan(found.expected).all()
     assert (found.noise_share, found.log_likelihood_gain, found.excess_loss, found.moved) == (0.0, 0.0, 0.0, False)

@@ -195,7 +195,7 @@ def test_a_fit_that_ends_answers_and_has_followed_what_came_since(monkeypatch):
     learner.observe("d", stream("d", 93))
     job[0].result()
     require_followed(learner)
-    assert present(learner).touches == len(OBSERVED) + 3
+    assert present(learner).fitted.touches == len(OBSERVED) + 3
     learner.settle()
     assert bits(learner) == expected((*OBSERVED, *(("a", 90 + i) for i in range(3)), ("d", 93)))
 

@@ -57,7 +57,7 @@ def test_what_is_rehearsed_is_what_the_model_says_of_a_touch_that_it_lacks(learn
     rows, keys = model.matcher.kept.rows(), [key for _, key, _ in model.held_out.sample]
     assert len(said.targets) == len(rows) == len(TOUCHES)  # all are held out: they are few
     for touch in held_out_touches(model, 0.05)[::7]:
-        stream = stream_of(model.matcher.kept.levels(rows[touch.key]), SKIN)
+        stream = stream_of(model.matcher.kept.levels[rows[touch.key]], SKIN)
         other = _without(model, learner.memory, touch)
         with one_thread():
             for i, row in enumerate(weighing.early):

@@ -356,9 +356,7 @@ class MemoryFacts:
         try:
             if not self.counts:
                 return None
-            model = self.learner._by(self.of).fitted()
-            rehearse(model)
-            return model
+            return rehearse(self.learner._by(self.of).fitted())
         except CapacityError:
             raise
         except ScrollTactileError as error:  # sums that came from elsewhere have no readout, and the ridge has a limit

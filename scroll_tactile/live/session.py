@@ -441,9 +441,7 @@ class LiveSession:
 
     def _rule(self, model: Model, risk: float) -> DecisionRule:
         """When predictions are made with a model, and when they are decided; found once for each fit."""
-        if model.weighing is None:
-            return decision_rule(model, risk)
-        known = _RULES.setdefault(model.weighing, {})
+        known = {} if model.weighing is None else _RULES.setdefault(model.weighing, {})
         if risk not in known:
             known[risk] = decision_rule(model, risk)
         return known[risk]
@@ -557,10 +555,10 @@ def _checked(predictor: Predictor, widths: Mapping[str, float] | None) -> dict[s
     for name, width in requested.items():
         if not (isinstance(width, Real) and 0 < float(width) < math.inf):
             raise InputError(f"expected the width of {name!r} as a number above 0; came {width!r:.60}")
+    if requested and not estimator.quantities:
+        why = "none was declared, or answers are by labels"
+        raise InputError(f"expected widths of declared quantities; came {sorted(requested)}, and {why}")
     if not estimator.quantities:
-        if requested:
-            why = "none was declared, or answers are by labels"
-            raise InputError(f"expected widths of declared quantities; came {sorted(requested)}, and {why}")
         return {}
     estimator.wanted(list(requested))
     for stage in range(estimator.last + 1):

@@ -29,6 +29,7 @@ __all__ = [
     "MOST_BYTES",
     "OBSERVE",
     "PACKED_SHAPE",
+    "PACKED_ZERO",
     "RETRACT",
     "RETRACTS",
     "SENSE",

@@ -33,6 +33,7 @@ from scroll_tactile.memory.touch_rows import (
     MOST_BYTES,
     OBSERVE,
     PACKED_SHAPE,
+    PACKED_ZERO,
     RETRACT,
     RETRACTS,
     SENSE,
@@ -199,10 +200,12 @@ class Expected:
                 array(arrays, codes[scale], "int32", (rows, self._dimension), -LARGEST_CODE, LARGEST_CODE)
 
     def _readings(self, packed: Arrays, count: int) -> npt.NDArray[np.float32]:
-        """So many readings of a row; the shape that it claims is compared before anything is made of it."""
+        """So many readings of a row; what it claims is compared with what it has before anything is made of it."""
         shape = (count, *self._sensor.shape)
-        claimed = packed[PACKED_SHAPE].tolist() if PACKED_SHAPE in packed else list(shape)
-        expect(claimed == list(shape), PACKED_SHAPE, f"{shape}", claimed)
+        if PACKED_SHAPE in packed:
+            claimed = packed[PACKED_SHAPE].tolist()
+            expect(claimed == list(shape), PACKED_SHAPE, f"{shape}", claimed)
+            array(packed, PACKED_ZERO, "uint8", (-(-count * self._sensor.channels // 8),))
         with np.errstate(all="ignore"):
             readings = unpack_readings(packed)
         return array({"readings": readings}, "readings", "float32", shape, *self._sensor.limits)

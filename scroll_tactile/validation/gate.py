@@ -1,9 +1,9 @@
 """The gate: what is read from a memory's folder passes it before it is replayed, merged, listed, exported or counted.
 
 Checksums tell what was written from what was damaged, and not who wrote it: a folder may come from somebody else. The
-gate takes every row and checkpoint for what it must be (see `expected`), and raises DamageError
-with its place for anything else. A row with readings is under their hash. What it lets through may be false, as a touch
-under another name is, and it fits.
+gate takes every row and checkpoint for what it must be (see `expected`), and raises DamageError with its place for
+anything else. A row with readings is under their hash. What it lets through may be false, as a touch under another
+name is.
 """
 
 from __future__ import annotations

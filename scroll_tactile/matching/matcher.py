@@ -41,6 +41,7 @@ EXPECTED = 0.1  # the same, of what is expected where channels are stuck
 BLENDED = 3  # materials, the likeliest, that have blends
 NEGLIGIBLE = 1e-6  # of the largest weight in a mean
 RARELY = 20  # kept touches, of which fewer than one is still for as long: then a channel that is so is stuck
+LONG = 9  # readings: a channel that is still for fewer is not asked whether it is dead
 PAIRS = 64  # kept touches by which the spread is measured
 ASSUMED = (10.0, 10.0)  # coherence and energy, unless measured: about what RoboSkin's and BioTac's touches have
 PRIOR_VALUES, PRIOR_SPREAD = 50, 2.0  # of the spread at each level: where hardly any value was read
@@ -223,7 +224,7 @@ class TouchMatcher:
             return Query(mine, levels.shape[1], step, whole, stuck, seen, values, entropy, blocks, rows)
 
         found = without(still & rare)
-        if held_out is not None or not len(rows) or not (still & ~rare).any():
+        if held_out is not None or not len(rows) or own.shape[1] < LONG or not (still & ~rare).any():
             return found
         dead = without(still)  # channels that are often still are so here, too, or dead: as a value is the likelier
         either = [self.beside(each, CLEAN).logs.max() / max(each.values, 1) for each in (found, dead)]

@@ -121,6 +121,8 @@ def array(
 def _within(field: str, least: Bound, most: Bound, values: npt.NDArray[Any]) -> None:
     if values.size:
         low, high = values.min(axis=0), values.max(axis=0)  # NaN, which is in no bounds, if any is
+        if values.dtype.kind == "f":  # a bound of doubles is no single float
+            low, high = np.float64(low), np.float64(high)
         inside = bool(np.all(low >= least) and np.all(high <= most))
         expect(inside, field, f"values from {least} to {most}", (low.min(), high.max()))
 

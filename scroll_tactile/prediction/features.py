@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.contact import Rest, image_of, pressed
 from scroll_tactile.signals.image import shape_image, stretched, tactile_image
+from scroll_tactile.signals.levels import LevelArray, levels_of
 from scroll_tactile.signals.stream import Stream, validate
 from scroll_tactile.signals.windows import COMPETING, SHAPE, WHOLE, Extent, Scale, WindowPlan
 from scroll_tactile.statistics.grid import in_units, to_codes
@@ -47,6 +48,12 @@ class Encoded:
         """T, the steps of time in the image."""
         return int(self.image.shape[1])
 
+    @cached_property
+    def levels(self) -> LevelArray:
+        """The levels of the whole touch, (C, T'); MISSING marks each value that was not read (`Stream.mask`)."""
+        read, mask = self.stream.readings, self.stream.mask
+        return levels_of(read if mask is None else np.where(mask, np.nan, read), self.stream.sensor)
+
 
 class WindowCache:
     """Features of the windows of a touch in progress, by what they read, so that no window is embedded twice."""
@@ -68,8 +75,7 @@ class WindowCache:
             first = min(map(min, absent.values()))
             shifted = {width: [at - first for at in starts] for width, starts in absent.items()}
             for width, rows in embed(np.ascontiguousarray(image[:, first:]), shifted).items():
-                keys = [(width, image[:, at : at + width].tobytes()) for at in absent[width]]
-                self._rows |= zip(keys, rows, strict=True)
+                self._rows |= zip([key for key in read[width] if key not in self._rows], rows, strict=True)
         return {width: np.stack([self._rows[key] for key in keys]) for width, keys in read.items()}
 
 

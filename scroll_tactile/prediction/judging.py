@@ -66,7 +66,8 @@ def answer(
     any order to the same bits; a touch that comes twice counts once. The p of their typicality is twice the mean of
     theirs, a bound that holds whatever the dependence between them (Vovk and Wang 2020).
     """
-    own = [touch for _, touch in sorted({touch.stream.key: touch for touch in touches}.items())]
+    once = {touch.stream.key if len(touches) > 1 else b"": touch for touch in touches}  # one alone needs no hash
+    own = [once[key] for key in sorted(once)]
     with one_thread():
         judgements = [judged(model, extractor, candidates, touch) for touch in own]
         typical = _typicality(model, candidates, own)
@@ -118,18 +119,18 @@ def judged(model: Model, extractor: FeatureExtractor, candidates: Names, encoded
     learned = weighing.least <= length <= model.longest
     if matcher is None or (learned and alone.row.suffices(float(alone.probability.max()), alone.distance)):
         return _by_readouts(model, encoded, alone)
-    levels, hypotheses = _levels_of(encoded.stream), [own]
+    hypotheses = [own]
     shortest, longest = (part * float(np.median(matcher.kept.columns)) for part in PACES)
     if model.views and not learned and shortest <= length <= longest:
         hypotheses.append("paced")
-    matches = _matches(model, levels, hypotheses, alone)
+    matches = _matches(model, encoded.levels, hypotheses, alone)
     gains = np.array([match.log_likelihood_gain for _, match, _ in matches])
     likeliest, best, _ = matches[int(gains.argmax())]
     filled = encoded if likeliest != own else _filled(model, extractor, encoded, best)
     answers = []
     for hypothesis, match, clean in matches:
         if hypothesis == "paced":
-            judgement = _paced(model, extractor, candidates, filled.stream, clean)
+            judgement = _paced(model, extractor, candidates, filled, clean)
         else:
             judgement = alone if filled is encoded else _alone(model, extractor, candidates, filled)
         answers.append(_fused(model, candidates, judgement, hypothesis, match))
@@ -174,15 +175,15 @@ def _matches(
     ]
 
 
-def _paced(model: Model, extractor: FeatureExtractor, candidates: Names, stream: Stream, clean: float) -> Judgement:
+def _paced(model: Model, extractor: FeatureExtractor, candidates: Names, encoded: Encoded, clean: float) -> Judgement:
     """The judgement by the readouts of a touch as a whole one at another pace. clean: see `Matched`."""
-    means = extractor.means(extractor.image(stream_of(_levels_of(stream), extractor.sensor)), model.views)
-    judgement, kept = model.judge(candidates, means, len(stream), "paced"), model.matcher
+    means = extractor.means(extractor.image(stream_of(encoded.levels, extractor.sensor)), model.views)
+    judgement, kept = model.judge(candidates, means, len(encoded.stream), "paced"), model.matcher
     assert kept is not None
     if (paces := paces_of(model, extractor)) is None:
         return judgement
     values = np.append(model.distances(judgement.row.scales, means, candidates), clean)
-    pace = float(np.median(kept.kept.columns)) / len(stream)
+    pace = float(np.median(kept.kept.columns)) / len(encoded.stream)
     return replace(judgement, novelty=paces.novelty(values, pace))
 
 
@@ -190,7 +191,7 @@ def _typicality(model: Model, candidates: Names, touches: Sequence[Encoded]) -> 
     """How typical touches are of each candidate, shape (C, 4); see `Conformal.p_rows`."""
     if model.matcher is None:
         return np.ones((len(candidates), 4))
-    shares = [model.matcher.conformal.p_rows(_levels_of(touch.stream), candidates) for touch in touches]
+    shares = [model.matcher.conformal.p_rows(touch.levels, candidates) for touch in touches]
     if len(shares) == 1:
         return shares[0]
     sums = [[math.fsum(column) for column in of.T] for of in np.stack(shares, axis=1)]
@@ -201,7 +202,7 @@ def _by_readouts(model: Model, encoded: Encoded, alone: Judgement) -> Judgement:
     """The judgement by the readouts. For a novel touch its match names how it differs."""
     unusual = _unusual(model, encoded)
     if model.matcher is not None and alone.novelty > alone.row.calibration.thresholds.above("", 1 - WITHIN):
-        match = model.matcher.match(_levels_of(encoded.stream), noise=None)
+        match = model.matcher.match(encoded.levels, noise=None)
         unusual = _unusual(model, encoded, match)
     return replace(alone, probability=tempered(alone.probability, alone.row.readout_outliers), unusual=unusual)
 
@@ -228,12 +229,6 @@ def _unusual(
         marks += [("noisy", match.noise_share > 0.5), ("zero moved", match.moved)]
         marks.append(("channels dead", bool(match.stuck.any())))
     return tuple(mark for mark, holds in marks if holds)
-
-
-def _levels_of(stream: Stream) -> LevelArray:
-    """The levels of a touch, (C, T); MISSING marks each value that was not read (`Stream.mask`)."""
-    readings = stream.readings if stream.mask is None else np.where(stream.mask, np.nan, stream.readings)
-    return levels_of(readings, stream.sensor)
 
 
 def _filled(model: Model, extractor: FeatureExtractor, encoded: Encoded, match: Match) -> Encoded:

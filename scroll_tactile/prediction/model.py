@@ -262,6 +262,11 @@ class Model:
         """The materials, as a set."""
         return frozenset(self.names)
 
+    @cached_property
+    def knows_sample(self) -> bool:
+        """Whether all materials that it was weighed by are still there."""
+        return {material for material, *_ in self.held_out.sample} <= self.known
+
     def followed(self, memory: Memory, changed: Collection[str]) -> Model | None:
         """The model of the memory as it is now, some materials of which have changed; None where one must be fitted.
 
@@ -357,8 +362,7 @@ class Model:
 
     def novelty(self, row: Row, means: Mapping[Scale, FloatArray], names: Sequence[str]) -> float:
         """The standardised novelty of a touch judged by a row, among these materials."""
-        everyone = len(names) == len(self.names) and {material for material, *_ in self.held_out.sample} <= self.known
-        among = None if everyone else set(names)
+        among = None if len(names) == len(self.names) and self.knows_sample else set(names)
         windows = (scale for scale in row.scales if scale.width)
         local = [own.novelty(means[scale], among) for own, scale in zip(self._near(row), windows, strict=False)]
         return float(row.calibration.novelty(np.array([*self.distances(row.scales, means, names), *local])))

@@ -329,7 +329,7 @@ class Predictor:
     def _composed_by(self) -> Composer:
         """The heads of all constituents that were described, over a model of the present memory."""
         model = self.present()
-        if not {material for material, *_ in model.held_out.sample} <= model.known:
+        if not model.knows_sample:
             model = self._settled()
         state = model, self.ledger.version, self.ledger.described
         if self._composer is None or self._composer[:3] != state:

@@ -12,11 +12,11 @@ from itertools import takewhile
 
 from scroll_tactile_store import Head, Store
 
+from scroll_tactile.memory.gate import sound_rows
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import MEMBER, OBSERVE, annotation_of
 from scroll_tactile.signals.ranges import CURE
 from scroll_tactile.statistics.annotations import Annotation
-from scroll_tactile.validation.gate import sound_rows
 
 __all__ = ["ListedContents", "Rows", "StoredContents", "refusal"]
 

@@ -15,6 +15,7 @@ from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.descriptions import Description, require_units
 from scroll_tactile.memory.exemplars import Exemplar
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
@@ -59,7 +60,6 @@ from scroll_tactile.results import Adaptation, Compacted, Merged, Receipt
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
-from scroll_tactile.validation.gate import MemoryStore
 
 __all__ = ["AxisLedger", "Ledger"]
 
@@ -329,7 +329,6 @@ class Ledger(OpenMemory):
             store, memory = self.require_store("merge"), self.memory
             self._require_no_batch("a merge")
             with MemoryStore.open(other, mode="read") as source:
-                source.read_with(memory.plan)
                 plan = MergePlan.of(store, memory, source, self.contents(), rules)
                 with self._mutation(), store.batch():
                     added = plan.append_to(store, memory, lambda done, of: progress("merging", done, of))

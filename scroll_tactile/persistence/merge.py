@@ -13,6 +13,7 @@ from scroll_tactile_store.files import same_folder
 
 from scroll_tactile.errors import AnnotationError, DescriptionError, MismatchError, ObservationError
 from scroll_tactile.memory.descriptions import Description, describe, require_units
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -28,13 +29,13 @@ from scroll_tactile.memory.touch_rows import (
     active_rows,
     annotation_of,
     declaration,
+    declared_by,
+    quantities_of,
 )
 from scroll_tactile.persistence.contents import ListedContents, Rows, StoredContents, refusal
 from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.replaying import append_row
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.validation.expected import quantities_of
-from scroll_tactile.validation.gate import MemoryStore, wrong_retractions, wrong_values
 
 __all__ = ["Choice", "MergePlan", "MergeRules"]
 
@@ -193,8 +194,7 @@ def _quantities(
 ) -> list[Quantity]:
     """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
     declared = quantities_of({} if compaction is None else compaction.attributes)
-    for wrong in wrong_values(theirs.path, (head for head in heads if head.sequence > theirs.compacted), declared):
-        raise wrong
+    declared |= {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
     both = dict(memory.quantities)
     for name, quantity in sorted(declared.items()):
         try:
@@ -309,8 +309,6 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
 
 def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> Checkpoint | None:
     """Their newest checkpoint. Verifies the rows that stay behind, too: raises DamageError where one fails the gate."""
-    for wrong in wrong_retractions(theirs.path, heads):
-        raise wrong
     for head in heads:
         if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
             theirs.record(head.sequence)

@@ -7,13 +7,14 @@ from collections.abc import Collection, Sequence
 from copy import copy
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any
 
 from scroll_tactile_store import Checkpoint, DamageError, Head, Store
 from scroll_tactile_store.archive import write_archive
 from scroll_tactile_store.exceptions import reported
 
 from scroll_tactile.memory.exemplars import ExemplarSample
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -30,7 +31,6 @@ from scroll_tactile.memory.touch_rows import (
     declaration,
 )
 from scroll_tactile.persistence.replaying import exemplar_candidates
-from scroll_tactile.validation.gate import MemoryStore
 
 __all__ = ["pack_memory", "sums_without"]
 
@@ -101,13 +101,11 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
     if found.last_sequence != source.last:
         return None
     heads = [head for head in source.heads() if head.kind == OBSERVE]
-    observed = found.arrays["observations"]
-    counts = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
     if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE, SENSE, ADAPT)):
         return None
-    if observed.ndim != 1 or counts != Counter(head.label for head in heads):
+    sums = memory.empty_like().fill(found, source.path)
+    if sums.statistics.materials != Counter(head.label for head in heads):
         raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
-    sums = memory.empty_like().fill(found.arrays, found.attributes)
     if not left_out:
         return sums
     gone, rest = memory.empty_like(), memory.empty_like()

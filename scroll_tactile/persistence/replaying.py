@@ -14,8 +14,8 @@ from scroll_tactile_store import CompactedError, DamageError, Head, Record, Stor
 
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import describe
-from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
+from scroll_tactile.memory.exemplars import Exemplar, rank
+from scroll_tactile.memory.state import Memory, MemoryFields
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
     CORRECTION,
@@ -32,6 +32,7 @@ from scroll_tactile.memory.touch_rows import (
     Codes,
     active_rows,
     annotation_of,
+    declared_by,
     only_readings,
     retracted_by,
     unpack_readings,
@@ -40,7 +41,6 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
-from scroll_tactile.validation.gate import misdeclared, wrong_values
 
 __all__ = [
     "append_row",
@@ -77,12 +77,10 @@ def load(empty: Memory, store: Store) -> Memory:
 def _loaded(memory: Memory, store: Store) -> Memory:
     memory.compacted = store.compacted
     # Where no checkpoint is sound, that of a compaction raises what is lost; without one the journal has every row.
-    newest = store.latest(
-        late=[LATE_ROWS, *(f"{name}-{scale}" for name in LATE_SECOND for scale in memory.plan.scales)]
-    )
+    newest = store.latest()
     start = store.compaction() if newest is None else newest
     if start is not None:
-        memory.fill(start.arrays, start.attributes, start.last_sequence, source=0, late=start.late)
+        memory.fill(start, store.path, source=0)
     memory.checkpoint = None if newest is None else newest.number
     memory.saved = memory.sequence
     for record in store.records(after=memory.sequence):
@@ -165,11 +163,8 @@ def _retracted(memory: Memory, record: Record, sequence: int, store: Store) -> C
 
 def _join(memory: Memory, record: Record, store: Store) -> None:
     """Add another memory of the same recipe, from a row with the arrays and attributes of its compaction checkpoint."""
-    other = memory.empty_like().fill(record.arrays, record.attributes, source=record.sequence)
-    for name, quantity in other.quantities.items():
-        if memory.quantities.get(name) != quantity:
-            raise misdeclared(store.path, record, f"values of {quantity}, which is not what was declared")
-    memory.join(other, exemplars="exemplar-readings" in record.arrays)
+    other = memory.empty_like().fill(record, store.path, source=record.sequence)
+    memory.join(other, exemplars="exemplars-held-readings" in record.arrays)
 
 
 def apply_note(memory: Memory, row: Head, path: Path) -> None:
@@ -177,9 +172,9 @@ def apply_note(memory: Memory, row: Head, path: Path) -> None:
 
     A forgotten material loses its description. Raises DamageError for a value or a quantity that cannot be.
     """
-    for wrong in wrong_values(path, [row], memory.quantities):
-        raise wrong
-    if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
+    if row.kind == DECLARE:
+        memory.quantities.setdefault(row.label, declared_by(row))
+    elif row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
         describe(memory.descriptions, row.label, row.attributes.get("constituents"))
     elif row.kind == ADAPT and RETRACTS in row.attributes:
         memory.corrections.pop(cast(int, row.attributes[RETRACTS]), None)
@@ -197,8 +192,9 @@ def apply_appended(memory: Memory, store: Store, records: Sequence[Record]) -> l
         # Heads of all kinds are read: filtered ones skip damaged rows, and such a row may be a retraction.
         behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.last_sequence))
         gone = min(retracted_by(behind), default=None)
-        if gone is None or gone > cast(int, newest.attributes["tuned_last_sequence"]):
-            memory.take_tuned(newest.arrays, newest.attributes)
+        made = MemoryFields.of(newest, memory.statistics.dimension, store.path)
+        if gone is None or gone > made.tuned_last_sequence:
+            memory.take_tuned(made)
     return None if None in changed else [each for added in changed for each in added or ()]
 
 
@@ -259,7 +255,7 @@ def _compaction_samples(memory: Memory, store: Store) -> Memory:
     require_compaction(memory, store)
     try:
         if (compaction := store.compaction()) is not None:
-            fresh.fill(compaction.arrays, compaction.attributes, source=0)
+            fresh.fill(compaction, store.path, source=0)
     except DamageError as damage:
         # The statistics are complete without it: better to open with fewer samples than not at all.
         logger.warning(
@@ -322,5 +318,5 @@ def _exemplars_in(memory: Memory, store: Store, sequence: int) -> list[Exemplar]
         steps, codes = memory.codes(row)
         readings, stages = only_readings(row.arrays), memory.plan.scored_stages(steps)
         return [Exemplar.of(row.label, row.key, readings, stages, codes)]
-    about = None if row is None else cast(Any, row.attributes.get("exemplars"))
-    return [] if row is None or about is None else exemplars_from_arrays(row.arrays, about)
+    kept = None if row is None else MemoryFields.of(row, memory.statistics.dimension, store.path).exemplars
+    return [] if kept is None else kept.exemplars()

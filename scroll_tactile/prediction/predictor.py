@@ -20,11 +20,12 @@ from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
-from scroll_tactile_store import Store
+from scroll_tactile_store import Checkpoint, Store
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
+from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory
 from scroll_tactile.memory.identity import FingerprintCheck, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
@@ -45,7 +46,6 @@ from scroll_tactile.results import Composition, Constituent, Estimate, Predictio
 from scroll_tactile.settings import Settings, candidates_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.validation.gate import MemoryStore, finish_interrupted, open_memory
 
 __all__ = ["LogitsReader", "Predictor", "embed_again", "nothing_known", "reembed_memory"]
 
@@ -128,7 +128,7 @@ class Predictor:
     def of_snapshot(cls, state: Mapping[str, Any]) -> Self:
         """Of the memory that `snapshot` described, in memory only."""
         recipe: Recipe = state["recipe"]
-        ledger = Ledger(lambda: Memory(recipe).fill(*state["held"]), contents=state["contents"])
+        ledger = Ledger(lambda: Memory(recipe).fill(state["held"], Path()), contents=state["contents"])
         return cls(recipe, _extractor(recipe, state["check"]), ledger)
 
     def snapshot(self) -> dict[str, Any]:
@@ -136,7 +136,8 @@ class Predictor:
         with self.ledger.lock:
             memory = self.ledger.memory
             arrays, attributes = memory.to_arrays(candidates=exemplar_candidates(memory, self.ledger.store))
-            found = {"held": (arrays, attributes, memory.sequence), "contents": self.ledger.copied_contents()}
+            held = Checkpoint(0, memory.sequence, attributes, arrays)
+            found: dict[str, Any] = {"held": held, "contents": self.ledger.copied_contents()}
             return found | {"recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:

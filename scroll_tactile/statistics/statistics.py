@@ -9,23 +9,43 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.errors import InputError, MismatchError, UnknownMaterialError
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.grid import rows_of, table_of
-from scroll_tactile.statistics.moments import SecondMoment, Sums, require_room
+from scroll_tactile.statistics.fields import Ints, Must, Name, expect
+from scroll_tactile.statistics.grid import BITS
+from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, Sums, require_room
 
-__all__ = ["SECOND", "Statistics"]
+__all__ = ["LONGEST_TOUCH", "Statistics", "StatisticsFields"]
 
-IntArray = npt.NDArray[np.int64]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
 
 LARGEST = 2**31 - 1  # of what is kept in int32
-SECOND = ("second", "values", "places")  # arrays of a scale: a triangle, or rows; most of a checkpoint
+LONGEST_TOUCH = 2**28  # columns: 256 MiB of the smallest readings
+
+
+@dataclass
+class StatisticsFields:
+    """What a store keeps of statistics of C materials or labels, at scales of d features.
+
+    materials: in alphabetical order. observations: of each, (C,). lengths: (L, 2): steps, and how many touches have
+    so many. By scale: rows: of codes, of each material, (C,); sums: Σ x of each, (C, d); codes: of no more rows than
+    features all of them, feature by feature, which takes half the bytes: (d, rows); second: of more rows the lower
+    triangle of Σ x xᵀ, row after row, (d·(d+1)/2,).
+    """
+
+    materials: Annotated[list[Name], Must("", "C")]
+    observations: Annotated[Ints, Must("int64", "C", 1, MOST_ROWS)]
+    lengths: Annotated[Ints, Must("int64", "* 2", 0, (LONGEST_TOUCH, MOST_ROWS))]
+    rows: Annotated[dict[Scale, Ints], Must("int64", "C", 0, MOST_ROWS)]
+    sums: Annotated[dict[Scale, Ints], Must("int64", "C d")]
+    codes: Annotated[dict[Scale, npt.NDArray[np.int32]], Must("int32", "d *", -(2**BITS), 2**BITS)]
+    second: Annotated[dict[Scale, Ints], Must("int64", "triangle")]
 
 
 class Statistics:
@@ -92,7 +112,7 @@ class Statistics:
         self._observations[place] += 1
         self._lengths[columns] += 1
 
-    def _add_sums(self, scale: Scale, place: int, more: IntArray) -> None:
+    def _add_sums(self, scale: Scale, place: int, more: Ints) -> None:
         total = self._sums[scale][place] + more
         if self._sums[scale].dtype == np.int32 and np.abs(total).max(initial=0) > LARGEST:
             self._sums = {**self._sums, scale: self._sums[scale].astype(np.int64)}  # who undoes this has those before
@@ -166,16 +186,16 @@ class Statistics:
         rows = self._rows[scale].tolist()
         return [name for name, place in sorted(self._places.items()) if rows[place]]
 
-    def counts(self, scale: Scale, names: Sequence[str]) -> IntArray:
+    def counts(self, scale: Scale, names: Sequence[str]) -> Ints:
         """Rows of each material, shape (C,); zero of one that was never observed."""
         rows, places = self._rows[scale], self._places
         return np.array([rows[places[name]] if name in places else 0 for name in names], dtype=np.int64)
 
-    def sums(self, scale: Scale, names: Sequence[str]) -> IntArray:
+    def sums(self, scale: Scale, names: Sequence[str]) -> Ints:
         """Sums of codes of each material, shape (C, d)."""
         return self.totals(scale, names)[1].astype(np.int64)
 
-    def totals(self, scale: Scale, names: Sequence[str]) -> tuple[IntArray, Sums]:
+    def totals(self, scale: Scale, names: Sequence[str]) -> tuple[Ints, Sums]:
         """Rows, shape (C,), and sums of codes, shape (C, d), of each material; int32 while all of the scale are."""
         places = [self._places[name] for name in names]
         return self._rows[scale][places], self._sums[scale][places]
@@ -251,71 +271,45 @@ class Statistics:
                 return False
         return True
 
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-        """What a store keeps: arrays by name, and the materials in the order of their first axis.
-
-        Of a second moment whose rows are there these, as `grid.table_of` gives them; of another its triangle.
-        """
+    def to_fields(self) -> StatisticsFields:
+        """What a store keeps of them."""
         names = sorted(self.materials)
         places = [self._places[name] for name in names]
         lengths = np.array(sorted(self._lengths.items()), dtype=np.int64).reshape(-1, 2)
-        arrays: dict[str, npt.NDArray[Any]] = {"observations": self._observations[places], "lengths": lengths}
-        for scale in self.scales:
-            arrays[f"rows-{scale}"] = self._rows[scale][places]
-            arrays[f"sums-{scale}"] = self._sums[scale][places].astype(np.int64)
-            second = self._seconds[scale]
+        kept = StatisticsFields(names, self._observations[places], lengths, {}, {}, {}, {})
+        for scale, second in self._seconds.items():
+            kept.rows[scale] = self._rows[scale][places]
+            kept.sums[scale] = self._sums[scale][places].astype(np.int64)
             if second.rows and (codes := second.codes()) is not None:
-                arrays[f"values-{scale}"], arrays[f"places-{scale}"] = table_of(codes)
+                kept.codes[scale] = np.ascontiguousarray(codes.T)
             elif second.rows:
-                arrays[f"second-{scale}"] = second.packed().copy()
-        return arrays, names
+                kept.second[scale] = second.packed()
+        return kept
 
     @classmethod
-    def from_arrays(
-        cls,
-        dimension: int,
-        scales: Sequence[Scale],
-        arrays: Mapping[str, npt.NDArray[Any]],
-        names: Sequence[str],
-        late: Mapping[str, Callable[[], npt.NDArray[Any]]] | None = None,
-        like: Statistics | None = None,
+    def of(
+        cls, dimension: int, scales: Sequence[Scale], kept: StatisticsFields, like: Statistics | None = None
     ) -> Statistics:
-        """The statistics that `to_arrays` described; the arrays are taken over or copied.
+        """The statistics that these fields were made of; the arrays are taken over or copied.
 
-        late: what reads those arrays of second moments that are not among the arrays, when they are needed. like: those
-        whose second moments these have too, where there are no arrays of any.
+        like: those whose second moments these have, too, where they have none of their own. Raises Unexpected where
+        there is not one array for each scale.
         """
-        statistics = cls(dimension, scales)
-        statistics._places = {name: place for place, name in enumerate(names)}
-        statistics._observations = arrays["observations"]
-        statistics._lengths = Counter(dict(arrays["lengths"].tolist()))
-        for scale in statistics.scales:
-            statistics._rows[scale], sums = arrays[f"rows-{scale}"], arrays[f"sums-{scale}"]
+        made = cls(dimension, scales)
+        made._places = {name: place for place, name in enumerate(kept.materials)}
+        made._observations, made._lengths = kept.observations, Counter(dict(kept.lengths.tolist()))
+        for scale in made.scales:
+            expect(scale in kept.rows and scale in kept.sums, f"rows-{scale}", "rows and sums of each scale", "none")
+            made._rows[scale], sums = kept.rows[scale], kept.sums[scale]
             narrow = max(int(sums.max(initial=0)), -int(sums.min(initial=0))) <= LARGEST
-            statistics._sums[scale] = sums.astype(np.int32) if narrow else sums
-            if rows := int(statistics._rows[scale].sum()):
-                own = any(f"{name}-{scale}" in arrays for name in SECOND)
-                statistics._seconds[scale] = (
-                    _second(int(scale), rows, dimension, arrays, late or {})
-                    if own or like is None
-                    else like.second(scale).copy()
-                )
-        return statistics
-
-
-def _second(
-    scale: int,
-    rows: int,
-    dimension: int,
-    arrays: Mapping[str, npt.NDArray[Any]],
-    late: Mapping[str, Callable[[], npt.NDArray[Any]]],
-) -> SecondMoment:
-    """The second moment of so many rows that arrays describe, read when it is needed where all of it is late."""
-    second, values, places = (f"{name}-{scale}" for name in SECOND)
-    if second in late:
-        return SecondMoment.of(late[second], rows, dimension)
-    if second in arrays:
-        return SecondMoment.of(arrays[second], rows, dimension)
-    if places in late:
-        return SecondMoment.of_codes(lambda: rows_of(late[values](), late[places]()), rows, dimension)
-    return SecondMoment.of_codes(rows_of(arrays[values], arrays[places]), rows, dimension)
+            made._sums[scale] = sums.astype(np.int32) if narrow else sums
+            rows = int(made._rows[scale].sum())
+            if scale in kept.codes:
+                codes = np.ascontiguousarray(kept.codes[scale].T)
+                made._seconds[scale] = SecondMoment.of_codes(codes, dimension)
+            elif scale in kept.second:
+                made._seconds[scale] = SecondMoment.of(kept.second[scale], rows, dimension)
+            elif rows:
+                expect(like is not None, f"second-{scale}", f"a second moment of {rows} rows", "none")
+                made._seconds[scale] = cast(Statistics, like).second(scale).copy()
+        return made

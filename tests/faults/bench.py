@@ -22,9 +22,9 @@ from faults.mutants import mutated_payload
 from faults.named import NAMED, REFUSED
 from faults.received import OURS, READING, WRITING, Case, Memory, Reader, Target, check, corpus, merge, read
 from scroll_tactile import TactileLearner
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.touch_rows import pack_codes
 from scroll_tactile.persistence.replaying import replay
-from scroll_tactile.validation.gate import MemoryStore
 
 SPARE = 256 * 2**20  # bytes beyond the memory's own
 KINDS = ("frames", "records", "rows", "bytes", "identities", "checkpoints", "currents", "files")

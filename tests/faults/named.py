@@ -66,14 +66,14 @@ def shaped(shape: list[int], chunk: list[int], *, named: bool) -> Folder:
 
     def write(path: Path) -> None:
         number = newest(path)
-        folder = group_of(path, number) / "rows-15"
+        folder = group_of(path, number) / "statistics-rows-15"
         about = json.loads((folder / "zarr.json").read_text())
         about["shape"], about["chunk_grid"]["configuration"]["chunk_shape"] = shape, chunk
         (folder / "zarr.json").write_text(json.dumps(about))
         shutil.rmtree(folder / "c")
         if named:
             known = described(path, number)
-            known["arrays"]["rows-15"]["shape"] = shape
+            known["arrays"]["statistics-rows-15"]["shape"] = shape
             seal(path, number, known)
 
     return write

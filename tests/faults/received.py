@@ -28,7 +28,7 @@ from scroll_tactile import TactileLearner
 from scroll_tactile.clients.cli import application
 from scroll_tactile.clients.learning.plain_export import export_plain
 from scroll_tactile.errors import ScrollTactileError
-from scroll_tactile.validation.gate import check_memory
+from scroll_tactile.memory.gate import check_memory
 
 OURS = (ScrollTactileError, StoreError)
 GOLDEN = Path(__file__).parents[1] / "data" / "format-2.zip"

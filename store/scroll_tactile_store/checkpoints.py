@@ -60,16 +60,13 @@ class Checkpoints:
         self._submitted: Future[None] | None = None
         self._failure: Exception | None = None
 
-    def latest(self, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
-        """Return the newest checkpoint that verifies, None when there is none; only: the arrays to read, or all.
-
-        late: those that are read when they are needed.
-        """
+    def latest(self, only: Collection[str] | None = None) -> Checkpoint | None:
+        """Return the newest checkpoint that verifies, None when there is none; only: the arrays to read, or all."""
         passed: set[int] = set()
         while left := [named for named in self._journal.current().checkpoints if named.number not in passed]:
             passed.add(left[0].number)
             try:
-                return self._load(left[0], only, late)
+                return self._load(left[0], only)
             except DamageError as damage:
                 if self._is_named(left[0]):
                     logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
@@ -89,12 +86,9 @@ class Checkpoints:
         """Whether it still counts: a writer replaces checkpoints and removes them."""
         return named in self._journal.current().checkpoints
 
-    def _load(
-        self, named: NamedCheckpoint, only: Collection[str] | None = None, late: Collection[str] = ()
-    ) -> Checkpoint:
+    def _load(self, named: NamedCheckpoint, only: Collection[str] | None = None) -> Checkpoint:
         reader = self._verified(named)
-        arrays = reader.arrays(only, but=late)
-        return Checkpoint(named.number, named.last_sequence, reader.attributes, arrays, reader.late(late))
+        return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays(only))
 
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)

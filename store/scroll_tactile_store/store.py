@@ -205,17 +205,16 @@ class Store:
         self._check_open()
         return self._journal.with_key(check_key(key))
 
-    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
+    def latest(self, *, only: Collection[str] | None = None) -> Checkpoint | None:
         """Return the newest checkpoint that verifies, None when there is none.
 
         only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
-        over. With none it is the checkpoint's attributes, in well below a millisecond. late: names of arrays of which
-        the files are verified and stay open; they are decompressed when they are needed, whatever happens to the store.
+        over. With none it is the checkpoint's attributes, in well below a millisecond.
         A logged warning names the file and the array of each checkpoint that it passes over. Raises VersionError for a
         checkpoint of another format.
         """
         self._check_open()
-        return self._checkpoints.latest(only, late)
+        return self._checkpoints.latest(only)
 
     @property
     def newest(self) -> int | None:

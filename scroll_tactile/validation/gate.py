@@ -9,7 +9,7 @@ name is.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -152,10 +152,8 @@ class MemoryStore(Store):
         """As `Store.records`."""
         return map(self.gate.record, super().records(after))
 
-    def latest(self, *, only: Collection[str] | None = None) -> Checkpoint | None:
-        """As `Store.latest`; what has not all of its arrays is not looked at."""
-        if only is not None:
-            return super().latest(only=only)
+    def latest(self) -> Checkpoint | None:
+        """As `Store.latest`."""
         newest = super().latest()
         return None if newest is None else self.gate.checkpoint(newest)
 

@@ -10,6 +10,7 @@ import errno
 import hashlib
 import re
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -27,13 +28,12 @@ from scroll_tactile_store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, fro
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["INDEX", "QUICK", "THOROUGH", "CheckpointDraft", "CheckpointReader", "index_name", "write_checkpoint"]
+__all__ = ["INDEX", "CheckpointDraft", "CheckpointReader", "index_name", "write_checkpoint"]
 
 INDEX = "log-"  # begins the name of an array of the store's own: which rows are where in a log
 
-# The arrays of 800 BioTac touches, 28.5 MB, become 14.5 MB at level 3, 14.0 at level 6 in twice the time: that is for
-# checkpoints that somebody waits for, and that stay.
-QUICK, THOROUGH = 3, 6
+# The arrays of 800 BioTac touches, 28.5 MB, become 14.5 MB; at level 6 14.0 MB, in twice the time.
+LEVEL = 3
 
 # Pieces of a large array, along its first axis: a hundred megabytes are some tens of files to make durable.
 CHUNK_BYTES = 4 * 2**20
@@ -53,12 +53,11 @@ GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
 
 @dataclass(frozen=True, eq=False)
 class CheckpointDraft:
-    """Checked arrays that are to become a checkpoint; `attributes` is JSON, `level` how hard to compress."""
+    """Checked arrays that are to become a checkpoint; `attributes` is JSON."""
 
     arrays: Mapping[str, np.ndarray]
     last_sequence: int
     attributes: str
-    level: int
 
 
 def index_name(log: bytes) -> str:
@@ -86,7 +85,7 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
                 sync_folder(folder)
             remove_tree(partial)
             with replacing(final, partial):
-                group = _write_zarr(partial, draft.arrays, draft.level)
+                group = _write_zarr(partial, draft.arrays, LEVEL)
                 if sum(array.nbytes for array in draft.arrays.values()) > most_bytes(Files(folder), partial):
                     # Readers make no room for so much that so little stands for: anybody could claim it.
                     remove_tree(partial)
@@ -102,11 +101,9 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
                 digest = json_digest(known)
                 group.update_attributes(known | {"sha256": digest})
                 try:
-                    _read_attributes(partial / "zarr.json", Files(folder))
-                except (ValueError, DamageError) as error:
-                    raise RecordError(
-                        f"checkpoint {number} has more attributes than could be read again: {error}"
-                    ) from error
+                    CheckpointReader(partial, Files(folder))
+                except DamageError as error:
+                    raise RecordError(f"checkpoint {number} has more attributes than can be read: {error}") from error
     except BaseException:
         remove_tree(final)
         raise
@@ -166,70 +163,59 @@ class CheckpointReader:
 
     def __init__(self, path: Path, files: Files) -> None:
         self._path, self._read = path, files.read
-        known = _read_description(path, files)
+        header = path / "zarr.json"
+        with _reading(f"a checkpoint in {header}", header):
+            known = _described(header, files)
+            self._room = most_bytes(files, path)
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]
         self.sha256: str = known["sha256"]
         self.attributes: Mapping[str, JSON] = known["attributes"]
         self.identity: Mapping[str, JSON] = known["identity"]
-        self._described: dict[str, dict[str, str]] = {}  # by array and file
+        self._files: dict[str, dict[str, str]] = {}  # by array and file
         for name, sha256 in known["files"].items():
             array, _, inside = name.partition("/")
-            self._described.setdefault(array, {})[inside] = sha256
-        try:
-            self._room = most_bytes(files, path)
-        except OSError as error:
-            raise _unreadable(error, f"checkpoint {self.number} in {path}", path) from error
+            self._files.setdefault(array, {})[inside] = sha256
 
     def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
         """Return those of these arrays that it has, or all of the caller's, verified and writable."""
-        wanted = [
-            name for name in self._described if (name in names if names is not None else not name.startswith(INDEX))
-        ]
-        return dict(zip(wanted, self._arrays(wanted), strict=True))
+        room, found = self._room, {}
+        for name in self._files:
+            if name in names if names is not None else not name.startswith(INDEX):
+                folder = self._path / name
+                with _reading(f"array {name!r} of checkpoint {self.number} in {folder}", folder):
+                    content, size = self._verified(name, room)
+                    found[name] = _read_zarr(content)
+                room -= size
+        return found
 
     def damage(self, log: bytes = b"") -> Iterator[DamageError]:
         """Yield what is wrong with the caller's arrays, or, where a log's identity is given, with the index of that."""
-        for name in self._described:
+        for name in self._files:
             if name == index_name(log) if log else not name.startswith(INDEX):
                 try:
-                    self._arrays([name])
+                    self.arrays([name])
                 except DamageError as damage:
                     yield damage
 
-    def _arrays(self, names: Collection[str]) -> list[np.ndarray]:
-        room, found = self._room, []
-        for name in names:
-            folder = self._path / name
-            what = f"array {name!r} of checkpoint {self.number} in {folder}"
-            try:
-                content, size = self._verified(name, room)
-                found.append(_read_zarr(content))
-            except Exception as error:
-                raise _unreadable(error, what, folder) from error
-            room -= size
-        return found
-
     def _verified(self, name: str, room: int) -> tuple[dict[str, bytes], int]:
         """Return the files of an array, which are those that were written, and its bytes, at most `room`."""
-        own = self._described[name]
         content = {"zarr.json": self._verified_file(name, "zarr.json", LARGEST_DESCRIPTION)}
         chunk, chunks, compressed = _claimed(content["zarr.json"])
         if chunk * chunks > room:
             raise ValueError(f"it claims {chunk * chunks} bytes; the checkpoint's files can stand for {room} more")
-        if chunks != len(own) - 1:
-            raise ValueError(f"it has {len(own) - 1} files for {chunks} chunks")
-        for inside in own.keys() - {"zarr.json"}:
-            data = self._verified_file(name, inside, chunk + chunk // 64 + 1024)
+        if chunks != len(own := self._files[name].keys() - content.keys()):
+            raise ValueError(f"it has {len(own)} files for {chunks} chunks")
+        for inside in own:
+            data = content[inside] = self._verified_file(name, inside, chunk + chunk // 64 + 1024)
             if (declared_size(data) if compressed else len(data)) != chunk:
                 raise ValueError(f"{inside} does not stand for {chunk} bytes")
-            content[inside] = data
         return content, chunk * chunks
 
     def _verified_file(self, name: str, inside: str, limit: int) -> bytes:
         path = self._path / name / inside
         data = self._read(path, limit)
-        if hashlib.sha256(data).hexdigest() != self._described[name].get(inside):
+        if hashlib.sha256(data).hexdigest() != self._files[name].get(inside):
             raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
         return data
 
@@ -250,50 +236,37 @@ def _claimed(description: bytes) -> tuple[int, int, bool]:
     return prod(chunk) * dtype.itemsize, prod(grid), len(codecs) > 1
 
 
-def _read_attributes(header: Path, files: Files) -> dict[str, Any]:
-    """Return the attributes of a group; raise DamageError, ValueError where it is none, and OSError."""
-    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
-    attributes = group.get("attributes")
-    if not isinstance(attributes, dict) or (group.get("node_type"), group.get("zarr_format")) != ("group", 3):
-        raise ValueError("it describes no group of zarr's format 3")
-    return attributes
-
-
-def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
-    if isinstance(error, DamageError):
-        return DamageError(f"{what} cannot be read: {error}", path=error.path)
-    other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
-    if other or isinstance(error, MemoryError):
-        return StoreError(f"{what} could not be read: {error}")
-    return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
-
-
-def _read_description(path: Path, files: Files) -> dict[str, Any]:
-    header = path / "zarr.json"
+@contextmanager
+def _reading(what: str, path: Path) -> Iterator[None]:
+    """Raise whatever reading raises as DamageError, but where the system, and no file, is at fault."""
     try:
-        known = _read_attributes(header, files)
-        stored = known.pop("sha256", None)
-        # Before the version, which a flipped bit can make a newer one.
-        if json_digest(known) != stored:
-            raise ValueError("it is not what was written: its sha256 differs")
-        if type(version := known.get("format")) is int and version != FORMAT_VERSION:
-            raise VersionError(other_format(path, version))
-        _require_described(known)
+        yield
     except VersionError:
         raise
+    except DamageError as error:
+        raise DamageError(f"{what} cannot be read: {error}", path=error.path) from error
     except Exception as error:
-        raise _unreadable(error, f"a checkpoint in {header}", header) from error
-    return known | {"sha256": stored}
+        other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
+        if other or isinstance(error, MemoryError):
+            raise StoreError(f"{what} could not be read: {error}") from error
+        raise DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path) from error
 
 
-def _require_described(known: Mapping[str, Any]) -> None:
-    """Raise ValueError where a group does not say whose it is, or names files that are not an array's."""
+def _described(header: Path, files: Files) -> dict[str, Any]:
+    """Return what a group says of itself, verified. Raises ValueError for another thing, VersionError and OSError."""
+    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
+    known: dict[str, Any] = dict(group["attributes"])
+    # Before the format, which a flipped bit can make another one.
+    if json_digest({name: value for name, value in known.items() if name != "sha256"}) != known.get("sha256"):
+        raise ValueError("it is not what was written: its sha256 differs")
     kinds = {"format": int, "number": int, "last_sequence": int, "attributes": dict, "identity": dict, "files": dict}
     for name, kind in kinds.items():
         if type(known.get(name)) is not kind:
             raise ValueError(f"its {name} is {str(known.get(name))[:80]!r}")
+        if name == "format" and known[name] != FORMAT_VERSION:
+            raise VersionError(other_format(header.parent, known[name]))
     if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["last_sequence"] <= LARGEST_NUMBER):
         raise ValueError(f"its number is {known['number']}, its last_sequence {known['last_sequence']}")
-    for name in known["files"]:
-        if not FILE.fullmatch(name):
-            raise ValueError(f"it names the file {name[:80]!r}, which is no array's")
+    if strange := [name for name in known["files"] if not FILE.fullmatch(name)]:
+        raise ValueError(f"it names the file {strange[0][:80]!r}, which is no array's")
+    return known

@@ -83,8 +83,7 @@ def test_an_array_that_claims_what_is_never_written_is_damage_and_takes_no_memor
     forge(path)
     with taking_at_most(40 * 2**20):
         require_damage(path)
-    with Store.open(path, mode="read") as opened:
-        assert list(opened.latest(only=["one"]).arrays) == ["one"]
+    assert list(CheckpointReader(newest(path), Files(path)).arrays(["one"])) == ["one"]
 
 
 def test_a_frame_that_claims_another_size_is_damage_and_takes_no_memory(path):
@@ -147,7 +146,6 @@ def test_what_a_checkpoint_never_says_of_itself_is_damage(path, forge, is_compac
         set_current(path, compaction=get_current(path)["newest"])
     with Store.open(path, mode="read") as opened:
         assert opened.latest() is None
-        assert opened.latest(only=()) is None
         if is_compaction:
             with pytest.raises(DamageError, match="checkpoint"):
                 opened.compaction()

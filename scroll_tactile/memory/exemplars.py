@@ -26,7 +26,6 @@ __all__ = [
     "CANDIDATES",
     "Exemplar",
     "ExemplarSample",
-    "Source",
     "exemplars_from_arrays",
     "exemplars_to_arrays",
     "herd",
@@ -146,15 +145,10 @@ class Exemplar:
         return readings
 
 
-Source = int | Exemplar
-"""Where a candidate's readings lie: in this row of the journal; 0, or a compacted row: in the compaction checkpoint.
-
-Without a journal it is the exemplar itself.
-"""
-
-
-class ExemplarSample(Sample[Source]):
+class ExemplarSample(Sample[int]):
     """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
+
+    Of each it has the row of the journal in which its readings lie; 0 or a compacted row: the compaction checkpoint.
 
     exemplars: streams in the buffer; `ratio` times as many candidates are kept.
     ratio: at 1 the buffer is a random choice; more candidates come nearer to the class mean.
@@ -177,16 +171,13 @@ class ExemplarSample(Sample[Source]):
         return arrays, {"materials": [material for material, *_ in self]}
 
     @classmethod
-    def from_arrays(cls, arrays: Arrays, about: Mapping[str, Any], exemplars: int, source: int | None) -> Self:
+    def from_arrays(cls, arrays: Arrays, about: Mapping[str, Any], exemplars: int, source: int) -> Self:
         """The sample that `to_arrays` gave, or that of the exemplars that `exemplars_to_arrays` gave.
 
         exemplars: may be fewer than when it was made; a sample of more lacks what was dropped before. source: of those
-        for which the arrays name none; None where the journal is left behind.
+        for which the arrays name none.
         """
         sample = cls(exemplars)
-        if source is None:
-            sample.update((held.material, held.key, held) for held in exemplars_from_arrays(arrays, about))
-            return sample
         keys = [key.tobytes() for key in arrays["exemplar-keys"]]
         sources = arrays["exemplar-sources"].tolist() if "exemplar-sources" in arrays else [source] * len(keys)
         sample.update(zip(about["materials"], keys, sources, strict=True))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel
@@ -28,16 +27,17 @@ from scroll_tactile.memory.touch_rows import (
     active_rows,
     annotation_of,
     declaration,
+    declared_by,
 )
-from scroll_tactile.persistence.contents import ListedContents, Rows, StoredContents, refusal
+from scroll_tactile.persistence.observations import TouchRows, refusal, rows_with
 from scroll_tactile.persistence.packing import sums_without
-from scroll_tactile.persistence.replaying import append_row
+from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.quantities import Quantity, require_declarable
 from scroll_tactile.validation.expected import quantities_of
-from scroll_tactile.validation.gate import MemoryStore, wrong_retractions, wrong_values
 
 __all__ = ["Choice", "MergePlan", "MergeRules"]
 
+MEMBERS = SOURCE, VALUES, LABELS  # attributes of an observation that stay where it comes in without its features
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
@@ -61,16 +61,16 @@ class MergeRules:
 class MergePlan:
     """What a merge will append to our journal, in order.
 
-    source: the other memory. rows: heads of its journal that are appended. compaction: its compaction checkpoint, which
-    stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
-    rows that are not appended: shared streams, and refused ones. refused: touches that have another name already, each
+    source: the other memory. compaction: its compaction checkpoint, which stands for the rows that it compacted. heads:
+    all of its rows. rows: those that come in. shared: how many streams both observed, or the other has twice. left_out:
+    rows that do not come in: shared streams, and refused ones. refused: touches that have another name already, each
     with the reason. descriptions: material → the description that is taken over. quantities: that ours lacks.
-    default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be added in place
-    of its rows.
+    default_source: see `MergeRules`.
     """
 
-    source: MemoryStore
+    source: AnyStore
     compaction: Checkpoint | None
+    heads: list[Head]
     rows: list[Head]
     shared: int
     left_out: set[int]
@@ -78,110 +78,82 @@ class MergePlan:
     descriptions: dict[str, Description]
     quantities: list[Quantity]
     default_source: str | None
-    newest: Checkpoint | None
 
     @classmethod
-    def of(
-        cls,
-        ours: Store,
-        memory: Memory,
-        theirs: MemoryStore,
-        contents: ListedContents | StoredContents,
-        rules: MergeRules,
-    ) -> Self:
-        """Plan a merge from both journals. contents: which touches ours has.
+    def of(cls, ours: AnyStore, memory: Memory, theirs: AnyStore, rules: MergeRules) -> Self:
+        """Plan a merge from both journals.
 
         Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a shared
         stream, or their descriptions and `descriptions` is "same"; ObservationError where a touch that must be
-        left out was compacted; DamageError for a damaged row of theirs, and for a shared stream whose readings do not
-        hash to its key, in either memory.
+        left out was compacted; DamageError for a damaged row of theirs.
         """
         _require_mergeable(ours, memory, theirs)
         compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
         quantities = _quantities(ours, memory, theirs, found, heads)
         incoming = active_rows(heads)
         declared = memory.quantities | {quantity.name: quantity for quantity in quantities}
-        known, refused = _already_there(incoming, contents, ours.path, compacted, rules, declared)
+        known, refused = _already_there(incoming, ours, memory, compacted, rules, declared)
         if refused and not rules.one_name:
             raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {refused[0][1]}")
         left_out = {*known, *(head.sequence for head, _ in refused)}
         out = [head for head in incoming if head.sequence in left_out]
         if fixed := [head for head in out if head.sequence <= compacted or head.kind == MEMBER]:
             raise _cannot_be_left_out(ours, theirs, fixed, refused)
-        rows = [head for head in incoming if head.sequence not in left_out]
+        # A merge before the compaction checkpoint is a part of it.
+        within = [head.sequence for head in incoming if head.kind == MERGE and head.sequence <= compacted]
+        rows = [head for head in incoming if head.sequence not in left_out.union(within)]
         bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
         if bare and memory.exemplars is not None:
             raise MismatchError(
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
-        described = _descriptions(ours, memory, theirs, found, rules.descriptions)
-        newest = _require_sound(theirs, heads, coming={head.sequence for head in rows})
-        for sequence in known.values():
-            if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
-                ours.record(sequence)
-        summed = newest if theirs.is_packed else None
+        described = _descriptions(ours, memory, theirs, found, heads, rules.descriptions)
         source = rules.default_source
-        return cls(theirs, found, rows, len(known), left_out, refused, described, quantities, source, summed)
+        return cls(theirs, found, heads, rows, len(known), left_out, refused, described, quantities, source)
 
-    def append_to(self, ours: Store, memory: Memory, progress: Callable[[int, int], object]) -> int:
-        """Append the rows to our journal and add them to our memory; returns the number of observations added.
-
-        The caller opens a batch around it: where one row does not pass the gate none is kept. progress: called with
-        (rows done, rows in all).
-        """
-        compaction = self.compaction
-        # A compaction checkpoint comes in as one row, and the merges before it are a part of it.
-        part = (
-            0
-            if compaction is None
-            else sum(head.kind == MERGE and head.sequence <= compaction.last_sequence for head in self.rows) - 1
-        )
-        total = len(self.rows) - part
-        for quantity in self.quantities:
-            append_row(memory, ours, DECLARE, quantity.name, attributes=declaration(quantity))
-        for material, description in self.descriptions.items():
-            append_row(memory, ours, DESCRIBE, material, attributes={"constituents": description})
-        sums = self._sums(memory)
-        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(compaction), start=1):
-            if sums is None:
-                append_row(memory, ours, kind, label, key, attributes=attributes, arrays=arrays, time=time)
-            else:
-                head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
-                if memory.exemplars is not None and "nbytes" in attributes:
-                    memory.exemplars.add(label, key, head.sequence)
-                memory.sequence = head.sequence
-            progress(done, total)
-        if sums is not None:
-            memory.join(sums, exemplars=False)
+    @property
+    def added(self) -> int:
+        """How many observations come in."""
         return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
 
-    def _sums(self, memory: Memory) -> Memory | None:
-        """The sums of the rows that come in, from the packed memory's own; None where the rows must be replayed."""
-        source = self.source
-        if self.newest is None or source.compacted:
-            return None
-        if memory.kept is not None and Identity.read(source).kept_touches != memory.kept.capacity:
-            return None
-        return sums_without(source, self.newest, memory, self.left_out)
+    def sums(self, memory: Memory) -> Memory | None:
+        """The sums of the rows that come in, from those of the other memory; None where the rows must be replayed.
 
-    def _rows_to_append(
-        self, compaction: Checkpoint | None
-    ) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
-        if compaction is not None:
+        Raises DamageError.
+        """
+        if self.compaction is not None or len(self.left_out) > len(self.rows):
+            return None
+        if memory.kept is not None and Identity.read(self.source).kept_touches != memory.kept.capacity:
+            return None
+        return sums_without(self.source, self.heads, memory, self.left_out)
+
+    @property
+    def total(self) -> int:
+        """How many rows `rows_to_append` gives."""
+        return len(self.quantities) + len(self.descriptions) + (self.compaction is not None) + len(self.rows)
+
+    def rows_to_append(self) -> Iterator[dict[str, Any]]:
+        """The rows that come in, each as the arguments of `Ledger`'s append."""
+        for quantity in self.quantities:
+            yield {"kind": DECLARE, "label": quantity.name, "attributes": declaration(quantity)}
+        for material, description in self.descriptions.items():
+            yield {"kind": DESCRIBE, "label": material, "attributes": {"constituents": description}}
+        if (compaction := self.compaction) is not None:
             left_out = ("tuned", "corrections", "descriptions")  # these stay there, and descriptions come as rows
             attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in compaction.arrays.items() if not name.startswith("tuned")}
-            yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
+            time = self.rows[0].time if self.rows else None
+            yield {"kind": MERGE, "label": "", "attributes": attributes, "arrays": arrays, "time": time}
         for head in self.rows:
-            if compaction is not None and head.sequence <= compaction.last_sequence:
-                if head.kind != MERGE:  # a merge before the compaction checkpoint is a part of it
-                    attributes = self._attributes_of(head)
-                    kept = {name: value for name, value in attributes.items() if name in (SOURCE, VALUES, LABELS)}
-                    yield MEMBER, head.label, head.key, kept, None, head.time
+            row = {"label": head.label, "key": head.key, "time": head.time}
+            attributes = self._attributes_of(head)
+            if compaction is None or head.sequence > compaction.last_sequence:
+                arrays = dict(self.source.record(head.sequence).arrays)
+                yield row | {"kind": head.kind, "attributes": attributes, "arrays": arrays}
             else:
-                record = self.source.record(head.sequence)
-                yield head.kind, head.label, head.key, self._attributes_of(head), record.arrays, head.time
+                kept = {name: value for name, value in attributes.items() if name in MEMBERS}
+                yield row | {"kind": MEMBER, "attributes": kept}
 
     def _attributes_of(self, head: Head) -> dict[str, Any]:
         touch = head.kind in (OBSERVE, MEMBER) and self.default_source is not None
@@ -189,12 +161,11 @@ class MergePlan:
 
 
 def _quantities(
-    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, heads: Sequence[Head]
+    ours: AnyStore, memory: Memory, theirs: AnyStore, compaction: Checkpoint | None, heads: Sequence[Head]
 ) -> list[Quantity]:
     """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
     declared = quantities_of({} if compaction is None else compaction.attributes)
-    for wrong in wrong_values(theirs.path, (head for head in heads if head.sequence > theirs.compacted), declared):
-        raise wrong
+    declared |= {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
     both = dict(memory.quantities)
     for name, quantity in sorted(declared.items()):
         try:
@@ -207,8 +178,8 @@ def _quantities(
 
 def _already_there(
     incoming: Sequence[Head],
-    contents: ListedContents | StoredContents,
-    where: Path,
+    store: AnyStore,
+    memory: Memory,
     compacted: int,
     rules: MergeRules,
     declared: Mapping[str, Quantity],
@@ -216,18 +187,18 @@ def _already_there(
     """The touches that our memory, or an earlier row of theirs, has under the same name: their row → ours, 0 of theirs.
 
     Also those that are refused, each with the reason: these have other values or labels there, or by `one_name`
-    another name. where: our memory. compacted: rows of theirs that cannot be left out.
+    another name. store, memory: ours. compacted: rows of theirs that cannot be left out.
     """
-    came: dict[bytes, Rows] = {}
+    came: dict[bytes, TouchRows] = {}
     known: dict[int, int] = {}
     refused: list[tuple[Head, str]] = []
     for head in (head for head in incoming if head.kind != MERGE):
-        ours, theirs = contents.rows(head.key), came.setdefault(head.key, {})
+        ours, theirs = rows_with(store, memory, head.key), came.setdefault(head.key, {})
         there, annotation = ours.get(head.label) or theirs.get(head.label), annotation_of(head.attributes)
         why = refusal(list(ours or theirs), head.label, head.key in rules.clipped) if rules.one_name else None
         if why is None and annotation and there is not None and annotation != there[1]:
             why = (
-                f"row {there[0]} of {where if head.label in ours else 'the same memory'} has this touch of "
+                f"row {there[0]} of {store.path if head.label in ours else 'the same memory'} has this touch of "
                 f"{head.label!r} with {there[1].shown(declared)}; row {head.sequence} comes with "
                 f"{annotation.shown(declared)}: retract one of them"
             )
@@ -243,7 +214,7 @@ def _already_there(
 
 
 def _cannot_be_left_out(
-    ours: Store, theirs: MemoryStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
+    ours: AnyStore, theirs: AnyStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
 ) -> ObservationError:
     named = {head.sequence: why for head, why in refused}
     if why := named.get(fixed[0].sequence):
@@ -257,13 +228,18 @@ def _cannot_be_left_out(
 
 
 def _descriptions(
-    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
+    ours: AnyStore,
+    memory: Memory,
+    theirs: AnyStore,
+    compaction: Checkpoint | None,
+    heads: Sequence[Head],
+    choice: Choice,
 ) -> dict[str, Description]:
     """Their descriptions that are taken over."""
     told: Mapping[str, Any] = {} if compaction is None else compaction.attributes
     theirs_now: dict[str, Description] = dict(told.get("descriptions", {}))
-    for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
-        if head.kind in (DESCRIBE, RETRACT):
+    for head in heads:
+        if head.kind in (DESCRIBE, RETRACT) and head.sequence > theirs.compacted:
             describe(theirs_now, head.label, head.attributes.get("constituents"))
     ours_now = memory.descriptions
     new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}
@@ -283,8 +259,8 @@ def _descriptions(
     return taken
 
 
-def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None:
-    if same_folder(ours.path, theirs.path):
+def _require_mergeable(ours: AnyStore, memory: Memory, theirs: AnyStore) -> None:
+    if isinstance(theirs, Store) and same_folder(ours.path, theirs.path):
         raise MismatchError(f"{ours.path} cannot be merged into itself: it has all of it already")
     mine, other = Identity.read(ours), Identity.read(theirs)
     for part in ("sensor", "embedding", "reading", "views", "grid"):
@@ -305,16 +281,6 @@ def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None
             f"{theirs.path} was compacted and keeps {other.kept_touches} touches to match with; {ours.path} keeps "
             f"{mine.kept_touches}, and the readings for the others are gone"
         )
-
-
-def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> Checkpoint | None:
-    """Their newest checkpoint. Verifies the rows that stay behind, too: raises DamageError where one fails the gate."""
-    for wrong in wrong_retractions(theirs.path, heads):
-        raise wrong
-    for head in heads:
-        if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
-            theirs.record(head.sequence)
-    return theirs.latest()
 
 
 def _without_configuration(part: Any) -> Any:

@@ -61,11 +61,10 @@ from scroll_tactile.persistence.observations import (
 )
 from scroll_tactile.persistence.ram_store import AnyStore, RamStore
 from scroll_tactile.persistence.replaying import (
-    Leaving,
     apply,
     apply_appended,
+    chosen_without,
     exemplar_candidates,
-    leaving,
     load,
     until,
 )
@@ -83,7 +82,6 @@ logger = logging.getLogger(__name__)
 Answer = TypeVar("Answer")
 
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
-REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
 MOST_CHANGES = 1024  # that are remembered for those who follow
 # A checkpoint writes all materials, so many of them in the time that one touch takes to learn: it waits until as long
 # was spent on touches. With 100 000 materials and a row for each 16, writing took twice as long as learning.
@@ -234,12 +232,13 @@ class Ledger:
         arrays: Arrays | None = None,
         time: float | None = None,
         codes: Codes | None = None,
-        gone: Leaving | None = None,
+        gone: Mapping[int, Record] | None = None,
+        chosen: Memory | None = None,
         summed: bool = False,
     ) -> int:
         """Append a row to the journal, then apply it; returns its number.
 
-        codes: of an observation; gone: of a retraction: what was read for it before. summed: see `apply`.
+        codes, gone, summed: see `apply`. chosen: what is chosen after a retraction, see `chosen_without`.
         """
         memory = self.memory
         self._whole = False
@@ -249,9 +248,9 @@ class Ledger:
             self._whole = not self._batching  # in a batch, rows before it may be lost, too
             raise
         row = Record(**vars(head) | {"arrays": arrays or {}})
-        changed = apply(memory, row, self.store, codes, gone=gone and gone.records, summed=summed)
-        if gone and gone.chosen:
-            memory.chosen = gone.chosen.chosen
+        changed = apply(memory, row, self.store, codes, gone=gone, summed=summed)
+        if chosen is not None:
+            memory.chosen = chosen.chosen
         if changed != []:
             self._changed(changed)
         self._whole = True
@@ -419,9 +418,9 @@ class Ledger:
         return len(found)
 
     def _retract(self, records: Sequence[Record], material: str) -> None:
-        # All that it reads is read before its row is in the journal: on a damaged one every later opening would fail.
-        gone = leaving(self.memory, self.store, records)
-        self._append(RETRACT, material, attributes={"sequences": spans(gone.records)}, gone=gone)
+        gone = {record.sequence: record for record in records}
+        chosen = chosen_without(self.memory, self.store, gone)
+        self._append(RETRACT, material, attributes={"sequences": spans(gone)}, gone=gone, chosen=chosen)
 
     def relabel(self, receipt: Receipt | int, material: str) -> int:
         """As `TactileLearner.relabel`."""
@@ -513,16 +512,12 @@ class Ledger:
             if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.compacted):
                 return False
             try:
-                # A checkpoint that was written between the reads may contain later rows than were read here.
-                for _ in range(REFRESH_ATTEMPTS):
-                    if store.compacted != memory.compacted or store.last - memory.sequence > CHECKPOINT_EVERY:
-                        break
+                if store.compacted == memory.compacted and store.last - memory.sequence <= CHECKPOINT_EVERY:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     self._whole = False
                     self._changed(apply_appended(memory, store, records))
                     self._whole = True
-                    if store.newest == memory.checkpoint and store.compacted == memory.compacted:
-                        return True
+                    return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
             self._memory, self._whole = load(self._empty, store), True

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from copy import copy
 from itertools import takewhile
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
     CORRECTION,
+    DECLARE,
     DESCRIBE,
     MERGE,
     OBSERVE,
@@ -31,6 +32,7 @@ from scroll_tactile.memory.touch_rows import (
     Changed,
     Codes,
     active_rows,
+    declared_by,
     only_readings,
     retracted_by,
     unspanned,
@@ -39,14 +41,12 @@ from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
-from scroll_tactile.validation.gate import misdeclared, wrong_values
 
 __all__ = [
-    "Leaving",
     "apply",
     "apply_appended",
+    "chosen_without",
     "exemplar_candidates",
-    "leaving",
     "load",
     "ranked_exemplars",
     "refill",
@@ -57,17 +57,6 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 LOAD_ATTEMPTS = 20  # of a reader, while a writer changes the store
-
-
-class Leaving(NamedTuple):
-    """What a retraction takes, read before its row is written: a damaged row is named while nothing has changed.
-
-    records: the observations that go, by row. chosen: what is chosen among those that stay; None where none of those
-    that go was chosen.
-    """
-
-    records: Mapping[int, Record]
-    chosen: Memory | None
 
 
 def load(empty: Memory, store: AnyStore) -> Memory:
@@ -119,7 +108,7 @@ def apply(
     after the last row. Raises CapacityError before anything is added, DamageError for what cannot be.
     """
     changed: list[Changed] | None = []
-    _note(memory, row, store)
+    _note(memory, row)
     if row.kind == OBSERVE and summed:
         memory.add_exemplar(row)
     elif row.kind == OBSERVE:
@@ -127,17 +116,17 @@ def apply(
     elif row.kind == RETRACT:
         changed = _retract(memory, row, store, gone or {})
     elif row.kind == MERGE:
-        _join(memory, row, store)
+        _join(memory, row)
         changed = None
     memory.sequence = row.sequence
     return changed
 
 
-def _note(memory: Memory, row: Head, store: AnyStore) -> None:
+def _note(memory: Memory, row: Head) -> None:
     """Apply what a row says of quantities, descriptions and the skin, if anything."""
-    for wrong in wrong_values(store.path, [row], memory.quantities):
-        raise wrong
-    if row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
+    if row.kind == DECLARE:
+        memory.quantities.setdefault(row.label, declared_by(row))
+    elif row.kind in (DESCRIBE, RETRACT):  # a retraction has no constituents, and names a material only in `forget`
         describe(memory.descriptions, row.label, row.attributes.get("constituents"))
     elif row.kind == ADAPT and RETRACTS in row.attributes:
         memory.corrections.pop(cast(int, row.attributes[RETRACTS]), None)
@@ -172,12 +161,9 @@ def _retract(memory: Memory, row: Record, store: AnyStore, known: Mapping[int, R
     return changed
 
 
-def _join(memory: Memory, row: Record, store: AnyStore) -> None:
+def _join(memory: Memory, row: Record) -> None:
     """Add another memory of the same recipe, from a row with the arrays and attributes of its compaction checkpoint."""
     other = memory.empty_like().fill(row.arrays, row.attributes, source=row.sequence)
-    for name, quantity in other.quantities.items():
-        if memory.quantities.get(name) != quantity:
-            raise misdeclared(store.path, row, f"values of {quantity}, which is not what was declared")
     memory.join(other, exemplars="exemplar-readings" in row.arrays)
 
 
@@ -196,16 +182,6 @@ def apply_appended(memory: Memory, store: AnyStore, records: Sequence[Record]) -
     return None if None in changed else [each for touches in changed for each in touches or ()]
 
 
-def leaving(memory: Memory, store: AnyStore, records: Sequence[Record]) -> Leaving:
-    """What it takes to retract some observations. Raises DamageError where a row that it takes is damaged."""
-    store.compaction()  # raises where it is damaged: choosing samples again needs it
-    held = any(sample.holds(record.label, record.key) for sample in memory.samples for record in records)
-    gone = {record.sequence: record for record in records}
-    rest = copy(memory)
-    rest.retracted = memory.retracted | gone.keys()
-    return Leaving(gone, _chosen(rest, store, memory.sequence) if held else None)
-
-
 def refill(memory: Memory, store: AnyStore) -> None:
     """Choose sample and exemplars again after a retraction; does nothing if no retracted touch was among them."""
     if memory.stale:
@@ -213,10 +189,22 @@ def refill(memory: Memory, store: AnyStore) -> None:
         memory.chosen = _chosen(memory, store, memory.sequence).chosen
 
 
+def chosen_without(memory: Memory, store: AnyStore, gone: Mapping[int, Record]) -> Memory | None:
+    """A memory with what is chosen where these observations are retracted; None where none of them was chosen.
+
+    A damaged row is named by this, while the retraction has no row yet: on it every later opening would fail.
+    """
+    if not any(sample.holds(row.label, row.key) for sample in memory.samples for row in gone.values()):
+        return None
+    store.compaction()  # raises where it is damaged: with the memory as it was, there is still a choice
+    rest = copy(memory)
+    rest.retracted = memory.retracted | gone.keys()
+    return _chosen(rest, store, memory.sequence)
+
+
 def until(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
     """The memory of all observations up to a row, without retracted ones: a compaction at that row keeps it."""
     made, later = _chosen(memory, store, last_sequence), memory.empty_like()
-    later.quantities = dict(memory.quantities)
     for head in store.heads(last_sequence):  # whoever compacts has read all
         if head.kind in (OBSERVE, MERGE) and head.sequence not in memory.retracted:
             apply(later, store.record(head.sequence), store)
@@ -225,36 +213,27 @@ def until(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
 
 
 def _chosen(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
-    """A memory with what was chosen and noted up to a row, without the retracted observations."""
-    fresh, heads = _compaction_samples(memory, store), _behind_compaction(memory, store, last_sequence)
+    """A memory with what was chosen and noted up to a row, without the retracted observations.
+
+    Raises DamageError for a damaged row: without it other touches would be chosen.
+    """
+    fresh = _compaction_samples(memory, store)
+    try:
+        heads = list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
+    except DamageError as damage:
+        raise DamageError(
+            f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair the "
+            "memory (scroll-tactile memory repair)",
+            path=damage.path,
+            sequence=damage.sequence,
+        ) from damage
     for head in heads:
-        _note(fresh, head, store)
+        _note(fresh, head)
         if head.kind == MERGE:
-            _join(fresh, store.record(head.sequence), store)
+            _join(fresh, store.record(head.sequence))
     observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]
     fresh.choose(observed, store.record, memory)
     return fresh
-
-
-def _behind_compaction(memory: Memory, store: AnyStore, last_sequence: int) -> list[Head]:
-    """The rows up to one from which samples are chosen.
-
-    A damaged row may be of any kind. Without it other touches would be chosen, and a writer would save them: it gets
-    DamageError. A reader, which saves nothing, gets the remaining rows and a warning.
-    """
-    try:
-        return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
-    except DamageError as damage:
-        if store.mode == "write":
-            raise DamageError(
-                f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair the "
-                "memory (scroll-tactile memory repair)",
-                path=damage.path,
-                sequence=damage.sequence,
-            ) from damage
-        logger.warning("%s; samples of touches are chosen without it, others than there were", damage)
-    left = (head for kind in (MERGE, OBSERVE) for head in store.heads(memory.compacted, kind=kind))
-    return [head for head in left if head.sequence <= last_sequence]
 
 
 def _compaction_samples(memory: Memory, store: AnyStore) -> Memory:
@@ -265,7 +244,7 @@ def _compaction_samples(memory: Memory, store: AnyStore) -> Memory:
         if (compaction := store.compaction()) is not None:
             fresh.fill(compaction.arrays, compaction.attributes)
     except DamageError as damage:
-        # The statistics are complete without it: better to open with fewer samples than not at all.
+        # The statistics are complete without it, and a repair has them where a checkpoint is written behind it.
         logger.warning(
             "%s; no other touch can take the place of a retracted one: repair the memory (scroll-tactile memory "
             "repair)",
@@ -301,17 +280,17 @@ def exemplar_candidates(memory: Memory, store: AnyStore) -> list[Exemplar]:
 
     Raises CompactedError where the store was compacted since the memory was read, DamageError, StoreClosedError.
     """
-    found: dict[tuple[str, bytes], Exemplar] = {}
-    wanted: dict[int, list[tuple[str, bytes]]] = {}
+    wanted: dict[int, set[tuple[str, bytes]]] = {}
     for material, key, source in memory.exemplars or ():
         # The compaction checkpoint holds what was compacted.
-        wanted.setdefault(source if source > memory.compacted else 0, []).append((material, key))
-    for sequence, streams in sorted(wanted.items()):
-        held = {(exemplar.material, exemplar.key): exemplar for exemplar in _exemplars_in(memory, store, sequence)}
-        found |= {stream: held[stream] for stream in streams if stream in held}
-        if lost := len(set(streams) - set(held)):
+        wanted.setdefault(source if source > memory.compacted else 0, set()).add((material, key))
+    found: list[Exemplar] = []
+    for source, touches in wanted.items():
+        held = [one for one in _exemplars_in(memory, store, source) if (one.material, one.key) in touches]
+        if lost := len(touches) - len(held):
             logger.warning("%s: the readings of %d candidates for exemplars were lost to damage", store.path, lost)
-    return [found[stream] for stream in sorted(found)]
+        found += held
+    return sorted(found, key=lambda exemplar: (exemplar.material, exemplar.key))
 
 
 def _exemplars_in(memory: Memory, store: AnyStore, sequence: int) -> list[Exemplar]:

@@ -150,10 +150,7 @@ class Ledger:
     @property
     def correction(self) -> Correction | None:
         """Through which new touches are read; None where the skin is the one that learned."""
-        with self.lock:
-            return self.memory.correction
-
-    # What changed since, for those who follow.
+        return self.read(lambda memory, _: memory.correction)
 
     def _changed(self, touches: Sequence[Changed] | None) -> None:
         self.version += 1
@@ -173,8 +170,6 @@ class Ledger:
             labels = ((touch.material if not axis else dict(touch.labels).get(axis)) for touch in touches)
             found |= {label for label in labels if label is not None}
         return found
-
-    # Whether it can be changed.
 
     def require_open(self) -> AnyStore:
         """The store. Raises StoreClosedError after `close`."""
@@ -219,8 +214,6 @@ class Ledger:
     def _require_no_batch(self, what: str) -> None:
         if self._batching:
             raise InputError(f"{what} is a batch of its own: end the batch before it")
-
-    # Changes.
 
     def _append(
         self,
@@ -524,8 +517,6 @@ class Ledger:
             self._changed(None)
             return True
 
-    # Checkpoints.
-
     def _checkpoint_if_due(self) -> None:
         if self.saves:
             materials = self._memory.statistics.material_count
@@ -552,10 +543,6 @@ class Ledger:
 
     def _note_saved(self) -> None:
         self._saved, self._saved_weighings = self._memory.sequence, dict(self._memory.weighings)
-
-    def take_weighing(self, axis: str) -> str | None:
-        """What the checkpoint that the memory was read from says of how an axis is weighed, once."""
-        return self.memory.weighings.pop(axis, None)
 
     def close(self, weighings: Mapping[str, str]) -> None:
         """As `TactileLearner.close`. weighings: see `Memory`."""

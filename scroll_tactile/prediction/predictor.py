@@ -322,7 +322,7 @@ class Predictor:
 
         It was fitted to these touches or to fewer: a retraction drops it.
         """
-        if (text := self.ledger.take_weighing(self.axis)) is None:
+        if (text := self.ledger.memory.weighings.pop(self.axis, None)) is None:
             return None
         memory = self.memory
         try:

@@ -105,16 +105,6 @@ class SecondMoment:
         """One that changes independently; a triangle is of both until it changes."""
         return SecondMoment(self.dimension, self.rows, self._kept.copy())
 
-    def undo(self) -> Callable[[], None]:
-        """What takes the next `add` back, however much of it was done; it can be called again."""
-        kept, state, rows = self._kept, dict(self._kept.__dict__), self.rows
-
-        def undo() -> None:
-            kept.__dict__.update(state)
-            self._kept, self.rows = kept, rows
-
-        return undo
-
     def joined(self, other: SecondMoment, sign: int) -> SecondMoment:
         """This one and another; with a sign of −1 this one without the other."""
         rows, ours, theirs = self.rows + sign * other.rows, self.codes(), other.codes()

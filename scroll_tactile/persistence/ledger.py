@@ -50,7 +50,7 @@ from scroll_tactile.memory.touch_rows import (
     spans,
 )
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.persistence.merge import MergePlan, MergeRules
+from scroll_tactile.persistence.merge import Merge, MergeRules
 from scroll_tactile.persistence.observations import (
     adaptation_of,
     compaction_point,
@@ -445,17 +445,17 @@ class Ledger:
             store, memory = self.require_open(), self.memory
             self._require_no_batch("a merge")
             with _opened(other, memory) as source:
-                plan = MergePlan.of(store, memory, source, rules)
-                sums = plan.sums(memory)
+                merge = Merge(store, memory, source, rules)
+                sums = merge.sums()
                 with self._together():
-                    for done, row in enumerate(plan.rows_to_append(), start=1):
+                    for done, row in enumerate(merge.rows(), start=1):
                         self._append(**row, summed=sums is not None)
-                        progress("merging", done, plan.total)
+                        progress("merging", done, merge.total)
                     if sums is not None:
                         memory.join(sums, exemplars=False)
             self._changed(None)
             self._checkpoint_if_due()
-        return Merged(plan.added, plan.shared, len(plan.descriptions)), plan.refused
+        return Merged(merge.added, merge.shared, len(merge.descriptions)), merge.refused
 
     def compact(self, keep: int) -> Compacted:
         """As `TactileLearner.compact`."""

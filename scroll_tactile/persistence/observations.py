@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import takewhile
-from typing import Literal, cast
+from typing import cast
 
 from scroll_tactile_store import Head, Record
 
@@ -182,22 +182,17 @@ def observations(store: AnyStore) -> list[Observation]:
     """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
-
-    def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
-        if head.sequence in retracted:
-            return "retracted"
-        return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
-
     quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
+        gone = head.sequence <= compacted or head.kind == MEMBER
         return Observation(
             sequence=head.sequence,
             material=head.label,
             key=head.key,
             time=head.time,
-            state=state(head),
+            state="retracted" if head.sequence in retracted else "compacted" if gone else "kept",
             source=cast("str | None", head.attributes.get(SOURCE)),
             values=annotation.measured(quantities),
             labels=dict(annotation.labels),

@@ -48,6 +48,7 @@ __all__ = [
     "chosen_without",
     "exemplar_candidates",
     "load",
+    "note",
     "ranked_exemplars",
     "refill",
     "require_compaction",
@@ -108,7 +109,7 @@ def apply(
     after the last row. Raises CapacityError before anything is added, DamageError for what cannot be.
     """
     changed: list[Changed] | None = []
-    _note(memory, row)
+    note(memory, row)
     if row.kind == OBSERVE and summed:
         memory.add_exemplar(row)
     elif row.kind == OBSERVE:
@@ -122,7 +123,7 @@ def apply(
     return changed
 
 
-def _note(memory: Memory, row: Head) -> None:
+def note(memory: Memory, row: Head) -> None:
     """Apply what a row says of quantities, descriptions and the skin, if anything."""
     if row.kind == DECLARE:
         memory.quantities.setdefault(row.label, declared_by(row))
@@ -228,7 +229,7 @@ def _chosen(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
             sequence=damage.sequence,
         ) from damage
     for head in heads:
-        _note(fresh, head)
+        note(fresh, head)
         if head.kind == MERGE:
             _join(fresh, store.record(head.sequence))
     observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]

@@ -29,7 +29,6 @@ __all__ = [
     "Exemplar",
     "ExemplarFields",
     "ExemplarSample",
-    "Source",
     "herd",
     "quotas",
     "rank",
@@ -176,15 +175,10 @@ class ExemplarFields(TouchFields):
         return [Exemplar(name, key, {"readings": each}, code, scale) for (name, key, _), each, code, scale in own]
 
 
-Source = int | Exemplar
-"""Where a candidate's readings lie: in this row of the journal; 0, or a compacted row: in the compaction checkpoint.
-
-Without a journal it is the exemplar itself.
-"""
-
-
-class ExemplarSample(Sample[Source]):
+class ExemplarSample(Sample[int]):
     """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
+
+    Of each it has the row of the journal in which its readings lie; 0 or a compacted row: the compaction checkpoint.
 
     exemplars: streams in the buffer; `ratio` times as many candidates are kept.
     ratio: at 1 the buffer is a random choice; more candidates come nearer to the class mean.
@@ -214,17 +208,13 @@ class ExemplarSample(Sample[Source]):
         names, keys = [one.material for one in candidates], key_rows([one.key for one in candidates])
         return ExemplarFields(names, [], keys, np.zeros(len(names), np.int64), held)
 
-    def fill(self, kept: ExemplarFields, source: int | None) -> Self:
-        """Take in what `to_fields` gave.
+    def fill(self, kept: ExemplarFields, source: int) -> Self:
+        """Take in what `to_fields` gave. source: the row of those that come with their readings.
 
-        source: of those that come with their readings; None: each is its own. A sample of fewer keeps the first; one of
-        more lacks what was dropped before.
+        A sample of fewer keeps the first; one of more lacks what was dropped before.
         """
-        if source is None:
-            self.update((held.material, held.key, held) for held in kept.exemplars())
-        else:
-            sources = kept.sources.tolist() if kept.held is None else [source] * len(kept.materials)
-            self.update((*each[:2], row) for each, row in zip(kept.named(), sources, strict=True))
+        sources = kept.sources.tolist() if kept.held is None else [source] * len(kept.materials)
+        self.update((*each[:2], row) for each, row in zip(kept.named(), sources, strict=True))
         return self
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,18 @@ class _Kept(BaseModel):
     """A part of an identity, as JSON keeps it; fields that a later version adds are ignored."""
 
     model_config = ConfigDict(frozen=True)
+
+
+class Identified(Protocol):
+    """A store, as far as it says what it was made with."""
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """What it was made with."""
 
 
 class EmbeddingIdentity(_Kept):
@@ -132,7 +144,7 @@ class Identity(_Kept):
             raise InputError(f"no memory can be made with {first_wrong(error)}") from None
 
     @classmethod
-    def read(cls, store: Store) -> Self:
+    def read(cls, store: Identified) -> Self:
         """The identity that a store was made with.
 
         Raises MismatchError for a store that holds no memory of touch, DamageError for one that is none.

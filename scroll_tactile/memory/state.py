@@ -14,7 +14,7 @@ from scroll_tactile_store import Checkpoint, Head, Record
 
 from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.descriptions import Description, checked
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarFields, ExemplarSample, Source
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarFields, ExemplarSample
 from scroll_tactile.memory.touch_rows import (
     Changed,
     Codes,
@@ -207,57 +207,42 @@ class Memory:
         for old in list(self.corrections)[:-MOST_CORRECTIONS]:
             del self.corrections[old]
 
-    def add(
-        self,
-        material: str,
-        key: bytes,
-        columns: int,
-        codes: Codes,
-        sequence: int,
-        source: Source | None,
-        readings: Readings | None,
-        annotation: Annotation = NO_ANNOTATION,
-    ) -> None:
-        """Add an observation without a journal: a touch of so many columns, its rows of codes by scale, and its number.
+    def add(self, row: Record, codes: Codes | None = None) -> Changed:
+        """Add an observation; only `replaying.apply` does. codes: its own, where they are there already.
 
-        source: of its readings, for the exemplars. readings: for the kept touches. None: they are not kept.
-        `replaying.replay` adds what a journal has. Raises CapacityError before anything is added.
+        Raises CapacityError before anything is added.
         """
+        columns, codes = self.codes(row) if codes is None else (cast(int, row.attributes["columns"]), codes)
+        material, key, annotation = row.label, row.key, annotation_of(row.attributes)
         self.statistics.add(material, codes, columns)
         self.targets.add(material, key, annotation, codes, columns)
         if self.sample.wants(material, key):
             self.sample.add(material, key, self._touch(columns, codes, annotation))
-        if self.kept is not None and source is not None:
-            self.kept.take(material, key, readings, annotation)
-        if self.exemplars is not None and source is not None:
-            self.exemplars.add(material, key, source)
-        self.sequence = sequence
+        if self.kept is not None and self.kept.wants(material, key):
+            self.kept.take(material, key, unpack_readings(row.arrays), annotation)
+        self.add_exemplar(row)
+        return Changed(material, annotation.labels)
 
-    def undo(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
-        """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
-        parts = [sample.undo(material, key) for sample in self.samples if sample.wants(material, key)]
-        parts += [self.statistics.undo(material, columns), self.targets.undo(annotation, columns)]
-        sequence = self.sequence
+    def add_exemplar(self, row: Head) -> None:
+        """Add an observation to the candidates for exemplars, if its row holds readings."""
+        if self.exemplars is not None and row.attributes.get("nbytes"):
+            self.exemplars.add(row.label, row.key, row.sequence)
 
-        def undo() -> None:
-            for part in parts:
-                part()
-            self.sequence = sequence
+    def retract(self, row: Record) -> Changed:
+        """Subtract an observation from the sums; `replaying.refill` chooses again what was chosen.
 
-        return undo
-
-    def retract(self, record: Record) -> Changed:
-        """Subtract an observation from the sums; call `replaying.refill` afterwards, for what was chosen."""
-        material, key, annotation = record.label, record.key, annotation_of(record.attributes)
-        columns, codes = self.codes(record)
+        Raises UnknownMaterialError for one that the sums do not have.
+        """
+        material, key, annotation = row.label, row.key, annotation_of(row.attributes)
+        columns, codes = self.codes(row)
         self.statistics.remove(material, codes, columns)
         self.targets.remove(material, key, annotation, codes, columns)
-        self.retracted.add(record.sequence)
+        self.retracted.add(row.sequence)
         self.retractions += 1
         self.weighings.clear()
         if any(sample.holds(material, key) for sample in self.samples):
             self.stale = True
-        if record.sequence <= self.tuned_last_sequence:
+        if row.sequence <= self.tuned_last_sequence:
             self.tuned = None
         return Changed(material, annotation.labels)
 
@@ -265,14 +250,6 @@ class Memory:
     def samples(self) -> list[Sample[Any]]:
         """What was chosen among the observations, as far as the recipe keeps it."""
         return [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
-
-    def put_back(self, record: Record) -> None:
-        """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and the tuned model."""
-        columns, codes = self.codes(record)
-        self.statistics.add(record.label, codes, columns)
-        self.targets.add(record.label, record.key, annotation_of(record.attributes), codes, columns)
-        self.retracted.discard(record.sequence)
-        self.stale = False
 
     def choose(self, heads: Sequence[Head], record: Callable[[int], Record], made: Memory) -> None:
         """Choose samples and exemplars among what they hold and some observations.
@@ -381,12 +358,11 @@ class Memory:
             )
         )
 
-    def fill(self, held: Checkpoint | Record, path: Path, source: int | None = None) -> Self:
+    def fill(self, held: Checkpoint | Record, path: Path, source: int = 0) -> Self:
         """This memory, empty before, filled with what a checkpoint holds, or a row that brought one.
 
         The arrays are taken over. path: of the memory where they were read, for the error. source: the row that has the
-        readings of exemplars which come with them, 0 for the compaction checkpoint; None where they are their own.
-        Raises DamageError.
+        readings of exemplars which come with them, 0 for the compaction checkpoint. Raises DamageError.
         """
         made, sensor = MemoryFields.of(held, self.statistics.dimension, path), self.recipe.sensor
         self.sequence = 0 if isinstance(held, Record) else held.last_sequence

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scroll_tactile_store import Head, Store, StoreError
+from scroll_tactile_store import Head, StoreError
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
@@ -23,7 +23,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.observations import is_from
-from scroll_tactile.persistence.open_memory import OpenMemory
+from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name
@@ -42,13 +42,13 @@ LIKELIER = math.log(100)  # that the touches have to be, each by the correction 
 FEWEST_SPREAD = 8  # touches of materials that were touched before, by which it is known how touches differ
 
 
-def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
+def health_of(ledger: Ledger, channels: int, rules: WatchRules) -> Health:
     """The health that the rows chosen by rules tell, in the journal's order; retracted ones are not there.
 
     It goes on from the rows that were read last by the same rules. Two threads that ask at once read them both.
     """
     with ledger.lock:
-        ledger.require_store("tell how its sensor is")
+        ledger.require_open()
         _ = ledger.memory  # which may have lost rows, and says so as it is read
         watched = ledger.watched.pop(rules, None)
         if watched is None or watched.lost != ledger.lost:
@@ -61,13 +61,13 @@ def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
         _keep(ledger, watched)
         raise
     with ledger.lock:
-        store = ledger.require_store("tell how its sensor is")
+        store = ledger.require_open()
         found = watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
         _keep(ledger, watched)  # from here on another thread may take it further
         return found
 
 
-def _keep(ledger: OpenMemory, watched: WatchedRows) -> None:
+def _keep(ledger: Ledger, watched: WatchedRows) -> None:
     """Go on from these rows at the next question by the same rules; those by the last few rules are kept."""
     with ledger.lock:
         ledger.watched[watched.rules] = watched
@@ -75,10 +75,10 @@ def _keep(ledger: OpenMemory, watched: WatchedRows) -> None:
             del ledger.watched[next(iter(ledger.watched))]
 
 
-def _piece(ledger: OpenMemory, watched: WatchedRows) -> list[WatchedRow]:
+def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
     """The next rows to be taken, none at the end, and after an alarm; those retracted meanwhile are taken back."""
     with ledger.lock:
-        store, memory = ledger.require_store("tell how its sensor is"), ledger.memory
+        store, memory = ledger.require_open(), ledger.memory
         _take_back(store, memory, watched)
         if watched.watch.alarmed is not None:
             return []
@@ -91,7 +91,7 @@ def _piece(ledger: OpenMemory, watched: WatchedRows) -> list[WatchedRow]:
         return rows
 
 
-def _take_back(store: Store, memory: Memory, watched: WatchedRows) -> None:
+def _take_back(store: AnyStore, memory: Memory, watched: WatchedRows) -> None:
     """Have what was retracted since it was last read go."""
     if memory.sequence > watched.known:
         new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
@@ -155,8 +155,7 @@ def adapt_to(
 ) -> Adaptation:
     """As `TactileLearner.adapt`, for touches that `known_touches` gave. unknown_of: how many are called unknown."""
     with ledger.lock:
-        store, memory = ledger.require_store("be adapted"), ledger.memory
-        ledger.require_write_mode()
+        store, memory = ledger.require_write_mode(), ledger.memory
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
         own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
@@ -193,7 +192,7 @@ def adapt_to(
     )
 
 
-def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:
+def _reference(store: AnyStore, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:
     """What the rows up to one say of touches, without those by which the memory is to be adapted."""
     last = memory.sequence if until is None else min(until, memory.sequence)
     reference = Reference(channels)
@@ -207,7 +206,7 @@ def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], unt
     return reference
 
 
-def _require_known(reference: Reference, materials: Sequence[str], store: Store) -> None:
+def _require_known(reference: Reference, materials: Sequence[str], store: AnyStore) -> None:
     """Raise InputError where the rows do not say how touches of these materials read, and how touches differ."""
     if missing := [name for name in materials if not reference.counts.get(name)]:
         raise InputError(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
@@ -171,18 +171,6 @@ class TargetSums:
         self._quantities[of] = count, total, squares
         if not any(self._quantities[of]):
             del self._quantities[of]
-
-    def undo(self, annotation: Annotation, columns: int) -> Callable[[], None]:
-        """What takes the next `add` back, of this annotation, however much of it was done; it can be called again."""
-        axes, quantities, counts = dict(self.axes), dict(self._quantities), (self._touches, self._total)
-        parts = [self.axes[axis].undo(label, columns) for axis, label in annotation.labels if axis in self.axes]
-
-        def undo() -> None:
-            for part in parts:
-                part()
-            self.axes, self._quantities, (self._touches, self._total) = dict(axes), dict(quantities), counts
-
-        return undo
 
     def digest(self) -> str:
         """Hex of a SHA-256 over all of it: equal where the annotations are those of the same touches."""

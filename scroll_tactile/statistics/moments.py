@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import Counter
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -135,10 +134,6 @@ class SecondMoment:
         other = copy.copy(self)
         other._codes = self._codes[: self._kept].copy()
         return other
-
-    def undo(self) -> Callable[[], None]:
-        """What takes the next `add` back, however much of it was done; it can be called again."""
-        return partial(self.__dict__.update, self.__dict__.copy())
 
     def joined(self, other: SecondMoment, sign: int) -> SecondMoment:
         """This one and another; with a sign of −1 this one without the other."""

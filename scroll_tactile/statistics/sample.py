@@ -134,21 +134,6 @@ class Sample(Generic[T]):
             del self._items[last, self._keys[last].pop()]
             self._greatest = None
 
-    def undo(self, material: str, key: bytes) -> Callable[[], None]:
-        """What takes the next `add` back, of an item that is wanted; however much was done, and repeatedly."""
-        touched = {material, self._last()[2]} if len(self) >= self.capacity else {material}
-        keys = {name: list(self._keys.get(name, [])) for name in touched}
-        # What falls out is the last of its material.
-        items = {(name, own[-1]): self._items[name, own[-1]] for name, own in keys.items() if own}
-
-        def undo() -> None:
-            self._items.pop((material, key), None)
-            self._items.update(items)
-            self._keys.update(keys)
-            self._greatest = None
-
-        return undo
-
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
         for material, key, item in items:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
@@ -115,33 +115,8 @@ class Statistics:
     def _add_sums(self, scale: Scale, place: int, more: Ints) -> None:
         total = self._sums[scale][place] + more
         if self._sums[scale].dtype == np.int32 and np.abs(total).max(initial=0) > LARGEST:
-            self._sums = {**self._sums, scale: self._sums[scale].astype(np.int64)}  # who undoes this has those before
+            self._sums = {**self._sums, scale: self._sums[scale].astype(np.int64)}
         self._sums[scale][place] = total
-
-    def undo(self, material: str, columns: int) -> Callable[[], None]:
-        """What takes the next `add` back, of this material and so many columns, however much of it was done.
-
-        It can be called again.
-        """
-        arrays, length = (self._observations, self._rows, self._sums), self._lengths[columns]
-        seconds = [second.undo() for second in self._seconds.values()]
-        new = material not in self._places
-        place = len(self._places) if new else self._places[material]
-        own = slice(place, place + 1)  # empty where the arrays have yet to grow
-        before = [(array, array[own].copy()) for array in (arrays[0], *arrays[1].values(), *arrays[2].values())]
-
-        def undo() -> None:
-            self._observations, self._rows, self._sums = arrays
-            for array, values in before:
-                array[own] = values
-            for second in seconds:
-                second()
-            self._lengths[columns] = length
-            self._lengths = +self._lengths
-            if new:
-                self._places.pop(material, None)
-
-        return undo
 
     def require_room(self, codes: Codes) -> None:
         """Raise CapacityError where these codes could not be added."""

@@ -17,13 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scroll_tactile_store import check_store
+from scroll_tactile_store import Record, check_store
 from touches import PAD, SETTINGS, SMALL, SmallSample, stream
 
 import scroll_tactile.memory.state
 from faults.model import Operation, Pairs, State, Touch
 from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.memory.touch_rows import annotated
 from scroll_tactile.persistence.merge import MergeRules
 from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.statistics.fields import encode
@@ -107,8 +108,9 @@ def fed(pairs: Pairs, embedding: str = "own", **more: Any) -> TactileLearner:
 def _count_once_more(learner: TactileLearner, material: str, touch: Touch) -> None:
     stream, memory = learner.stream(KIT.stream(touch)), learner.memory
     annotation = Annotation.of(learner.quantities, *KIT.noted(touch))
-    learned = learner._predictor.extractor.learned(stream)
-    memory.add(material, stream.key, *learned, memory.sequence, None, None, annotation)
+    columns, codes = learner._predictor.extractor.learned(stream)
+    attributes = {"columns": columns} | annotated(annotation)
+    memory.add(Record(memory.sequence, "observe", material, stream.key, 0.0, attributes, 0, arrays={}), codes)
 
 
 def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:

@@ -425,7 +425,7 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
             learner.adapt(five(lambda stream: stream.readings))  # though it would be left as it is
         with pytest.raises(ReadOnlyError):
             learner.retract(done)
-    with pytest.raises(errors.InputError, match="without a path"):
+    with pytest.raises(errors.UnknownMaterialError):
         TactileLearner(sensor=PAD).adapt(pairs)
     with TactileLearner.open(tmp_path / "new", sensor=PAD, **HOW) as learner:
         for name in NAMES:

@@ -200,10 +200,6 @@ def test_a_compaction_checkpoint_gives_exemplars_back_and_says_that_it_has_them(
         (e.material, e.key, e.readings.tobytes(), e.readings.shape, e.code.tolist(), e.scale) for e in kept
     ]
     assert all(source == 0 for *_, source in ExemplarSample(99).fill(fields, 0))
-    alone = ExemplarSample(99).fill(fields, None)
-    assert [(material, key, source.key) for material, key, source in alone] == [
-        (e.material, e.key, e.key) for e in kept
-    ]
 
 
 def test_an_exemplars_code_is_the_last_of_its_own_at_its_widest_scale():

@@ -123,22 +123,6 @@ def test_rows_that_were_never_added_leave_the_sums_that_are_left():
     assert moment.packed().tolist() == [x - y for x, y in zip(truth(codes(3, 8, 1)), truth(other), strict=True)]
 
 
-def test_an_addition_is_undone_before_and_after_the_rows_are_given_up():
-    moment, batch = SecondMoment(8), codes(20, 8)
-    for first, last in ((0, 3), (3, 8), (8, 12), (12, 20)):
-        before = None if first > 8 else moment.codes()
-        undo = moment.undo()
-        for _ in range(2):
-            moment.add(batch[first:last])
-            moment.packed()
-            undo()
-            assert moment.rows == first
-            assert (moment.codes() is None) == (before is None)
-            assert moment.packed().tolist() == truth(batch[:first])
-        moment.add(batch[first:last])
-    assert moment.packed().tolist() == truth(batch)
-
-
 def test_a_full_moment_refuses_before_anything_is_added():
     assert MOST_ROWS * EDGE**2 < 2**63
     moment = SecondMoment.of(np.arange(10, dtype=np.int64), MOST_ROWS - 2, 4)

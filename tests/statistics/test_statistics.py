@@ -211,7 +211,7 @@ def filled(rows, scale=20):
     """Statistics that seem to hold so many rows of zeros at a scale already."""
     statistics = of([])
     statistics.add("wool", {5: np.zeros((1, 3), np.int32), scale: np.zeros((1, 3), np.int32)})
-    statistics._rows[scale][0] = rows
+    statistics._own["wool"].rows[scale] = rows
     statistics._seconds[scale] = SecondMoment.of(np.zeros(6, np.int64), rows, DIMENSION)
     return statistics
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from reprlib import repr as shortened
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +37,7 @@ __all__ = [
     "decode",
     "encode",
     "expect",
+    "first_wrong",
     "key_rows",
 ]
 
@@ -76,18 +77,17 @@ class Must:
 
     def check(self, field: str, array: Any, sizes: dict[str, int]) -> None:
         """Raise Unexpected where an array is anything else; sizes: those that are known, to which its own are added."""
-        axes, shape = self.shape.split(), getattr(array, "shape", (len(array),) if isinstance(array, list) else ())
+        axes, shape = self.shape.split(), getattr(array, "shape", None) or np.shape(array or ())[:1]
         if axes[-1] == "...":
             axes = axes[:-1] + ["*"] * (len(shape) - len(axes) + 1)
-        known = [None if axis == "*" else int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes]
-        fits = len(shape) == len(axes) and all(own in (None, size) for own, size in zip(known, shape, strict=True))
-        if self.dtype:
-            came = "none" if array is None else f"{array.dtype} {array.shape}"
-            shown = ", ".join("any" if size is None else str(size) for size in known)
-            expect(fits and array.dtype.name == self.dtype, field, f"{self.dtype} of shape ({shown})", came)
-        else:
-            expect(fits, field, f"{known[0]} values", shape)
-        sizes |= {axis: size for axis, size in zip(axes, shape, strict=True) if not (axis == "*" or axis.isdigit())}
+        known = {axis: int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes}
+        fits = len(shape) == len(axes) and all(
+            known[axis] in (None, own) for axis, own in zip(axes, shape, strict=True)
+        )
+        came = f"{getattr(array, 'dtype', type(array).__name__)} {shape}"
+        shown = f"{self.dtype or 'a list'} of shape ({', '.join(str(known[axis] or 'any') for axis in axes)})"
+        expect(fits and str(getattr(array, "dtype", "")) == self.dtype, field, shown, came)
+        sizes |= {axis: own for axis, own in zip(axes, shape, strict=True) if axis.isalpha()}
         if self.least > -math.inf and array.size:
             low, high = array.min(), array.max(axis=0)
             inside = bool(low >= self.least and np.all(high <= self.most))
@@ -99,18 +99,17 @@ def key_rows(keys: Sequence[bytes]) -> Bytes:
     return np.frombuffer(b"".join(keys), np.uint8).reshape(len(keys), len(keys[0]) if keys else KEY_BYTES)
 
 
-Kind = Literal["array", "arrays", "part", "parts", "json"]
-
-
 @dataclass(frozen=True)
 class _Field:
-    """A field of a part. inner: the type of its arrays' keys, or of its part, or what reads its JSON."""
+    """A field of a part: an array, several arrays by `keys`, another `part`, `several` parts, or what `json` reads."""
 
     name: str
-    kind: Kind
-    inner: Any
-    must: Must | None
     needed: bool
+    must: Must | None
+    keys: Any
+    part: Any
+    several: bool
+    json: TypeAdapter[Any] | None
 
 
 @cache
@@ -120,45 +119,37 @@ def _fields_of(part: Any) -> list[_Field]:
         options, needed = get_args(hints[field.name]), field.default is MISSING and field.default_factory is MISSING
         hint = options[0] if type(None) in options else hints[field.name]
         must = next((each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Must)), None)
-        own = get_args(hint)[0] if must is not None else hint
-        origin, inside = get_origin(own), get_args(own)
-        kind: Kind = "json"
-        inner: Any = None
-        if must is not None and must.dtype:
-            kind, inner = ("arrays", inside[0]) if origin is dict else ("array", None)
-        elif is_dataclass(own):
-            kind, inner = "part", own
-        elif origin is list and is_dataclass(inside[0]):
-            kind, inner = "parts", inside[0]
-        found.append(_Field(field.name, kind, TypeAdapter(own) if kind == "json" else inner, must, needed))
+        own = hint if must is None else get_args(hint)[0]
+        several = get_origin(own) is list and is_dataclass(get_args(own)[0])
+        inner = get_args(own)[0] if several else own
+        array, part_of = must is not None and bool(must.dtype), inner if is_dataclass(inner) else None
+        keys = get_args(own)[0] if array and get_origin(own) is dict else None
+        json = None if array or part_of else TypeAdapter(own)
+        found.append(_Field(field.name, needed, must, keys, part_of, several, json))
     return found
 
 
-def encode(part: Any) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """The arrays of a part by name, and its values of JSON."""
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    return arrays, _encoded(part, "", arrays)
-
-
-def _encoded(part: Any, at: str, arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Any]:
-    """The JSON of a part that lies in these fields; its arrays are added."""
-    told: dict[str, Any] = {}
+def encode(part: Any, at: str = "") -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """The arrays of a part by name, and its values of JSON. at: the fields that the part lies in."""
+    arrays, told = dict[str, npt.NDArray[Any]](), dict[str, Any]()
     kind: Any = type(part)
     for field in _fields_of(kind):
         value, name = getattr(part, field.name), at + field.name
-        if value is None:
+        if value is None or (field.json and not value and not field.needed):
             continue
-        if field.kind == "array":
-            arrays[name] = value
-        elif field.kind == "arrays":
-            arrays |= {f"{name}-{key}": array for key, array in value.items()}
-        elif field.kind == "part":
-            told[field.name] = _encoded(value, f"{name}-", arrays)
-        elif field.kind == "parts":
-            told[field.name] = [_encoded(one, f"{name}-{i}-", arrays) for i, one in enumerate(value)]
-        elif value or field.needed:
+        if field.json:
             told[field.name] = value
-    return told
+        elif field.keys:
+            arrays |= {f"{name}-{key}": array for key, array in value.items()}
+        elif not field.part:
+            arrays[name] = value
+        else:
+            parts = [(f"{name}-{i}-", one) for i, one in enumerate(value)] if field.several else [(f"{name}-", value)]
+            encoded = [encode(one, place) for place, one in parts]
+            for own, _ in encoded:
+                arrays |= own
+            told[field.name] = [each for _, each in encoded] if field.several else encoded[0][1]
+    return arrays, told
 
 
 def decode(part: type[P], arrays: Arrays, told: Any, sizes: Mapping[str, int], at: str = "") -> P:
@@ -171,24 +162,25 @@ def decode(part: type[P], arrays: Arrays, told: Any, sizes: Mapping[str, int], a
     found, known, kind = dict[str, Any](), dict(sizes), cast(Any, part)
     for field in _fields_of(kind):
         name, value = at + field.name, told.get(field.name)
-        if field.kind == "arrays":
-            own = {each: each.removeprefix(f"{name}-") for each in arrays if each.startswith(f"{name}-")}
-            of = (lambda key: Scale.numbered(int(key))) if field.inner is Scale else field.inner
-            found[field.name] = {of(key): _checked(field, each, arrays[each], known) for each, key in own.items()}
-        elif not field.needed and (name not in arrays if field.kind == "array" else value is None):
+        if field.keys:
+            of = (lambda key: Scale.numbered(int(key))) if field.keys is Scale else field.keys
+            own = [each for each in arrays if each.startswith(f"{name}-")]
+            value = {of(each.removeprefix(f"{name}-")): _checked(field, each, arrays[each], known) for each in own}
+        elif not field.part and not field.json:
+            value = arrays.get(name)
+        if value is None and not field.needed:
             continue  # it has its default
-        elif field.kind == "array":
-            found[field.name] = _checked(field, name, arrays.get(name), known)
-        elif field.kind == "part":
-            found[field.name] = decode(field.inner, arrays, value, sizes, f"{name}-")
-        elif field.kind == "parts":
-            expect(isinstance(value, list), name, "a list", value)
-            found[field.name] = [decode(field.inner, arrays, one, sizes, f"{name}-{i}-") for i, one in enumerate(value)]
-        else:
+        if field.json:
             try:
-                found[field.name] = _checked(field, name, field.inner.validate_python(value), known)
+                value = field.json.validate_python(value)
             except ValidationError as error:
                 raise Unexpected(f"{name}.{first_wrong(error)}") from None
+        elif field.several:
+            expect(isinstance(value, list), name, "a list", value)
+            value = [decode(field.part, arrays, one, sizes, f"{name}-{i}-") for i, one in enumerate(value)]
+        elif field.part:
+            value = decode(field.part, arrays, value, sizes, f"{name}-")
+        found[field.name] = value if field.keys else _checked(field, name, value, known)
     return part(**found)
 
 

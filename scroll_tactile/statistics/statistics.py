@@ -159,8 +159,7 @@ class Statistics:
         """Rows, shape (C,), and sums of codes, shape (C, d), of each material; int32 where all of them are."""
         zero = np.zeros(self.dimension, dtype=np.int32)
         own = [self._own.get(name, _Own()).sums.get(scale, zero) for name in names]
-        sums: Sums = np.stack(own) if own else zero[None][:0]
-        return self.counts(scale, names), sums
+        return self.counts(scale, names), cast(Sums, np.stack(own) if own else zero[None][:0])
 
     def second(self, scale: Scale) -> SecondMoment:
         """The second moment of a scale, over all materials."""

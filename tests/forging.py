@@ -298,18 +298,18 @@ def largest_array(path: Path) -> tuple[int, dict[str, Any], str]:
     return number, known, max(sizes, key=sizes.get)
 
 
-def change_array(path: Path, codec: str = "", data: bytes = b"", shape: Sequence[int] = (), named: str = "") -> None:
-    """The newest checkpoint's largest array with another codec, bytes, shape or name, and right checksums."""
+def change_array(path: Path, codec: str = "", data: bytes = b"", longer: int = 1, named: str = "") -> None:
+    """The newest checkpoint's largest array with another codec, bytes, last axis or name, and right checksums."""
     number, known, name = largest_array(path)
     folder = group_of(path, number) / name
     told = json.loads((folder / "zarr.json").read_text())
     if codec:
-        told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {}}]
+        told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {"level": 1, "checksum": False}}]
     if data:
         next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)
     known = refiled(path, number)
-    if shape:
-        told["shape"] = told["chunk_grid"]["configuration"]["chunk_shape"] = known["arrays"][name]["shape"] = [*shape]
+    for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"], known["arrays"][name]["shape"]):
+        shape[-1] *= longer
     (folder / "zarr.json").write_text(json.dumps(told))
     if named:
         known["arrays"][named] = known["arrays"].pop(name)

@@ -3,8 +3,7 @@
 A row of `MEMORIES` is done to a sound memory, with right checksums, and looked at as a folder and packed; a row of
 `ZIPS` is a packed memory; a row of `RECORDINGS` makes a recording. Whoever received it reads, checks, merges and
 repairs it. That ends as the row says, well or with an error of ours; nothing runs, nothing elsewhere is opened or
-changed, and it takes less than ROOM, though each bomb claims more. Names, at last, are text for a terminal, a page, a
-table and a C compiler.
+changed, and it takes less than ROOM, though each bomb claims more. Names are text for a terminal, a page, a table, a C compiler.
 """
 
 import csv
@@ -79,9 +78,8 @@ class Plugin(zarr.codecs.BytesCodec):
 
 zarr.registry.register_codec("evil", Plugin)
 PICKLE = pickle.dumps(Evil())
-PICKLED = {"id": "pickle", "protocol": 4}
 DEEP = "[" * 100_000 + "]" * 100_000
-ZEROS = zstd.compress(bytes(2**28), 1)
+ZEROS, GIGABYTE = (zstd.compress(bytes(size), 1) for size in (2**28, 2**30))
 BLOCK = (deflater := zlib.compressobj(1, wbits=-15)).compress(bytes(2**24)) + deflater.flush(zlib.Z_FULL_FLUSH)
 DEFLATED = b"\x78\x01" + BLOCK * 64  # a gigabyte
 
@@ -91,9 +89,11 @@ DEFLATED = b"\x78\x01" + BLOCK * 64  # a gigabyte
 def in_place(path, name, put):
     """Something else in the place of a file or folder, which is moved outside."""
     number, _, largest = largest_array(path)
-    place = path / name.replace("CHUNK", f"checkpoints/{number:08d}/{largest}/c")
-    place.rename(outside_of(place) / "moved")
-    put(place)
+    put(moved_out(path / name.replace("CHUNK", f"checkpoints/{number:08d}/{largest}/c")))
+
+
+def moved_out(place):
+    return place.rename(outside_of(place) / "moved") and place
 
 
 def link(place):
@@ -105,16 +105,19 @@ def touched(*arrays, **changes):
     return partial(put_touch, payload=pack(arrays), **changes)
 
 
-CLIMBS = {"kind": "frames", "weights": {"name": "../outside/secret", "sha256": "0" * 64}, "rest": None}
+def set_weights(path):
+    weights = {"name": str(outside_of(path) / "secret"), "sha256": "0" * 64}
+    set_configuration(path, kind="frames", weights=weights, rest=None, cosines=0, seed=0)
+
+
 MEMORIES = {
     "objects in a row": (touched(("x", "|O", (1,), 0, len(PICKLE), PICKLE)), REFUSED),
     "a codec of a plugin": (partial(change_array, codec="evil"), HARMLESS),
     "an embedding that names code": (partial(set_configuration, kind="module", name="os:system"), REFUSED),
-    "an embedding by a path": (partial(set_configuration, **CLIMBS, cosines=0, seed=0), REFUSED),
+    "an embedding by a path": (set_weights, REFUSED),
     "a log elsewhere": (partial(say_in_current, log="../../outside/secret"), REFUSED),
     "a checkpoint elsewhere": (partial(say_in_current, newest={"number": "../../../outside"}), REFUSED),
-    "an array of a row by a path": (touched(("../../outside/x", "|u1", (4,), 0, 4, b"abcd")), REFUSED),
-    "an array of a checkpoint by a path": (partial(change_array, named="../../../outside/x"), HARMLESS),
+    "an array of a checkpoint by a path": (partial(change_array, named="../../../../outside/x"), HARMLESS),
     **{
         f"a link for {name}": (partial(in_place, name=name, put=link), REFUSED)
         for name in ("CURRENT", "log-00000001", "checkpoints", "lock")
@@ -130,7 +133,6 @@ MEMORIES = {
     "a tebibyte in a row": (touched(("x", "|u1", (2**40,), 0, 2**40, b"")), REFUSED),
     "16 GiB of zeros in a row": (touched(*((f"x{i}", "|u1", (2**28,), 1, 2**28, ZEROS) for i in range(64))), REFUSED),
     "a text of 2^30 letters": (touched(("x", "<U1073741824", (1,), 1, 2**32, ZEROS)), REFUSED),
-    "a row that says 2^62 bytes": (touched(size=2**62), REFUSED),
     "a frame of 4 GiB": (forging.lengthen_frame, HARMLESS),
     "a log with a hole": (lambda path: os.truncate(path / "log-00000001", 2**40), REFUSED),
     "CURRENT with a hole": (lambda path: os.truncate(path / "CURRENT", 2**34), REFUSED),
@@ -139,8 +141,8 @@ MEMORIES = {
         partial(put_row, kind="retract", label="", attributes={"sequences": [[1, 10**12]]}),
         REFUSED,
     ),
-    "a checkpoint's array of 2^40": (partial(change_array, shape=[2**40], data=ZEROS), HARMLESS),
-    "a chunk of 1 GiB": (partial(change_array, data=zstd.compress(bytes(2**30), 1)), HARMLESS),
+    "a checkpoint's array of 2^40": (partial(change_array, codec="zstd", data=ZEROS, longer=2**28), HARMLESS),
+    "a chunk of 1 GiB": (partial(change_array, codec="zstd", data=GIGABYTE), HARMLESS),
     "deep attributes": (partial(put_touch, attributes=DEEP), REFUSED),
     "a deep identity": (partial(forging.set_identity, identity=DEEP), REFUSED),
     "a deep CURRENT": (lambda path: (path / "CURRENT").write_text(DEEP), REFUSED),
@@ -195,8 +197,13 @@ def test_a_strangers_memory_runs_nothing_reaches_nothing_and_takes_little(sound,
     entries = [entry.lstat() for entry in path.rglob("*")]
     if all(entry.st_mode >> 12 in (4, 8) and entry.st_size < 2**30 and entry.st_nlink < 2 for entry in entries):
         assert received(home, forging.zipped(path)) == expected or expected == HARMLESS
-    for write in (lambda: TactileLearner.open(path).close(), lambda: repair_store(path)):
-        ending(write, home / "outside")
+
+    def write():
+        with TactileLearner.open(path) as learner:
+            learner.observe("a", stream((8, 60)))
+
+    for use in (write, lambda: repair_store(path)):
+        ending(use, home / "outside")
 
 
 def linked(made):
@@ -209,13 +216,10 @@ def claims(made):
     made.filelist[1].file_size = made.filelist[1].compress_size = 2**32 - 2
 
 
-def deflates(made):
-    made.writestr("checkpoints/00000001/x/zarr.json", bytes(2**26), zipfile.ZIP_DEFLATED)
-
-
 OUTSIDE = ("../outside/evil", "/tmp/evil", "checkpoints/../../outside/evil", "..\\evil", "C:\\evil")
 ZIPS = {f"a file {name}": lambda made, name=name: made.writestr(name, b"evil") for name in OUTSIDE}
-ZIPS |= {"a link": linked, "a log of 4 GiB": claims, "zeros, deflated": deflates}
+ZIPS |= {"a link": linked, "a log of 4 GiB": claims}
+ZIPS["zeros, deflated"] = lambda made: made.writestr("log-00000009", bytes(2**26), zipfile.ZIP_DEFLATED)
 
 
 @pytest.mark.parametrize("name", ZIPS)
@@ -239,8 +243,7 @@ def text(value):
 
 MAGIC = b"\x89MCAP0\r\n"
 MESSAGE = struct.pack("<BBHI19f", 0, 1, 0, 19, *range(19))
-ATTACHMENT = struct.pack("<QQ", 0, 0) + text(b"../outside/evil") + text(b"") + struct.pack("<Q", 4) + b"evil" + bytes(4)
-GIGABYTE = zstd.compress(bytes(2**30), 1)
+ATTACHMENT = bytes(16) + text(b"../outside/evil") + text(b"") + struct.pack("<Q", 4) + b"evil" + bytes(4)
 CHUNK = struct.pack("<QQQI", 0, 0, 2**30, 0) + text(b"zstd") + struct.pack("<Q", len(GIGABYTE)) + GIGABYTE
 TOWER = ["a/L0[10] data", *(f"MSG: a/L{i}\na/L{i + 1}[10] data" for i in range(12)), "MSG: a/L12\nint8 x"]
 PICTURE = ["std_msgs/Header header\nstring format\nuint8[] data", "MSG: std_msgs/Header\nstring frame_id\n"]
@@ -313,8 +316,8 @@ def deflated(file, other):
     made.id.write_direct_chunk((0, 0), DEFLATED)
 
 
-ARRAY = {"zarr_format": 2, "shape": [64, 64], "chunks": [64, 64], "dtype": "|u1", "filters": None, "order": "C"}
-ARRAY |= {"compressor": None, "fill_value": 0}
+ARRAY = {"zarr_format": 2, "shape": [64, 64], "chunks": [64, 64], "dtype": "|u1", "filters": None}
+ARRAY |= {"order": "C", "compressor": None, "fill_value": 0}
 
 
 def zarr2(put=None, **about):
@@ -354,15 +357,10 @@ def equal_rows(file):
         [writer.write_batch(batch, row_group_size=10**9) for _ in range(45)]
 
 
-def moved_out(file):
-    file.rename(outside_of(file) / "moved")
-    link(file)
-
-
 RECORDINGS = {
     "npy: a pickle": lambda folder: np.save(folder / "x.npy", np.array([Evil()], object), allow_pickle=True),
-    "zarr: pickles": zarr2(PICKLE, shape=[1], chunks=[1], dtype="|O", filters=[{"id": "vlen-utf8"}, PICKLED]),
-    "zarr: a pickle that compresses": zarr2(PICKLE, shape=[1], chunks=[1], dtype="<f8", compressor=PICKLED),
+    "zarr: pickles": zarr2(PICKLE, shape=[1], chunks=[1], dtype="|O", filters=[{"id": "vlen-utf8"}, {"id": "pickle"}]),
+    "zarr: a pickle that compresses": zarr2(PICKLE, shape=[1], chunks=[1], dtype="<f8", compressor={"id": "pickle"}),
     "hdf5: a filter outside the list": hdf5(
         lambda file, _: file.create_dataset("tactile", data=TIP.astype("i4"), chunks=(7, 19), scaleoffset=0)
     ),
@@ -375,10 +373,10 @@ RECORDINGS = {
     ),
     "hdf5: an external link": hdf5(lambda file, other: file.update(tactile=h5py.ExternalLink(other, "secret"))),
     "hdf5: virtual": hdf5(virtual),
-    "bag: a part that is a link": lambda folder: moved_out(next(ros(folder, "mcap").glob("*.mcap"))),
+    "bag: a part that is a link": lambda folder: link(moved_out(next(ros(folder, "mcap").glob("*.mcap")))),
     "bag: a name that climbs": bag("\n  compression_mode: ''\n  relative_file_paths: [../../outside/secret]"),
     "lerobot: names that climb": partial(robot_set, data_path="../../outside/{chunk_index}.parquet"),
-    "lerobot: a link": partial(robot_set, change=moved_out),
+    "lerobot: a link": partial(robot_set, change=lambda file: link(moved_out(file))),
     "npy: 10^11 numbers in a hole": lambda folder: np.lib.format.open_memmap(folder / "x.npy", "w+", "f4", (10**11,)),
     "zarr: rows never written": zarr2(shape=[10**12, 19]),
     "zarr: deflated": zarr2(DEFLATED, compressor={"id": "zlib", "level": 9}),
@@ -416,17 +414,15 @@ def test_what_is_attached_to_a_recording_is_not_written(home):
         assert len(read(home / "in" / "x.mcap", **SKIN)) == 1
 
 
-# Names.
-
 ESCAPES = "\x1b]0;pwned\x07\x1b[2J\x9b31m\u202eevil"
 NAMES = ["<script>alert(1)</script>", "a\"'&<b>", "=cmd|'calc'!A0", '";}system("id");/*\\', "../../outside/evil"]
 
 
 def test_a_name_that_a_terminal_would_obey_is_shown_as_text_or_refused(sound, home):
-    path = Path(shutil.copytree(sound / "m", home / "in" / "m"))
+    path = Path(shutil.copytree(sound / "m", home / "in" / ESCAPES))
     put_touch(path, label=ESCAPES, key=b"../../outside/evil")
     for words in (["inspect", path], ["inspect", path, "--json"], ["memory", "check", path]):
-        assert all(line.isprintable() for line in run(*words).output.splitlines())
+        assert run(*words).output.replace("\n", "").isprintable()
 
 
 def test_names_are_text_on_a_page_in_a_table_and_in_c_and_never_paths(home):

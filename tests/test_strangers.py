@@ -3,7 +3,7 @@
 A row of `MEMORIES` is done to a sound memory, with right checksums, and looked at as a folder and packed; a row of
 `ZIPS` is a packed memory; a row of `RECORDINGS` makes a recording. Whoever received it reads, checks, merges and
 repairs it. That ends as the row says, well or with an error of ours; nothing runs, nothing elsewhere is opened or
-changed, and it takes less than ROOM, though each bomb claims more. Names are text for a terminal, a page, a table, a C compiler.
+changed, and it takes less than ROOM, though bombs claim more. Names are text: on a terminal, a page, in a table, in C.
 """
 
 import csv

@@ -61,7 +61,8 @@ def expected(touches=TOUCHES, **settings):
 
 
 def run(destination, sources, executor=None, **settings):
-    return learn(sources, destination, BY_FOLDER, executor=executor or DyingExecutor(), **SETTINGS | settings)
+    how = {"executor": executor or DyingExecutor(), "workers": 1}
+    return learn(sources, destination, BY_FOLDER, **SETTINGS | how | settings)
 
 
 def require_learned(destination, touches=TOUCHES, **settings):
@@ -488,7 +489,7 @@ class TestRange:
         with pytest.warns(RangeWarning) as first:
             _, _, _, refused = by_one_process(tmp_path / "one", [beyond])
         with pytest.warns(RangeWarning, match="100 % of the values lie outside the range of sensor 'pad'") as met:
-            done = run(tmp_path / "m", [beyond])
+            done = run(tmp_path / "m", [beyond], workers=2)  # a share of each source
         assert [str(each.message) for each in met] == [str(each.message) for each in first] == [done.range_problem]
         assert met[0].filename == run.__code__.co_filename
         assert [(each.source, each.why) for each in done.refused] == refused

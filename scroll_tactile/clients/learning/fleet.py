@@ -18,14 +18,15 @@ import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context, parent_process
-from multiprocessing.connection import wait as wait_for
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from signal import SIG_DFL, SIGINT, signal
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -163,7 +164,7 @@ class Share:
     """Sources, in order, that come in together: one memory, or recordings that a worker learns.
 
     folder: where the worker puts them, complete or not at all. recipe, quantities: of the memory that they are merged
-    into. known: the touches that this has, content → names.
+    into. known: a file of the touches that this has, content → names.
     """
 
     sources: tuple[str, ...]
@@ -171,7 +172,7 @@ class Share:
     recipe: Recipe
     options: SourceOptions
     quantities: tuple[Quantity, ...]
-    known: Mapping[bytes, Sequence[str]]
+    known: Path
 
     @property
     def memory(self) -> Path:
@@ -185,12 +186,11 @@ class Share:
         return replace(self, sources=tuple(sources), folder=self.folder.parent / f"share-{name}")
 
     def learned(self) -> Learned | None:
-        """What a worker learned of it; None where its folder is not complete, or does not fit the memory any more."""
+        """What a worker learned of it; None where its folder is not complete."""
         try:
-            done = Learned.from_json(json.loads((self.folder / "learned.json").read_text(encoding="utf-8")))
+            return Learned.from_json(json.loads((self.folder / "learned.json").read_text(encoding="utf-8")))
         except (OSError, ValueError, LookupError, TypeError):
             return None
-        return done if done.known <= self.known.keys() else None  # what was left out was there, and is not now
 
 
 def learn_share(share: Share) -> None:
@@ -204,10 +204,11 @@ def learn_share(share: Share) -> None:
     with made as draft, warnings.catch_warnings():
         warnings.simplefilter("ignore", RangeWarning)
         whole = Path(draft) / "whole"
+        known = {bytes.fromhex(key): names for key, names in json.loads(share.known.read_text("utf-8")).items()}
         with TactileLearner.open(whole / share.memory.name, **share.recipe.arguments) as learner, learner.batch():
             for quantity in share.quantities:
                 learner.declare(quantity)
-            done = learn_sources(learner, share.sources, share.options, known=share.known)
+            done = learn_sources(learner, share.sources, share.options, known=known)
         with reported(share.folder, "completing the folder of a share"):
             (whole / "learned.json").write_text(json.dumps(done.to_json()), encoding="utf-8")
             if share.learned() is None:  # a worker of a call before may have completed it meanwhile
@@ -260,12 +261,15 @@ class _Run:
             folder.mkdir(exist_ok=True)
         for left in folder.glob("share-*.partial"):  # of a worker that died
             remove_tree(left)
-        known: dict[bytes, list[str]] = {}
+        known: dict[str, list[str]] = {}
         for row in learner.observations():
             if row.state != "retracted":
-                known.setdefault(row.key, []).append(row.material)
-        quantities = tuple(learner.quantities.values())
-        share = Share((), folder / "share", learner._recipe, self._options, quantities, known)
+                known.setdefault(row.key.hex(), []).append(row.material)
+        self._known = {bytes.fromhex(key) for key in known}
+        quantities, file = tuple(learner.quantities.values()), folder / "share-known.json"
+        with reported(file, "writing which touches the memory has"):
+            file.write_text(json.dumps(known), encoding="utf-8")
+        share = Share((), folder / "share", learner._recipe, self._options, quantities, file)
         most = min(MOST_SOURCES, -(-len(found) // (SHARES_A_WORKER * workers)))
         shares = [(share.of(sources), memory) for sources, memory in _cut(found, most)]
         with ExitStack() as stack:
@@ -289,8 +293,10 @@ class _Run:
 
     def _submit(self, share: Share) -> Future[None] | None:
         """Hand a share to a worker; None where its folder is complete."""
-        if share.learned() is not None:
-            return None
+        if (done := share.learned()) is not None:
+            if done.known <= self._known:
+                return None
+            remove_tree(share.folder)  # it left out touches that the memory had, and has no more
         try:
             return self._executor.submit(learn_share, share)
         except RuntimeError as error:  # such as BrokenProcessPool
@@ -397,6 +403,8 @@ class Processes(ThreadPoolExecutor):
 
     def __init__(self, workers: int) -> None:
         super().__init__(workers)
+        self._context = get_context("spawn")
+        self._theirs, self._ours = self._context.Pipe(duplex=False)  # processes end when our end is closed
         self._own = threading.local()
         self._pools: list[ProcessPoolExecutor] = []
 
@@ -408,7 +416,8 @@ class Processes(ThreadPoolExecutor):
         """Call it in the process of this thread, which is begun anew where it died."""
         pool = getattr(self._own, "pool", None)
         if pool is None:
-            pool = self._own.pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_begin)
+            how: Any = {"mp_context": self._context, "initializer": _begin, "initargs": (self._theirs,)}
+            pool = self._own.pool = ProcessPoolExecutor(1, **how)
             self._pools.append(pool)
         try:
             return pool.submit(what, *words, **named).result()
@@ -416,22 +425,18 @@ class Processes(ThreadPoolExecutor):
             self._own.pool = None
             raise
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """As of any Executor."""
-        super().shutdown(wait=wait, cancel_futures=cancel_futures)
-        for pool in self._pools:
-            pool.shutdown(wait=wait, cancel_futures=cancel_futures)
-
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """An error, or ctrl-C, waits for no worker."""
+        """An error, or ctrl-C, waits for nothing and ends the processes."""
         self.shutdown(wait=kind is None, cancel_futures=kind is not None)
+        for pool in self._pools:
+            pool.shutdown(wait=kind is None)
+        self._ours.close()
 
 
-def _begin() -> None:
+def _begin(ends: Connection) -> None:
     """Make a worker: it leaves arithmetic to one thread, for others are beside it, and ends when its parent does."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)
-    parent = parent_process()
-    if parent is not None:
-        threading.Thread(target=lambda: (wait_for([parent.sentinel]), os._exit(1)), daemon=True).start()
+    signal(SIGINT, SIG_DFL)  # ctrl-C ends it without a word
+    threading.Thread(target=lambda: (wait([ends]), os._exit(1)), daemon=True).start()

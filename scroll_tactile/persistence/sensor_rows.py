@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import Any, cast
 
 import numpy as np
@@ -78,35 +79,32 @@ def _keep(ledger: Ledger, watched: WatchedRows) -> None:
 def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
     """The next rows to be taken, none at the end, and after an alarm; those retracted meanwhile are taken back."""
     with ledger.lock:
-        store, memory = ledger.require_open(), ledger.memory
-        _take_back(store, memory, watched)
+        store, memory, rules = ledger.require_open(), ledger.memory, watched.rules
+        if memory.sequence > watched.known:
+            new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
+            for gone in sorted(retracted_by(new), reverse=True):
+                watched.take_back(gone)
+            watched.known = memory.sequence
+        rows: list[WatchedRow] = []
         if watched.watch.alarmed is not None:
-            return []
-        until, rows = watched.rules.until, list[WatchedRow]()
-        last = memory.sequence if until is None else min(until, memory.sequence)
-        for head in store.heads(watched.last):
-            if head.sequence > last or len(rows) == PIECE:
+            return rows
+        for head in _heads(store, memory, rules.until, watched.last):
+            source = cast("str | None", head.attributes.get(SOURCE))
+            counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
+            if counts and (rules.source is None or is_from(source, rules.source)):
+                numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
+                rows.append(WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers))
+            else:
+                rows.append(WatchedRow(head.sequence))
+            if len(rows) == PIECE:
                 break
-            rows.append(_row(head, memory, watched))
         return rows
 
 
-def _take_back(store: AnyStore, memory: Memory, watched: WatchedRows) -> None:
-    """Have what was retracted since it was last read go."""
-    if memory.sequence > watched.known:
-        new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
-        for gone in sorted(retracted_by(new), reverse=True):
-            watched.take_back(gone)
-        watched.known = memory.sequence
-
-
-def _row(head: Head, memory: Memory, watched: WatchedRows) -> WatchedRow:
-    own, source = watched.rules.source, cast("str | None", head.attributes.get(SOURCE))
-    counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
-    if not counts or (own is not None and not is_from(source, own)):
-        return WatchedRow(head.sequence)
-    numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
-    return WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
+def _heads(store: AnyStore, memory: Memory, until: int | None, after: int = 0) -> Iterator[Head]:
+    """The rows behind one, as far as the memory knows them; until: the last of them."""
+    last = memory.sequence if until is None else min(until, memory.sequence)
+    return takewhile(lambda head: head.sequence <= last, store.heads(after))
 
 
 def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor: Sensor) -> dict[Stream, str]:
@@ -121,11 +119,9 @@ def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor
             + ("pixels" if sensor.camera else f"{sensor.channels}; at most {MOST_CHANNELS} can be told apart")
         )
     found: dict[Stream, str] = {}
+    given = touches.items() if isinstance(touches, Mapping) else touches
     try:
-        pairs = [
-            (material, readings)
-            for material, readings in (touches.items() if isinstance(touches, Mapping) else touches)
-        ]
+        pairs = [(material, readings) for material, readings in given]
     except (TypeError, ValueError):
         raise InputError(
             "expected touches as pairs of a material and its readings, or a mapping from materials to readings; came "
@@ -161,7 +157,7 @@ def adapt_to(
         own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
         out = own if until is None else own | {head.key for head in store.heads(until)}
         kept = [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
-        reference = _reference(store, memory, sensor.channels, own, until)
+        reference = _reference(_heads(store, memory, until), memory, sensor.channels, own)
     _require_known(reference, sorted(set(touches.values())), store)
     at_ends = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]  # of levels (n, T)
     ends: Floats = np.mean(at_ends, axis=0) if kept else np.ones(sensor.channels)
@@ -192,13 +188,10 @@ def adapt_to(
     )
 
 
-def _reference(store: AnyStore, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:
-    """What the rows up to one say of touches, without those by which the memory is to be adapted."""
-    last = memory.sequence if until is None else min(until, memory.sequence)
+def _reference(heads: Iterable[Head], memory: Memory, channels: int, own: set[bytes]) -> Reference:
+    """What some rows say of touches, without those by which the memory is to be adapted."""
     reference = Reference(channels)
-    for head in store.heads():
-        if head.sequence > last:
-            break
+    for head in heads:
         if head.kind == OBSERVE and not memory.is_gone(head.sequence) and head.key not in own:
             numbers = from_text(head.attributes.get(CHANNELS), channels)
             if numbers is not None:
@@ -211,8 +204,8 @@ def _require_known(reference: Reference, materials: Sequence[str], store: AnySto
     if missing := [name for name in materials if not reference.counts.get(name)]:
         raise InputError(
             f"the journal of {store.path} has no numbers of the channels of earlier touches of {missing[:5]}: they are "
-            "those by which it is to be adapted, lie behind `until`, came in with a compacted memory, or were observed "
-            "by a version before 0.14. Take touches of other materials"
+            "those by which it is to be adapted, lie behind `until`, or came in with a compacted memory. Take touches "
+            "of other materials"
         )
     if reference.total - len(reference.counts) < FEWEST_SPREAD:
         raise InputError(

@@ -145,20 +145,20 @@ def set_identity(path: Path, identity: Any) -> None:
             seal(path, named["number"], described(path, named["number"]) | {"identity": known})
 
 
-Packed = tuple[str, str, list[int], bytes]
-"""An array in a payload: its name, dtype, shape and buffer."""
+Packed = tuple[str, str, Sequence[int], bytes, int]
+"""An array in a payload: its name, dtype, shape, its buffer, and how many bytes that is said to have."""
 
 
 def raw(name: str, array: np.ndarray) -> Packed:
     """An array as it is, not compressed."""
-    return name, array.dtype.str, list(array.shape), np.asarray(array, order="C").tobytes()
+    return name, array.dtype.str, array.shape, np.asarray(array, order="C").tobytes(), array.nbytes
 
 
-def pack(arrays: Sequence[Packed], *, text: str | None = None) -> bytes:
-    """A payload of arrays of which anything may be said; text: what is said of them, where it is something else."""
-    said = {name: [dtype, shape, len(buffer)] for name, dtype, shape, buffer in arrays}
-    head = (as_text(said) if text is None else text).encode()
-    return b"".join([struct.pack("<I", len(head)), head, *(array[3] for array in arrays)])
+def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
+    """A payload of arrays of which anything may be said; text: in place of what is said of them."""
+    told = {name: [dtype, list(shape), stored] for name, dtype, shape, _, stored in arrays}
+    said = as_text(told if text is None else text).encode("utf-8", "surrogatepass")
+    return b"".join([struct.pack("<I", len(said)), said, *(buffer for _, _, _, buffer, _ in arrays)])
 
 
 def named_in(path: Path) -> list[dict[str, Any]]:
@@ -268,30 +268,29 @@ def set_configuration(path: Path, **configuration: Any) -> None:
     set_identity(path, known)
 
 
-def largest_array(path: Path) -> tuple[int, dict[str, Any], str]:
-    """The newest checkpoint's number, what it says of itself, and the name of its largest array."""
+def largest_array(path: Path) -> tuple[int, str]:
+    """The newest checkpoint's number, and the name of its largest array."""
     number = get_current(path)["newest"]["number"]
-    known = described(path, number)
-    folders = [folder for folder in group_of(path, number).iterdir() if folder.is_dir() and "log-" not in folder.name]
-    sizes = {folder.name: np.prod(json.loads((folder / "zarr.json").read_text())["shape"]) for folder in folders}
-    return number, known, max(sizes, key=lambda name: int(sizes[name]))
+    headers = [file for file in group_of(path, number).glob("*/zarr.json") if not file.parent.name.startswith("log-")]
+    sizes = {file.parent.name: int(np.prod(json.loads(file.read_text())["shape"])) for file in headers}
+    return number, max(sizes, key=lambda name: sizes[name])
 
 
 def change_array(path: Path, codec: str = "", data: bytes = b"", longer: int = 1, named: str = "") -> None:
     """The newest checkpoint's largest array with another codec, bytes, last axis or name, and right checksums."""
-    number, _, name = largest_array(path)
+    number, name = largest_array(path)
     folder = group_of(path, number) / name
     told = json.loads((folder / "zarr.json").read_text())
     if codec:
         told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {"level": 1, "checksum": False}}]
-    if data:
-        next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)
     for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"]):
         shape[-1] *= longer
     (folder / "zarr.json").write_text(json.dumps(told))
+    if data:
+        next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)
     known = refiled(path, number)
     if named:
-        known["files"][f"{named}/zarr.json"] = known["files"].pop(f"{name}/zarr.json")
+        known["files"] = {f"{named}/{file.partition('/')[2]}": one for file, one in known["files"].items()}
     seal(path, number, known)
 
 

@@ -1,22 +1,17 @@
 """What somebody can do to a memory's folder, with right checksums: name → a function of the folder.
 
-Nobody may take any of it in. tests/storage does it to stores, tests/validation to memories, and tests/faults has each
-reader look at what was done, in a process that may die of it.
+Nobody may take any of it in. tests/storage does it to stores, tests/validation to memories.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import socket
-import stat
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from forging import describe_again, get_current, get_identity, log_of, put_row, set_current, set_identity
+from forging import get_current, get_identity, log_of, put_row, set_current, set_identity
 from scroll_tactile_store.log import LogReader
 from touches import PAD, stream
 
@@ -76,87 +71,6 @@ CURRENTS: dict[str, Attack] = {
         "a place of another checksum": lambda path: placed(path, previous="00" * 16),
     }.items()
 }
-
-# A checkpoint: what it says of itself.
-
-SOUND = {"dtype": "<f8", "shape": [1000, 4], "sha256": "0" * 64, "files": ["0" * 64]}
-ARRAYS: dict[str, Any] = {
-    "a list": [1],
-    "a name that leads out": {"../rows": SOUND},
-    "a name in two cases": {"rows": SOUND, "Rows": SOUND},
-    "objects": {"rows": SOUND | {"dtype": "|O"}},
-    "no dtype": {"rows": {"shape": [1], "sha256": "0" * 64}},
-    "a shape in words": {"rows": SOUND | {"shape": "4"}},
-    "a length of 4.0": {"rows": SOUND | {"shape": [4.0]}},
-    "lengths whose product overflows": {"rows": SOUND | {"shape": [2**40, 2**40]}},
-    "a hundred axes": {"rows": SOUND | {"shape": [1] * 100}},
-    "no sha256": {"rows": SOUND | {"sha256": None}},
-    "no files": {"rows": SOUND | {"files": None}},
-    "too many files": {"rows": SOUND | {"files": ["0" * 64] * 2}},
-}
-OWN: dict[str, Any] = {
-    "a number in words": {"number": "1"},
-    "another number": {"number": 2},
-    "a last row above any": {"last_sequence": 2**63},
-    "another last row": {"last_sequence": 0},
-    "attributes in a list": {"attributes": [1]},
-    "another identity": {"identity": {"of": "another"}},
-    "a format in words": {"format": "x"},
-}
-
-
-def _checkpoint(**changes: Any) -> Attack:
-    return lambda path: describe_again(path, **changes)
-
-
-CHECKPOINTS = {f"arrays: {name}": _checkpoint(arrays=arrays) for name, arrays in ARRAYS.items()}
-CHECKPOINTS |= {name: _checkpoint(**changes) for name, changes in OWN.items()}
-
-# Links: which name in the folder leads where, outside of it.
-
-LINKS = {
-    "checkpoints": "",
-    "checkpoints/00000001": "12345",
-    "checkpoints/00000077": "12345",
-    "checkpoints/00000077.partial": "12345",
-    "holder.json": "file",
-    "holder.json.new": "file",
-    "lock": "file",
-    "CURRENT": "file",
-    "CURRENT.new": "file",
-    "log-00000001": "log",
-    "log-00000001.new": "file",
-    "log-00000001.damaged": "file",
-    "log-00000007": "file",
-}
-
-
-def as_link(path: Path, target: Path) -> None:
-    """Put a link in the place of a file or a folder."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(target)
-
-
-def no_file(path: Path, kind: str) -> None:
-    """Put in a file's place, or where none is, a "fifo", a "socket", a "folder" or a "device", as /dev/zero is."""
-    path.unlink(missing_ok=True)
-    if kind == "fifo":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "device":
-        os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 5))
-    else:
-        here = Path.cwd()
-        os.chdir(path.parent)  # the name of a socket may have no more than 107 bytes
-        try:
-            with socket.socket(socket.AF_UNIX) as made:
-                made.bind(path.name)
-        finally:
-            os.chdir(here)
-
 
 # A row: what is other in it than in a sound one.
 

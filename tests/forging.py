@@ -1,4 +1,4 @@
-"""Rows, identities and checkpoints with right checksums, such as anyone can make: nothing in a checksum is secret."""
+"""Rows, identities and checkpoints with right checksums, as anyone can make them who reads store/FORMAT.md."""
 
 from __future__ import annotations
 
@@ -6,26 +6,20 @@ import hashlib
 import json
 import shutil
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from quick_checkpoints import array_about
 from scroll_tactile_store import Store
-from scroll_tactile_store.chunks import ArrayContent
-from scroll_tactile_store.encoding import array_digest, check_arrays, encode_payload
-from scroll_tactile_store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
-from scroll_tactile_store.layout import CURRENT_FILE, checkpoint_path, log_path
-from scroll_tactile_store.log import LogPlace, LogReader
-from scroll_tactile_store.records import payload_digest
-from scroll_tactile_store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
-from scroll_tactile_store.rows import Rows
+from storage.second_reader import COMMIT, HEAD, MARK, ROW, ROW_KIND, Frame, digest, frame_at, frames
+from storage.second_reader import row as read_row
 
 PAYLOAD = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
+DIGEST_BYTES = 16
 
 
 def as_text(value: Any) -> str:
@@ -41,39 +35,34 @@ def sealed(known: Mapping[str, Any]) -> dict[str, Any]:
 
 def get_current(path: Path) -> dict[str, Any]:
     """What `CURRENT` says."""
-    return dict(json.loads((path / CURRENT_FILE).read_text(encoding="ascii")))
+    return dict(json.loads((path / "CURRENT").read_text(encoding="ascii")))
 
 
 def set_current(path: Path, **changes: Any) -> None:
     """Have `CURRENT` say other things, with the right sha256."""
-    (path / CURRENT_FILE).write_text(as_text(sealed(get_current(path) | changes)) + "\n", encoding="ascii")
+    (path / "CURRENT").write_text(as_text(sealed(get_current(path) | changes)) + "\n", encoding="ascii")
 
 
 def log_of(path: Path) -> Path:
     """The log that `CURRENT` names."""
-    return log_path(path, get_current(path)["log"][0])
+    return path / f"log-{get_current(path)['log'][0]:08d}"
+
+
+def frames_of(path: Path) -> dict[int, Frame]:
+    """The frames of a log's rows whose first 88 bytes are right, by the rows' sequences."""
+    data, offset, found = log_of(path).read_bytes(), 0, {}
+    while (frame := frame_at(data, offset)) is not None:
+        if frame.kind == ROW_KIND:
+            found[int.from_bytes(data[frame.offset + HEAD.size :][:8], "little")] = frame
+        offset = frame.end
+    return found
 
 
 def read_log(path: Path) -> tuple[bytes, list[bytes]]:
     """The payload of a store's first frame, and the bytes of each of its rows."""
-    with LogReader(log_of(path)) as log:
-        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
-        return log.header, [log.read(frame.offset, frame.size)[1] for frame in frames]
-
-
-def log_bytes(
-    identity: bytes, header: bytes, batches: Iterable[Sequence[tuple[int, bytes]]]
-) -> tuple[bytes, list[LogPlace]]:
-    """The bytes of a log, and the place behind its first frame and behind each batch of kinds and payloads."""
-    data, frame = pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)
-    parts, places, at = [data], [LogPlace.behind(frame)], LogPlace.behind(frame)
-    for batch in batches:
-        for kind, payload in [*batch, (COMMIT, b"")]:
-            data, frame = pack_frame(identity, at.offset, at.number, at.batch, kind, payload, at.previous)
-            parts.append(data)
-            at = LogPlace.behind(frame)
-        places.append(at)
-    return b"".join(parts), places
+    data = log_of(path).read_bytes()
+    about, whole, _ = frames(data)
+    return about, [data[frame.offset + HEAD.size : frame.end] for frame in whole if frame.kind == ROW_KIND]
 
 
 def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) -> None:
@@ -82,45 +71,30 @@ def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) ->
     `CURRENT` then names the checkpoints' places in it.
     """
     current = get_current(path)
-    header = read_log(path)[0] if header is None else header
-    data, places = log_bytes(bytes.fromhex(current["log"][1]), header, [[(ROW, row)] for row in rows])
-    log_of(path).write_bytes(data)
+    identity, log = bytes.fromhex(current["log"][1]), bytearray()
+    places: list[list[Any]] = []
+    previous, number = bytes(16), 0
+
+    def put(batch: int, kind: int, payload: bytes) -> None:
+        nonlocal previous, number
+        head = struct.pack(
+            "<8s8sQQII16s16s", MARK, identity, number, batch, kind, len(payload), previous, digest(payload)
+        )
+        previous, number = digest(head), number + 1
+        log.extend(head + previous + payload)
+
+    put(0, 0, read_log(path)[0] if header is None else header)
+    for row in rows:
+        places.append([len(log), number, previous.hex()])
+        put(number, ROW_KIND, row)
+        put(number - 1, COMMIT, b"")
+    places.append([len(log), number, previous.hex()])
+    log_of(path).write_bytes(log)
     sequences = [int.from_bytes(row[:8], "little") for row in rows]
     for named in filter(None, (current["newest"], current["compaction"])):
         behind = [i for i, sequence in enumerate(sequences) if sequence > named["last_sequence"]]
-        named["place"] = as_place(places[min(behind, default=len(rows))])
+        named["place"] = places[min(behind, default=len(rows))]
     set_current(path, **current)
-
-
-def as_place(place: LogPlace) -> list[Any]:
-    """A place as `CURRENT` has it."""
-    return [place.offset, place.number, place.previous.hex()]
-
-
-def as_row(
-    sequence: int,
-    kind: str,
-    label: str,
-    key: bytes,
-    time: float,
-    attributes: str,
-    payload: bytes | None,
-    size: int,
-    kept: int | None = None,
-) -> bytes:
-    """The bytes of a row of which anything may be said."""
-    texts = (key[:255], *(text.encode("utf-8", "surrogatepass") for text in (kind, label, attributes)))
-    kept = payload is not None if kept is None else kept
-    fields = FIELDS.pack(sequence % 2**64, time, size % 2**64, kept, *map(len, texts))
-    return b"".join((fields, payload_digest(b"".join((fields, *texts))), *texts, payload or b""))
-
-
-def observation(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The attributes and the payload of the first observation of a memory whose arrays are there."""
-    for row in map(decode_row, read_log(path)[1]):
-        if row.head.kind == "observe" and row.payload is not None:
-            return dict(row.head.attributes), row.payload
-    raise ValueError(f"{path} has no observation with its arrays")
 
 
 def put_row(
@@ -134,21 +108,29 @@ def put_row(
     time: float = 0.0,
     sequence: int | None = None,
     size: int | None = None,
-    kept: int | None = None,
 ) -> int:
     """Put a row into a log, in place of any that has its sequence, and return that: by default the next one.
 
-    payload: bytes, or arrays by name. size, kept: where they are to be others than the right ones.
+    payload: bytes, or arrays by name. size: where the row is to say another than the right one.
     """
-    body = payload if isinstance(payload, bytes) else encode_payload(check_arrays(payload or {}))
-    rows = {row_sequence(row): row for row in read_log(path)[1]}
+    body = payload if isinstance(payload, bytes) else pack([raw(*one) for one in (payload or {}).items()])
+    rows = {int.from_bytes(row[:8], "little"): row for row in read_log(path)[1]}
     if sequence is None:
         sequence = 1 + max([*rows, *(named["last_sequence"] for named in named_in(path))], default=0)
-    text = as_text({} if attributes is None else attributes)
-    size = len(body) if size is None else size
-    rows[sequence % 2**64] = as_row(sequence, kind, label, key, time, text, body, size, kept)
+    told = as_text({} if attributes is None else attributes)
+    texts = (key[:255], *(text.encode("utf-8", "surrogatepass") for text in (kind, label, told)))
+    fields = ROW.pack(sequence % 2**64, time, (len(body) if size is None else size) % 2**64, 1, *map(len, texts))
+    rows[sequence % 2**64] = b"".join((fields, digest(b"".join((fields, *texts))), *texts, body))
     write_log(path, [rows[number] for number in sorted(rows)])
     return sequence
+
+
+def observation(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The attributes and the payload of the first observation of a memory whose arrays are there."""
+    for row in map(read_row, read_log(path)[1]):
+        if row.kind == "observe" and row.arrays is not None:
+            return row.attributes, row.arrays
+    raise ValueError(f"{path} has no observation with its arrays")
 
 
 def get_identity(path: Path) -> dict[str, Any]:
@@ -165,57 +147,25 @@ def set_identity(path: Path, identity: Any) -> None:
             seal(path, named["number"], described(path, named["number"]) | {"identity": known})
 
 
-@dataclass(frozen=True)
-class Packed:
-    """An array in a payload: what is said of it, and its buffer; stored: the length that the buffer is said to have."""
-
-    name: str
-    dtype: str
-    shape: tuple[int, ...]
-    codec: int
-    size: int
-    buffer: bytes
-    stored: int | None = None
-
-
-def pack(arrays: Sequence[Packed], version: int = 1, count: int | None = None) -> bytes:
-    """A payload as FORMAT.md says it is, of arrays of which anything may be said."""
-    head, buffers = [PAYLOAD.pack(b"ARPL", version, len(arrays) if count is None else count)], []
-    for array in arrays:
-        for text in (array.name.encode("latin-1"), array.dtype.encode("latin-1")):
-            head.append(struct.pack("<B", len(text) % 256) + text)
-        lengths = [length % 2**64 for length in array.shape]
-        head.append(struct.pack(f"<B{len(lengths)}Q", len(lengths) % 256, *lengths))
-        stored = len(array.buffer) if array.stored is None else array.stored
-        head.append(LENGTHS.pack(array.codec % 256, array.size % 2**64, stored % 2**64))
-        buffers.append(array.buffer)
-    return b"".join(head + buffers)
-
-
-def unpack(payload: bytes) -> tuple[int, list[Packed]]:
-    """The version of a sound payload, and its arrays."""
-    _, version, count = PAYLOAD.unpack_from(payload)
-    start, arrays = PAYLOAD.size, []
-    for _ in range(count):
-        texts = []
-        for _ in ("name", "dtype"):
-            texts.append(payload[start + 1 : start + 1 + payload[start]].decode("ascii"))
-            start += 1 + payload[start]
-        axes = payload[start]
-        shape = struct.unpack_from(f"<{axes}Q", payload, start + 1)
-        codec, size, stored = LENGTHS.unpack_from(payload, start + 1 + 8 * axes)
-        start += 1 + 8 * axes + LENGTHS.size
-        arrays.append(Packed(*texts, shape, codec, size, b"", stored))
-    for i, array in enumerate(arrays):
-        length = array.stored or 0
-        arrays[i] = replace(array, buffer=payload[start : start + length], stored=None)
-        start += length
-    return version, arrays
+Packed = tuple[str, str, tuple[int, ...], int, int, bytes]
+"""An array in a payload: its name, dtype, shape, codec, the bytes that it is said to have, and its buffer."""
 
 
 def raw(name: str, array: np.ndarray) -> Packed:
     """An array as it is, in no codec."""
-    return Packed(name, array.dtype.str, array.shape, 0, array.nbytes, array.tobytes())
+    array = np.asarray(array, order="C")
+    return name, array.dtype.str, array.shape, 0, array.nbytes, array.tobytes()
+
+
+def pack(arrays: Sequence[Packed], *, count: int | None = None) -> bytes:
+    """A payload of arrays of which anything may be said; count: where it is to say another than the right one."""
+    head, buffers = [PAYLOAD.pack(b"ARPL", 1, len(arrays) if count is None else count)], []
+    for name, dtype, shape, codec, size, buffer in arrays:
+        head += [struct.pack("<B", len(text)) + text for text in (name.encode(), dtype.encode())]
+        head.append(struct.pack(f"<B{len(shape)}Q", len(shape), *shape))
+        head.append(LENGTHS.pack(codec, size, len(buffer)))
+        buffers.append(buffer)
+    return b"".join(head + buffers)
 
 
 def named_in(path: Path) -> list[dict[str, Any]]:
@@ -227,7 +177,7 @@ def named_in(path: Path) -> list[dict[str, Any]]:
 
 def group_of(path: Path, number: int) -> Path:
     """The folder of a checkpoint."""
-    return checkpoint_path(path, number)
+    return path / "checkpoints" / f"{number:08d}"
 
 
 def described(path: Path, number: int) -> dict[str, Any]:
@@ -278,6 +228,8 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
 
     They are written without any codec but that for bytes, in one chunk each, as anyone may.
     """
+    from scroll_tactile_store.encoding import array_digest
+
     known = described(path, number)
     for name, given in arrays.items():
         array = np.asarray(given, order="C")
@@ -292,6 +244,9 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dic
 
 def put_array(folder: Path, array: np.ndarray) -> list[str]:
     """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
+    from quick_checkpoints import array_about
+    from scroll_tactile_store.chunks import ArrayContent
+
     content = ArrayContent(array.dtype, array.shape, "")
     plain = content.to_plain(array)
     chunk = folder.joinpath("c", *["0"] * plain.ndim)
@@ -305,14 +260,70 @@ def put_array(folder: Path, array: np.ndarray) -> list[str]:
     return [hashlib.sha256(data).hexdigest()]
 
 
-def frames_of(path: Path) -> dict[int, Frame]:
-    """The frames of the rows that verify, by sequence."""
-    with LogReader(log_of(path)) as log:
-        found = Rows()
-        for _ in found.take(log):
-            pass
-        places = zip(found.sequences, found.offsets, found.sizes, strict=True)
-        return {number: log.read(offset, size)[0] for number, offset, size in places}
+def lengthen_frame(path: Path) -> None:
+    """Have the last row's frame say that it has 4 GiB."""
+    log, last = log_of(path), max(frame.offset for frame in frames_of(path).values())
+    data = bytearray(log.read_bytes())
+    data[last + 36 : last + 40] = b"\xff" * 4
+    data[last + 72 : last + 88] = digest(data[last : last + 72])
+    log.write_bytes(data)
+
+
+def put_touch(path: Path, **changes: Any) -> None:
+    """A sound observation once more, with changes."""
+    attributes, payload = observation(path)
+    put_row(path, **{"attributes": attributes, "payload": payload, "label": "a"} | changes)
+
+
+def say_in_current(path: Path, **changes: Any) -> None:
+    """`CURRENT` says other things, or, by `newest`, of the newest checkpoint."""
+    before = get_current(path)
+    changes |= {"newest": before["newest"] | changes["newest"]} if "newest" in changes else {}
+    changes |= {"log": [changes["log"], before["log"][1]]} if "log" in changes else {}
+    set_current(path, **changes)
+
+
+def set_configuration(path: Path, **configuration: Any) -> None:
+    """Give a memory another configuration of its embedding."""
+    known = get_identity(path)
+    known["embedding"]["configuration"] = configuration
+    set_identity(path, known)
+
+
+def largest_array(path: Path) -> tuple[int, dict[str, Any], str]:
+    """The newest checkpoint's number, what it says of itself, and the name of its largest array."""
+    number = get_current(path)["newest"]["number"]
+    known = described(path, number)
+    sizes = {name: int(np.prod(about["shape"])) for name, about in known["arrays"].items() if "log-" not in name}
+    return number, known, max(sizes, key=sizes.get)
+
+
+def change_array(path: Path, codec: str = "", data: bytes = b"", longer: int = 1, named: str = "") -> None:
+    """The newest checkpoint's largest array with another codec, bytes, last axis or name, and right checksums."""
+    number, known, name = largest_array(path)
+    folder = group_of(path, number) / name
+    told = json.loads((folder / "zarr.json").read_text())
+    if codec:
+        told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {"level": 1, "checksum": False}}]
+    if data:
+        next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)
+    known = refiled(path, number)
+    for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"], known["arrays"][name]["shape"]):
+        shape[-1] *= longer
+    (folder / "zarr.json").write_text(json.dumps(told))
+    if named:
+        known["arrays"][named] = known["arrays"].pop(name)
+    seal(path, number, known)
+
+
+def zipped(path: Path, change: Callable[[zipfile.ZipFile], object] = lambda made: None) -> Path:
+    """A folder as a packed memory beside it; change: of the zip, before it gets its list of files."""
+    files = [path / "CURRENT", *path.glob("log-*"), *sorted(path.glob("checkpoints/*/**/*"))]
+    with zipfile.ZipFile(path.with_suffix(".zip"), "w") as made:
+        for file in filter(Path.is_file, files):
+            made.writestr(str(file.relative_to(path)), file.read_bytes())
+        change(made)
+    return path.with_suffix(".zip")
 
 
 def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
@@ -320,7 +331,7 @@ def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
     found = frames_of(path)
     with log_of(path).open("r+b") as file:
         for frame in (found[number] for number in found if sequence in (0, number)):
-            at = frame.payload_offset + HEAD_BYTES if head else frame.end - 1
+            at = frame.offset + HEAD.size + ROW.size + DIGEST_BYTES if head else frame.end - 1
             file.seek(at)
             byte = file.read(1)[0] ^ 1
             file.seek(at)

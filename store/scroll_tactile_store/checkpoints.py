@@ -118,7 +118,7 @@ class Checkpoints:
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a checkpoint")
         first, last = self._journal.current().compacted, self._journal.last()
-        if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
+        if type(last_sequence) is not int or not first <= last_sequence <= last:
             # Recovery could not resume among the compacted rows, which have given up their arrays.
             raise RecordError(
                 f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
@@ -149,18 +149,17 @@ class Checkpoints:
                 number = self._next(log_numbers(self._folder, unfinished=True))
                 path = log_path(self._folder, number)
                 header = to_json("identity", self._journal.identity).encode()
+                rows_without = ((ROW, data) for data in self._journal.payloads(draft.last_sequence))
                 try:
-                    identity = create_log(
-                        path, header, ((ROW, data) for data in self._journal.payloads(draft.last_sequence))
-                    )
+                    identity = create_log(path, header, rows_without)
                     drafts = [draft] if newest is None else [draft, newest]
                     places, rows = read_back(path, [each.last_sequence for each in drafts])
                     named = [
                         self._write(each, place, identity, rows.table(each.last_sequence))
                         for each, place in zip(drafts, places, strict=True)
                     ]
-                    for damage in (damage for one in named for damage in self._verified(one).damage()):
-                        raise damage
+                    for one in named:
+                        self._load(one)
                 except BaseException:
                     remove_tree(path)
                     raise

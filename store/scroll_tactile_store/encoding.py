@@ -51,34 +51,26 @@ def check_arrays(arrays: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarra
     float64, all little-endian, in any shape. Raises RecordError for any other array and for a name that could not be
     a folder's on every system.
     """
-    checked: dict[str, np.ndarray] = {}
-    folded: dict[str, str] = {}
+    names: dict[str, str] = {}
     for name, array in (arrays or {}).items():
         if not isinstance(name, str) or not KEPT_NAME.fullmatch(name):
             raise RecordError(
                 f"{name!r} cannot name an array: use 1 to 100 ASCII letters, digits, '_', '-' and '.', not "
                 "starting with '__', '-' or '.' nor ending with '.', and not 'zarr.json'"
             )
-        if other := folded.get(name.casefold()):
+        if (other := names.setdefault(name.casefold(), name)) != name:
             raise RecordError(f"the names {other!r} and {name!r} would be one folder on a Mac or on Windows")
-        folded[name.casefold()] = name
-        _check_array(name, array)
-        # Not ascontiguousarray, which turns a 0-d array into a 1-d one.
-        checked[name] = np.asarray(array, order="C")
-    return checked
-
-
-def _check_array(name: str, array: np.ndarray) -> None:
-    if not isinstance(array, np.ndarray):
-        raise RecordError(f"array {name!r} is a {type(array).__name__}, not a numpy.ndarray")
-    if isinstance(array, np.ma.MaskedArray):
-        raise RecordError(f"array {name!r} is masked; keep its data and its mask as two arrays")
-    if array.dtype.str not in KEPT_TYPES:
-        hint = "byte-swap it to little-endian" if array.dtype.str.startswith(">") else "convert it"
-        raise RecordError(
-            f"array {name!r} has dtype {array.dtype} and shape {array.shape}; kept are integers and float16 to "
-            f"float64, little-endian: {hint} first"
-        )
+        if not isinstance(array, np.ndarray):
+            raise RecordError(f"array {name!r} is a {type(array).__name__}, not a numpy.ndarray")
+        if isinstance(array, np.ma.MaskedArray):
+            raise RecordError(f"array {name!r} is masked; keep its data and its mask as two arrays")
+        if array.dtype.str not in KEPT_TYPES:
+            raise RecordError(
+                f"array {name!r} has dtype {array.dtype} and shape {array.shape}; kept are integers and float16 to "
+                "float64, little-endian: convert it first"
+            )
+    # Not ascontiguousarray, which turns a 0-d array into a 1-d one.
+    return {name: np.asarray(array, order="C") for name, array in (arrays or {}).items()}
 
 
 def kept_dtype(text: object) -> np.dtype:

@@ -17,12 +17,11 @@ from quick_checkpoints import array_about
 from scroll_tactile_store import Store
 from scroll_tactile_store.chunks import ArrayContent
 from scroll_tactile_store.encoding import array_digest, check_arrays, encode_payload
-from scroll_tactile_store.framing import COMMIT, HEADER, NO_CHECKSUM, Frame, pack_frame
+from scroll_tactile_store.framing import COMMIT, HEADER, Frame, LogPlace, pack_frame
 from scroll_tactile_store.layout import CURRENT_FILE, checkpoint_path, log_path
-from scroll_tactile_store.log import LogPlace, LogReader
+from scroll_tactile_store.log import BEGIN, Log, refuse
 from scroll_tactile_store.records import payload_digest
-from scroll_tactile_store.row_encoding import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
-from scroll_tactile_store.rows import Rows
+from scroll_tactile_store.rows import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
 
 PAYLOAD = struct.Struct("<4sBH")
 LENGTHS = struct.Struct("<BQQ")
@@ -56,20 +55,20 @@ def log_of(path: Path) -> Path:
 
 def read_log(path: Path) -> tuple[bytes, list[bytes]]:
     """The payload of a store's first frame, and the bytes of each of its rows."""
-    with LogReader(log_of(path)) as log:
-        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
-        return log.header, [log.read(frame.offset, frame.size)[1] for frame in frames]
+    with Log(log_of(path)) as log:
+        frames = [frame for batch in log.scan(refuse) for frame in batch if frame.kind == ROW]
+        return log.header, [log.read(frame.offset, frame.size) for frame in frames]
 
 
 def log_bytes(
     identity: bytes, header: bytes, batches: Iterable[Sequence[tuple[int, bytes]]]
 ) -> tuple[bytes, list[LogPlace]]:
     """The bytes of a log, and the place behind its first frame and behind each batch of kinds and payloads."""
-    data, frame = pack_frame(identity, 0, 0, 0, HEADER, header, NO_CHECKSUM)
+    data, frame = pack_frame(identity, BEGIN, HEADER, header)
     parts, places, at = [data], [LogPlace.behind(frame)], LogPlace.behind(frame)
     for batch in batches:
         for kind, payload in [*batch, (COMMIT, b"")]:
-            data, frame = pack_frame(identity, at.offset, at.number, at.batch, kind, payload, at.previous)
+            data, frame = pack_frame(identity, at, kind, payload)
             parts.append(data)
             at = LogPlace.behind(frame)
         places.append(at)
@@ -307,12 +306,11 @@ def put_array(folder: Path, array: np.ndarray) -> list[str]:
 
 def frames_of(path: Path) -> dict[int, Frame]:
     """The frames of the rows that verify, by sequence."""
-    with LogReader(log_of(path)) as log:
-        found = Rows()
-        for _ in found.take(log):
-            pass
-        places = zip(found.sequences, found.offsets, found.sizes, strict=True)
-        return {number: log.read(offset, size)[0] for number, offset, size in places}
+    with Log(log_of(path)) as log:
+        found: list[Frame] = []
+        for batch in log.scan(lambda _, frames, found=found: found.extend(frames)):
+            found.extend(batch)
+        return {row_sequence(log.read(frame.offset, frame.size)): frame for frame in found if frame.kind == ROW}
 
 
 def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:

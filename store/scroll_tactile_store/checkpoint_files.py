@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import errno
+import os
 import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from scroll_tactile_store.archive import Files
 from scroll_tactile_store.chunks import (
     GROUP_VERSION,
     LARGEST_DESCRIPTION,
@@ -24,9 +25,8 @@ from scroll_tactile_store.chunks import (
 )
 from scroll_tactile_store.encoding import array_digest
 from scroll_tactile_store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
-from scroll_tactile_store.files import remove_tree, replacing, sync_folder
+from scroll_tactile_store.files import open_regular, read_regular, remove_tree, replacing, sync_folder, tree_sizes
 from scroll_tactile_store.layout import PARTIAL, checkpoint_path
-from scroll_tactile_store.log_file import LogFile
 from scroll_tactile_store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, LateArray, from_json, json_digest
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
             remove_tree(partial)
             with replacing(final, partial):
                 group = _write_zarr(partial, draft, described, draft.level)
-                if sum(content.size for content in described.values()) > most_bytes(Files(folder).sizes(partial)):
+                if sum(content.size for content in described.values()) > most_bytes(tree_sizes(partial)):
                     # Readers make no room for so much that so little stands for: anybody could claim it.
                     remove_tree(partial)
                     group = _write_zarr(partial, draft, described, None)
@@ -93,7 +93,7 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
                 digest = json_digest(known)
                 group.update_attributes(known | {"sha256": digest})
                 try:
-                    _read_attributes(partial / "zarr.json", Files(folder))
+                    _read_attributes(partial / "zarr.json")
                 except (ValueError, DamageError) as error:
                     raise RecordError(
                         f"checkpoint {number} has more attributes than could be read again: {error}"
@@ -149,16 +149,16 @@ class CheckpointReader:
     for another format, and StoreError for a file that cannot be read for a reason that says nothing against it.
     """
 
-    def __init__(self, path: Path, files: Files) -> None:
-        self._path, self._files = path, files
-        known, self._described = _read_description(path, files)
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        known, self._described = _read_description(path)
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]
         self.sha256: str = known["sha256"]
         self.attributes: Mapping[str, JSON] = known["attributes"]
         self.identity: Mapping[str, JSON] = known["identity"]
         try:
-            room = most_bytes(files.sizes(path))
+            room = most_bytes(tree_sizes(path))
         except OSError as error:
             raise _unreadable(error, f"checkpoint {self.number} in {path}", path) from error
         if (size := sum(array.size for array in self._described.values())) > room:
@@ -181,15 +181,19 @@ class CheckpointReader:
         return {name: self._late(name) for name in self._described if name in names}
 
     def _late(self, name: str) -> LateArray:
-        content, held = self._described[name], dict[Path, LogFile]()
+        content, held = self._described[name], dict[Path, BinaryIO]()
         with self._naming(name), ExitStack() as opened:
-            for _, path, _ in ArrayFiles(self._path, name, content, self._files.read).verified():
-                held[path] = self._files.open_log(path)
-                opened.callback(held[path].close)
-            text = self._files.read(self._path / name / "zarr.json", LARGEST_DESCRIPTION)
+            for _, path, _ in ArrayFiles(self._path, name, content, self._read).verified():
+                held[path] = opened.enter_context(os.fdopen(open_regular(path, os.O_RDONLY), "rb"))
+            text = self._read(self._path / name / "zarr.json", LARGEST_DESCRIPTION)
+            guard = Lock()
 
             def read(path: Path, limit: int) -> bytes:
-                return text if path.name == "zarr.json" else held[path].read_whole(limit)
+                if path.name == "zarr.json":
+                    return text
+                with guard:
+                    held[path].seek(0)
+                    return held[path].read(limit)
 
             late = LateArray(content.dtype, content.shape, lambda: self._array(name, read=read))
             weakref.finalize(late, opened.pop_all().close)
@@ -209,11 +213,14 @@ class CheckpointReader:
     ) -> np.ndarray:
         content = self._described[name]
         with self._naming(name) as (what, folder):
-            array = ArrayFiles(self._path, name, content, read or self._files.read).read()
+            array = ArrayFiles(self._path, name, content, read or self._read).read()
         # Its files were verified; what they stand for is looked at where damage is looked for.
         if thorough and array_digest(array) != content.sha256:
             raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
         return array
+
+    def _read(self, path: Path, limit: int) -> bytes:
+        return read_regular(path, limit, within=self._path.parent.parent)
 
     @contextmanager
     def _naming(self, name: str) -> Iterator[tuple[str, Path]]:
@@ -226,9 +233,9 @@ class CheckpointReader:
             raise _unreadable(error, what, folder) from error
 
 
-def _read_attributes(header: Path, files: Files) -> dict[str, Any]:
+def _read_attributes(header: Path) -> dict[str, Any]:
     """Return the attributes of a group; raise DamageError, ValueError where it is none, and OSError."""
-    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
+    group: dict[str, Any] = from_json(read_regular(header, LARGEST_JSON, within=header.parents[2]).decode())
     attributes = group.get("attributes")
     if not isinstance(attributes, dict) or (group.get("node_type"), group.get("zarr_format")) != ("group", 3):
         raise ValueError("it describes no group of zarr's format 3")
@@ -244,10 +251,10 @@ def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
     return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
 
 
-def _read_description(path: Path, files: Files) -> tuple[dict[str, Any], dict[str, ArrayContent]]:
+def _read_description(path: Path) -> tuple[dict[str, Any], dict[str, ArrayContent]]:
     header = path / "zarr.json"
     try:
-        known = _read_attributes(header, files)
+        known = _read_attributes(header)
         stored = known.pop("sha256", None)
         sound = json_digest(known) == stored
     except Exception as error:

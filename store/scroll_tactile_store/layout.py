@@ -6,15 +6,15 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from scroll_tactile_store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
-from scroll_tactile_store.framing import IDENTITY_BYTES
-from scroll_tactile_store.log import LogPlace, LogReader
+from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
+from scroll_tactile_store.log import Log, refuse
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
 
 __all__ = [
@@ -126,25 +126,24 @@ class Current:
             known: dict[str, Any] = dict(from_json(data.decode("ascii")))
             if known.pop("sha256", None) != json_digest(known):
                 raise ValueError("its sha256 differs")
-            if _count(known["format"]) > FORMAT_VERSION:
+            if (version := _count(known["format"])) > FORMAT_VERSION:
                 raise VersionError(
-                    f"{path} is written in format {known['format']}; this release reads format {FORMAT_VERSION}: "
-                    "upgrade it, or open the store with the release that wrote it; nothing was changed"
+                    f"{path} is written in format {version}; this release reads format {FORMAT_VERSION}: upgrade it, "
+                    "or open the store with the release that wrote it; nothing was changed"
                 )
-            if known["format"] < FORMAT_VERSION:
+            if version < FORMAT_VERSION:
                 raise VersionError(
-                    f"{path} is written in format {known['format']}, by scroll-tactile 0.15 or before; this one reads "
-                    f"format {FORMAT_VERSION}: learn it again from the recordings, or open it with scroll-tactile 0.15"
+                    f"{path} is written in format {version}, by scroll-tactile 0.15 or before; this one reads format "
+                    f"{FORMAT_VERSION}: learn it again from the recordings, or open it with scroll-tactile 0.15"
                 )
             number, identity = known["log"]
             newest, compaction = (
                 None if known[name] is None else NamedCheckpoint.from_json(known[name])
                 for name in ("newest", "compaction")
             )
-            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
-                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
-            last = _count(known.get("last", 0))
-            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, last)
+            if compaction is not None and newest is None:
+                raise ValueError("it names a compaction checkpoint and no newest one")
+            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, _count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
 
@@ -169,10 +168,10 @@ def _hex(text: Any, size: int) -> bytes:
     return bytes.fromhex(text)
 
 
-def read_current(path: Path, read: Callable[[Path, int], bytes] = read_regular) -> Current:
+def read_current(path: Path) -> Current:
     """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
     try:
-        data = read(path, LARGEST_CURRENT)
+        data = read_regular(path, LARGEST_CURRENT)
     except DamageError as error:
         raise _not_as_written(path, error) from error
     return Current.from_bytes(data, path)
@@ -273,8 +272,8 @@ def _was_made_since(folder: Path) -> bool:
 def _has_batches(folder: Path) -> bool:
     """Whether more than its first frame was ever written to the first log."""
     try:
-        with LogReader(log_path(folder, 1)) as log:
-            return any(True for _ in log.refresh())
+        with Log(log_path(folder, 1)) as log:
+            return any(True for _ in log.scan(refuse))
     except DamageError:
         return True
 

@@ -22,7 +22,7 @@ from scroll_tactile_store.layout import (
     require_unshared,
     write_current,
 )
-from scroll_tactile_store.log_writer import create_log
+from scroll_tactile_store.log import create_log
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock

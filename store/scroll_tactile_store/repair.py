@@ -10,11 +10,8 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
-from scroll_tactile_store.archive import Files
-from scroll_tactile_store.checkpoints import read_back
 from scroll_tactile_store.exceptions import DamageError, reported
 from scroll_tactile_store.files import store_folder, sync_folder
-from scroll_tactile_store.found_log import Fault, Progress
 from scroll_tactile_store.layout import (
     DAMAGED,
     LOG,
@@ -28,10 +25,10 @@ from scroll_tactile_store.layout import (
     write_current,
 )
 from scroll_tactile_store.lock import WriterLock
-from scroll_tactile_store.log_writer import create_log
+from scroll_tactile_store.log import Log, create_log
 from scroll_tactile_store.records import to_json
-from scroll_tactile_store.row_encoding import ROW, head_without_arrays
-from scroll_tactile_store.survey import FoundCheckpoint, Survey, require_store
+from scroll_tactile_store.rows import ROW, head_without_arrays, read_back
+from scroll_tactile_store.survey import Fault, FoundCheckpoint, Progress, Survey, require_store
 
 __all__ = ["Repair", "repair_store"]
 
@@ -78,7 +75,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     lock = WriterLock(folder)
     try:
         with reported(folder, "repairing the store"):
-            survey = Survey(Files(folder), progress or (lambda *_: None))
+            survey = Survey(folder, progress or (lambda *_: None))
             try:
                 if not survey.problems():
                     return Repair(survey.last, [], None)
@@ -148,7 +145,7 @@ def _lost(survey: Survey, plan: _Plan) -> list[str]:
 
 def _counts_again(survey: Survey, plan: _Plan) -> str:
     """Return in words which rows behind a new compaction checkpoint can have taken back one that it contains."""
-    behind = [sequence for sequence, _ in survey.log.rows if plan.compacted < sequence <= plan.kept]
+    behind = [sequence for sequence in survey.log.rows if plan.compacted < sequence <= plan.kept]
     if not behind:
         return ""
     kinds = Counter(survey.log.head(sequence).kind for sequence in behind)
@@ -187,7 +184,7 @@ def _numbers_aside(folder: Path) -> Iterator[int]:
 
 
 def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
-    for sequence, fault in survey.log.rows:
+    for sequence, fault in survey.log.rows.items():
         if sequence > plan.kept:
             return
         survey.progress("rows written", sequence, plan.kept)
@@ -207,11 +204,11 @@ def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
 
 def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
     """Return the newest and the compaction checkpoint, with places in the new log, which is read back."""
-    found = [plan.start, plan.stand_in]
-    places, _ = read_back(path, [0 if each is None else each.last_sequence for each in found])
+    with Log(path) as log:
+        rows = read_back(log)
     newest, compaction = (
-        None if each is None or each.named is None else replace(each.named, place=place)
-        for each, place in zip(found, places, strict=True)
+        None if each is None or each.named is None else replace(each.named, place=rows.place(each.last_sequence))
+        for each in (plan.start, plan.stand_in)
     )
     return newest, compaction
 

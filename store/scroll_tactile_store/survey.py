@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import closing
+import enum
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
 
-from scroll_tactile_store.archive import Files, files_of
+from scroll_tactile_store.archive import unpacked
 from scroll_tactile_store.checkpoint_files import CheckpointReader
-from scroll_tactile_store.exceptions import DamageError, NotAStoreError, reported
-from scroll_tactile_store.files import store_folder
-from scroll_tactile_store.found_log import Fault, FoundLog, Progress
-from scroll_tactile_store.framing import NO_CHECKSUM
+from scroll_tactile_store.encoding import decode_payload
+from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
+from scroll_tactile_store.files import is_file, store_folder
+from scroll_tactile_store.framing import FRAME_BYTES, Frame, LogPlace
 from scroll_tactile_store.layout import (
     CHECKPOINTS,
     CURRENT_FILE,
@@ -29,15 +29,19 @@ from scroll_tactile_store.layout import (
     log_numbers,
     log_path,
     numbers,
+    read_current,
     unsafe_entries,
 )
-from scroll_tactile_store.log import LogPlace
-from scroll_tactile_store.records import JSON
+from scroll_tactile_store.log import BEGIN, Log
+from scroll_tactile_store.records import JSON, Head, from_json
+from scroll_tactile_store.rows import ROW, decode_row, read_head, row_sequence
 
-__all__ = ["FoundCheckpoint", "Problem", "Survey", "check_store", "require_store"]
+__all__ = ["Fault", "FoundCheckpoint", "Problem", "Progress", "Survey", "check_store", "require_store"]
 
+# Called with what is being done, how many of it are done, and how many there are.
+Progress = Callable[[str, int, int], object]
+REPORT_EVERY = 256  # batches
 ATTEMPTS = 4
-NOWHERE = LogPlace(0, 0, 0, NO_CHECKSUM)  # in the log, of a checkpoint that `CURRENT` does not name
 
 
 @dataclass(frozen=True)
@@ -65,21 +69,24 @@ def check_store(path: str | PathLike[str], *, progress: Progress | None = None) 
     where a file cannot be read for a reason that says nothing against it.
     """
     folder = store_folder(path)
+    if is_file(folder):
+        try:
+            with unpacked(folder) as inside:
+                return [replace(problem, path=folder) for problem in check_store(inside, progress=progress)]
+        except DamageError as error:
+            return [Problem(folder, str(error), "lost")]
     with reported(folder, "checking the store"):
-        files = files_of(folder)
-        if not files.is_packed:
-            require_store(folder)
-            if strange := [Problem(error.path, str(error), "lost") for error in unsafe_entries(folder)]:
-                return strange
-        with closing(files):
-            for _ in range(ATTEMPTS):
-                survey = Survey(files, progress or (lambda *_: None))
-                try:
-                    found = survey.problems() + list(survey.leftovers())
-                finally:
-                    survey.log.close()
-                if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
-                    break
+        require_store(folder)
+        if strange := [Problem(error.path, str(error), "lost") for error in unsafe_entries(folder)]:
+            return strange
+        for _ in range(ATTEMPTS):
+            survey = Survey(folder, progress or (lambda *_: None))
+            try:
+                found = survey.problems() + list(survey.leftovers())
+            finally:
+                survey.log.close()
+            if not any(problem.kind != "leftover" for problem in found) or not survey.moved():
+                break
         return found
 
 
@@ -90,6 +97,148 @@ def require_store(folder: Path) -> None:
             raise NotAStoreError(f"{folder} holds no store")
     except DamageError:
         return
+
+
+class Fault(enum.Enum):
+    """A fault of a row; its value: the words for one row, and for several."""
+
+    MISSING = ("is missing", "are missing")
+    DAMAGED = ("fails its checksum", "fail their checksums")
+    NO_ARRAYS = ("has lost its arrays", "have lost their arrays")
+    DAMAGED_ARRAYS = ("has arrays that fail their checksum", "have arrays that fail their checksums")
+    FOREIGN_ARRAYS = ("has arrays that were never written so", "have arrays that were never written so")
+
+    def describe(self, first: int, last: int) -> str:
+        """Return in words that rows `first` to `last` have this fault."""
+        return f"row {first} {self.value[0]}" if first == last else f"rows {first} to {last} {self.value[1]}"
+
+
+class FoundLog:
+    """A log as it was found: the sequences of its rows, each with what is wrong with it, and other damage.
+
+    path: the log, or what an interrupted repair left of it. identity: the store's, None where that is lost. rows: by
+    sequence, ascending. compacted: the last row without arrays. torn: rows behind which there was something that cannot
+    be read. damage: what is wrong with it but for rows. durable: as of `Log.scan`.
+    """
+
+    def __init__(self, path: Path, identity: bytes | None, progress: Progress, durable: LogPlace | None = None) -> None:
+        self.path, self.damage, self._durable = path, list[str](), durable
+        self.identity: dict[str, JSON] | None = None
+        self.rows: dict[int, Fault | None] = {}
+        self.torn, self.without_arrays = set[int](), set[int]()
+        self.last = self.compacted = 0
+        self._frames: dict[int, tuple[int, int]] = {}
+        self.log: Log | None = None
+        try:
+            log = Log(path, identity=identity or b"")
+        except FileNotFoundError:
+            self.damage.append(f"{path} is gone")
+            return
+        except DamageError as error:
+            self.damage.append(str(error))
+            return
+        if identity is not None and log.identity != identity:
+            self.damage.append(f"{path} is the log of another store, or of another time: nothing of it was read")
+            log.close()
+            return
+        self.log = log
+        try:
+            self._read(log, progress)
+        except DamageError as error:  # nothing more of the file can be read
+            self.damage.append(str(error))
+        except BaseException:
+            self.close()
+            raise
+
+    def _read(self, log: Log, progress: Progress) -> None:
+        if log.header_damage is not None:
+            self.damage.append(str(log.header_damage))
+        else:
+            try:
+                self.identity = from_json(log.header.decode())
+            except ValueError as error:
+                self.damage.append(f"the identity in {self.path} was never written so: {error}")
+        for done, frames in enumerate(log.scan(self._note_damage, self._durable)):
+            if done % REPORT_EVERY == 0:
+                progress("batches", done, done)
+            for frame in frames:
+                self._note_row(frame)
+
+    def _note_damage(self, damage: DamageError, before: list[Frame]) -> None:
+        """Note a damaged frame: as a row with a fault where its first bytes still say which."""
+        for frame in before:
+            self._note_row(frame)
+        assert self.log is not None and damage.offset is not None and damage.frame is not None
+        try:
+            found = self.log.frame_at(damage.offset)
+            if found is not None and found.kind == ROW:
+                head = read_head(self.log, found.offset, found.size)
+                if head.sequence > self.last:
+                    self._note(head.sequence, found, Fault.DAMAGED_ARRAYS)
+                    return
+        except (DamageError, ValueError):
+            pass
+        self.damage.append(str(damage))
+        is_commit = self._durable is not None and self._durable[:2] == (damage.offset + FRAME_BYTES, damage.frame + 1)
+        if not is_commit:  # which is no row
+            self.torn.add(self.last)
+
+    def _note_row(self, frame: Frame) -> None:
+        if frame.kind != ROW:
+            return
+        assert self.log is not None
+        try:
+            data = self.log.read(frame.offset, frame.size)
+            if (sequence := row_sequence(data)) <= self.last:
+                raise ValueError(f"row {sequence} follows row {self.last}")
+        except (DamageError, ValueError) as error:
+            self.damage.append(f"{self.path} has a frame that is no row (byte {frame.offset}): {error}")
+            self.torn.add(self.last)
+            return
+        fault = None
+        try:
+            payload = decode_row(data).payload
+            if payload is None:
+                self.without_arrays.add(sequence)
+                self.compacted = sequence
+            elif not _is_readable(payload):
+                fault = Fault.FOREIGN_ARRAYS
+        except ValueError:
+            fault = Fault.DAMAGED
+        self._note(sequence, frame, fault)
+
+    def _note(self, sequence: int, frame: Frame, fault: Fault | None) -> None:
+        self.rows[sequence], self._frames[sequence], self.last = fault, (frame.offset, frame.size), sequence
+
+    def data(self, sequence: int) -> bytes:
+        """Return the bytes of a row, verified once more. Raises DamageError."""
+        assert self.log is not None
+        return self.log.read(*self._frames[sequence])
+
+    def head(self, sequence: int) -> Head:
+        """Return the head of a row. Raises DamageError where that does not verify."""
+        assert self.log is not None
+        try:
+            return read_head(self.log, *self._frames[sequence])
+        except ValueError as error:
+            what = f"the head of row {sequence} is not as it was written ({error})"
+            raise DamageError(f"{what} in {self.path}", path=self.path, sequence=sequence) from error
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.log is not None:
+            self.log.close()
+
+
+def _is_readable(payload: bytes) -> bool:
+    """Whether a payload is what `encode_payload` makes; one of a newer release counts."""
+    try:
+        decode_payload(payload)
+    except VersionError:
+        return True
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -128,12 +277,12 @@ class Survey:
     against it.
     """
 
-    def __init__(self, files: Files, progress: Progress) -> None:
-        self.files, self.folder, self.progress = files, files.folder, progress
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self.folder, self.progress = folder, progress
         self.current: Current | None = None
         self.damage: list[Problem] = []
         try:
-            self.current = files.current()
+            self.current = read_current(folder / CURRENT_FILE)
         except FileNotFoundError:
             path = self.folder / CURRENT_FILE
             self.damage.append(Problem(path, f"{path} is gone", "spare"))
@@ -164,8 +313,8 @@ class Survey:
         compaction = None if self.current is None else self.current.compaction
         is_compaction = compaction is not None and compaction.number == number
         try:
-            reader = CheckpointReader(path, self.files)
-            found = NamedCheckpoint(reader.number, reader.last_sequence, reader.sha256, NOWHERE)
+            reader = CheckpointReader(path)
+            found = NamedCheckpoint(reader.number, reader.last_sequence, reader.sha256, BEGIN)
             expected = found if named is None else named
             if (found.number, found.last_sequence, found.sha256) != (number, expected.last_sequence, expected.sha256):
                 raise DamageError(
@@ -193,12 +342,12 @@ class Survey:
             put_aside = named.with_name(named.name + DAMAGED)  # by an interrupted repair
             if not named.exists() and put_aside.exists():
                 named = put_aside
-            if self.files.is_packed or named.exists():
+            if named.exists():
                 durable = None if self.current.newest is None else self.current.newest.place
-                return FoundLog(self.files, named, self.current.log_identity, self.progress, durable)
+                return FoundLog(named, self.current.log_identity, self.progress, durable)
         there = [log_path(self.folder, number) for number in log_numbers(self.folder)]
         newest = self.sound[0].last_sequence if self.sound else 0
-        found = [FoundLog(self.files, path, None, self.progress) for path in there or aside[-1:]]
+        found = [FoundLog(path, None, self.progress) for path in there or aside[-1:]]
         # Of two that tell as much the newer: the other may be what a compaction replaced.
         best = max(reversed(found), key=lambda log: (log.compacted <= newest, log.last), default=None)
         for log in found:
@@ -206,7 +355,7 @@ class Survey:
                 log.close()
         if self.current is not None and best is not None:
             self.damage.append(Problem(named, f"{named} is gone: {best.path} is what was before it", "lost"))
-        return best or FoundLog(self.files, named, None, self.progress)
+        return best or FoundLog(named, None, self.progress)
 
     def _drop_foreign(self) -> None:
         """Where a checkpoint is another store's it does not count."""
@@ -220,7 +369,7 @@ class Survey:
         known = 0 if self.current is None else self.current.last
         self.faults: list[tuple[int, int, Fault]] = []
         before = 0
-        for sequence, fault in self.log.rows:
+        for sequence, fault in self.log.rows.items():
             self._note_gap(before, sequence - 1)
             if fault is not None and not (fault is not Fault.DAMAGED and sequence <= self.compacted):
                 self._note(sequence, sequence, fault)
@@ -264,7 +413,7 @@ class Survey:
     def moved(self) -> bool:
         """Whether a writer has committed something since."""
         try:
-            return self.files.current() != self.current
+            return read_current(self.folder / CURRENT_FILE) != self.current
         except (DamageError, FileNotFoundError):
             return False
 
@@ -279,10 +428,10 @@ class Survey:
             if self.current is not None or checkpoint.named is not None:
                 kind: Literal["lost", "spare"] = "spare" if self._is_spare(checkpoint) else "lost"
                 found += [Problem(damage.path, str(damage), kind) for damage in checkpoint.damage]
-        for named in () if self.current is None or not self.log.is_read else self.current.checkpoints:
-            if not self.log.has_place(named):
-                what = f"{self.log.path} has no place behind which are all rows behind checkpoint {named.number}, as "
-                found.append(Problem(self.log.path, f"{what}{self.folder / CURRENT_FILE} says", "spare"))
+        for named in () if self.current is None else self.current.checkpoints:
+            if self.log.log is not None and not self.log.log.has_place(named.place):
+                what = f"{self.log.path} holds no batch that ends where checkpoint {named.number} says"
+                found.append(Problem(self.log.path, what, "spare"))
         if self.identity is None:
             found.append(Problem(self.folder, f"nothing in {self.folder} tells what the store is for", "lost"))
         return found
@@ -298,8 +447,6 @@ class Survey:
 
     def leftovers(self) -> Iterator[Problem]:
         """Yield the files that are there too many, and who removes them."""
-        if self.files.is_packed:
-            return
         known = {found.folder for found in self.checkpoints} | {self.log.path}
         parent = self.folder / CHECKPOINTS
         entries = [*self.folder.iterdir(), *(parent.iterdir() if parent.is_dir() else ())]

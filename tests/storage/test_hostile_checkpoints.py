@@ -11,7 +11,6 @@ from forging import describe_again, get_current, put_row, set_current
 from scroll_tactile_store import DamageError, RecordError, Store, check_store
 from scroll_tactile_store import chunks as store_chunks
 from scroll_tactile_store import records as store_records
-from scroll_tactile_store.archive import Files
 from scroll_tactile_store.checkpoint_files import CheckpointReader
 from store_builds import flip, in_turns, newest, taking_at_most
 
@@ -71,7 +70,7 @@ def test_what_is_stored_is_verified_before_it_is_decompressed(path, monkeypatch)
 
     monkeypatch.setattr(store_chunks, "decompress_zstd", reached)
     with pytest.raises(DamageError, match="sha256 differs"):
-        CheckpointReader(newest(path), Files(path)).arrays(["rows"])
+        CheckpointReader(newest(path)).arrays(["rows"])
 
 
 def test_so_little_that_stands_for_so_much_is_written_as_it_is_and_read_back(path, monkeypatch):

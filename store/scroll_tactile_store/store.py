@@ -36,6 +36,7 @@ from scroll_tactile_store.exceptions import (
     RecordError,
     StoreClosedError,
     StoreError,
+    is_missing,
     reported,
 )
 from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
@@ -486,7 +487,8 @@ class Store:
                 if reader.sha256 == named.sha256 and (found := reader.arrays([name])):
                     return Rows.of_table(found[name], place)
         except (StoreError, ValueError) as error:
-            logger.warning("%s: rows are looked for in the log itself: %s", self._log.path, error)
+            if not is_missing(error):  # as where a writer has replaced it
+                logger.warning("%s: rows are looked for in the log itself: %s", self._log.path, error)
         log, end = self._log, self._log.place
         rows, log.place = Rows(log.first), log.first
         try:

@@ -16,7 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from forging import describe_again, get_current, get_identity, put_row, set_current, set_identity
+from forging import (
+    describe_again,
+    get_current,
+    get_identity,
+    group_of,
+    put_row,
+    refiled,
+    set_current,
+    set_identity,
+)
 from touches import PAD, stream
 
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -67,20 +76,28 @@ CURRENTS: dict[str, Attack] = {
 
 # A checkpoint: what it says of itself.
 
-SOUND = {"dtype": "<f8", "shape": [1000, 4], "sha256": "0" * 64, "files": ["0" * 64]}
-ARRAYS: dict[str, Any] = {
-    "a list": [1],
-    "a name that leads out": {"../rows": SOUND},
-    "a name in two cases": {"rows": SOUND, "Rows": SOUND},
-    "objects": {"rows": SOUND | {"dtype": "|O"}},
-    "no dtype": {"rows": {"shape": [1], "sha256": "0" * 64}},
-    "a shape in words": {"rows": SOUND | {"shape": "4"}},
-    "a length of 4.0": {"rows": SOUND | {"shape": [4.0]}},
-    "lengths whose product overflows": {"rows": SOUND | {"shape": [2**40, 2**40]}},
-    "a hundred axes": {"rows": SOUND | {"shape": [1] * 100}},
-    "no sha256": {"rows": SOUND | {"sha256": None}},
-    "no files": {"rows": SOUND | {"files": None}},
-    "too many files": {"rows": SOUND | {"files": ["0" * 64] * 2}},
+FILES: dict[str, Any] = {
+    "a list": ["rows/zarr.json"],
+    "a name that leads out": {"../rows/zarr.json": "0" * 64},
+    "a file of no array": {"rows/x": "0" * 64},
+}
+CLAIMS: dict[str, dict[str, Any]] = {  # of an array, with the right sha256
+    "objects": {"data_type": "variable_length_bytes"},
+    "text": {"data_type": {"name": "fixed_length_utf32", "configuration": {"length_bytes": 400}}},
+    "no dtype": {"data_type": None},
+    "a shape in words": {"shape": "4"},
+    "a length of 4.0": {"shape": [4.0, 4]},
+    "lengths whose product overflows": {"shape": [2**40, 2**40]},
+    "a hundred axes": {"shape": [1] * 100},
+    "an axis less": {"shape": [1000]},
+    "more chunks than files": {"shape": [10**6, 4]},
+    "a pickle": {"codecs": [{"name": "bytes"}, {"name": "numcodecs.pickle"}]},
+    "a codec of another list": {"codecs": [{"name": "bytes"}, {"name": "gzip", "configuration": {"level": 1}}]},
+    "no codecs": {"codecs": []},
+    "not compressed": {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
+    "chunks of nothing": {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [0, 4]}}},
+    "a larger chunk": {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40, 4]}}},
+    "chunks in words": {"chunk_grid": {"name": "x"}},
 }
 OWN: dict[str, Any] = {
     "a number in words": {"number": "1"},
@@ -97,7 +114,22 @@ def _checkpoint(**changes: Any) -> Attack:
     return lambda path: describe_again(path, **changes)
 
 
-CHECKPOINTS = {f"arrays: {name}": _checkpoint(arrays=arrays) for name, arrays in ARRAYS.items()}
+def _claiming(*sha256: Any, **about: Any) -> Attack:
+    """The array "rows" of the newest checkpoint has another description; sha256: in place of the right one."""
+
+    def attack(path: Path) -> None:
+        number = get_current(path)["newest"]["number"]
+        header = group_of(path, number) / "rows" / "zarr.json"
+        header.write_text(json.dumps(json.loads(header.read_text()) | about))
+        files = refiled(path, number)["files"]
+        describe_again(path, files=files | dict(zip(["rows/zarr.json"], sha256, strict=False)))
+
+    return attack
+
+
+CHECKPOINTS = {f"files: {name}": _checkpoint(files=files) for name, files in FILES.items()}
+ARRAYS = {f"an array: {name}": _claiming(**about) for name, about in CLAIMS.items()}
+ARRAYS |= {f"an array: {sha256} for a sha256": _claiming(sha256) for sha256 in ("0" * 64, None)}
 CHECKPOINTS |= {name: _checkpoint(**changes) for name, changes in OWN.items()}
 
 # Links: which name in the folder leads where, outside of it.

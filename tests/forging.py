@@ -8,23 +8,21 @@ import shutil
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from quick_checkpoints import array_about
 from scroll_tactile_store import Store
-from scroll_tactile_store.chunks import ArrayContent
-from scroll_tactile_store.encoding import array_digest, check_arrays, encode_payload
+from scroll_tactile_store.encoding import check_arrays, encode_payload
 from scroll_tactile_store.framing import COMMIT, HEADER, Frame, LogPlace, pack_frame
 from scroll_tactile_store.layout import CURRENT_FILE, checkpoint_path, log_path
 from scroll_tactile_store.log import BEGIN, Log, refuse
 from scroll_tactile_store.records import payload_digest
 from scroll_tactile_store.rows import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
 
-PAYLOAD = struct.Struct("<4sBH")
-LENGTHS = struct.Struct("<BQQ")
+LENGTH = struct.Struct("<I")
 
 
 def as_text(value: Any) -> str:
@@ -169,52 +167,35 @@ class Packed:
     """An array in a payload: what is said of it, and its buffer; stored: the length that the buffer is said to have."""
 
     name: str
-    dtype: str
-    shape: tuple[int, ...]
-    codec: int
-    size: int
+    dtype: Any
+    shape: Any
     buffer: bytes
-    stored: int | None = None
+    stored: Any = None
+
+    @property
+    def said(self) -> list[Any]:
+        """What the payload says of it."""
+        return [self.dtype, self.shape, len(self.buffer) if self.stored is None else self.stored]
 
 
-def pack(arrays: Sequence[Packed], version: int = 1, count: int | None = None) -> bytes:
-    """A payload as FORMAT.md says it is, of arrays of which anything may be said."""
-    head, buffers = [PAYLOAD.pack(b"ARPL", version, len(arrays) if count is None else count)], []
-    for array in arrays:
-        for text in (array.name.encode("latin-1"), array.dtype.encode("latin-1")):
-            head.append(struct.pack("<B", len(text) % 256) + text)
-        lengths = [length % 2**64 for length in array.shape]
-        head.append(struct.pack(f"<B{len(lengths)}Q", len(lengths) % 256, *lengths))
-        stored = len(array.buffer) if array.stored is None else array.stored
-        head.append(LENGTHS.pack(array.codec % 256, array.size % 2**64, stored % 2**64))
-        buffers.append(array.buffer)
-    return b"".join(head + buffers)
+def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
+    """A payload as FORMAT.md says it is, of arrays of which anything may be said; text: in place of what is said."""
+    said = (as_text({one.name: one.said for one in arrays}) if text is None else text).encode("utf-8", "surrogatepass")
+    return b"".join([LENGTH.pack(len(said)), said, *(array.buffer for array in arrays)])
 
 
-def unpack(payload: bytes) -> tuple[int, list[Packed]]:
-    """The version of a sound payload, and its arrays."""
-    _, version, count = PAYLOAD.unpack_from(payload)
-    start, arrays = PAYLOAD.size, []
-    for _ in range(count):
-        texts = []
-        for _ in ("name", "dtype"):
-            texts.append(payload[start + 1 : start + 1 + payload[start]].decode("ascii"))
-            start += 1 + payload[start]
-        axes = payload[start]
-        shape = struct.unpack_from(f"<{axes}Q", payload, start + 1)
-        codec, size, stored = LENGTHS.unpack_from(payload, start + 1 + 8 * axes)
-        start += 1 + 8 * axes + LENGTHS.size
-        arrays.append(Packed(*texts, shape, codec, size, b"", stored))
-    for i, array in enumerate(arrays):
-        length = array.stored or 0
-        arrays[i] = replace(array, buffer=payload[start : start + length], stored=None)
-        start += length
-    return version, arrays
+def unpack(payload: bytes) -> list[Packed]:
+    """The arrays of a sound payload."""
+    start, arrays = LENGTH.size + LENGTH.unpack_from(payload)[0], []
+    for name, (dtype, shape, stored) in json.loads(payload[LENGTH.size : start]).items():
+        arrays.append(Packed(name, dtype, shape, payload[start : start + stored]))
+        start += stored
+    return arrays
 
 
 def raw(name: str, array: np.ndarray) -> Packed:
-    """An array as it is, in no codec."""
-    return Packed(name, array.dtype.str, array.shape, 0, array.nbytes, array.tobytes())
+    """An array as it is, not compressed."""
+    return Packed(name, array.dtype.str, list(array.shape), array.tobytes())
 
 
 def named_in(path: Path) -> list[dict[str, Any]]:
@@ -263,45 +244,33 @@ def describe_again(path: Path, text: str | None = None, **changes: Any) -> None:
 
 def refiled(path: Path, number: int) -> dict[str, Any]:
     """What a checkpoint says of itself, with the digests of its files as they are now."""
-    known = described(path, number)
-    for name, about in known["arrays"].items():
-        top = group_of(path, number) / name / "c"
-        files = [top] if top.is_file() else [file for file in top.rglob("*") if file.is_file()]
-        files.sort(key=lambda file: [int(part) for part in file.relative_to(top).parts])
-        about["files"] = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-    return known
+    group = group_of(path, number)
+    files = [file for file in sorted(group.glob("*/**/*")) if file.is_file()]
+    digests = {str(file.relative_to(group)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return described(path, number) | {"files": digests}
 
 
-def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray], gone: Iterable[str] = ()) -> dict[str, Any]:
     """Write arrays into a checkpoint's group, in place of those of their names; what it then has to say of itself.
 
-    They are written without any codec but that for bytes, in one chunk each, as anyone may.
+    They are written without any codec but that for bytes, in one chunk each, as anyone may. gone: arrays that go.
     """
-    known = described(path, number)
-    for name, given in arrays.items():
-        array = np.asarray(given, order="C")
-        known["arrays"][name] = {
-            "dtype": array.dtype.str,
-            "shape": list(array.shape),
-            "sha256": array_digest(array),
-            "files": put_array(group_of(path, number) / name, array),
-        }
-    return known
+    for name in (*arrays, *gone):
+        shutil.rmtree(group_of(path, number) / name, ignore_errors=True)
+    for name, array in arrays.items():
+        put_array(group_of(path, number) / name, np.asarray(array, order="C"))
+    return refiled(path, number)
 
 
-def put_array(folder: Path, array: np.ndarray) -> list[str]:
-    """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
-    content = ArrayContent(array.dtype, array.shape, "")
-    plain = content.to_plain(array)
-    chunk = folder.joinpath("c", *["0"] * plain.ndim)
-    shutil.rmtree(folder / "c", ignore_errors=True)  # of other axes
-    chunk.parent.mkdir(parents=True, exist_ok=True)
-    (folder / "zarr.json").write_text(json.dumps(array_about(array, content, None)), encoding="utf-8")
-    data = np.ascontiguousarray(plain).tobytes()
-    if not plain.size:
-        return []
-    chunk.write_bytes(data)
-    return [hashlib.sha256(data).hexdigest()]
+def put_array(folder: Path, array: np.ndarray) -> None:
+    """Write one array as a zarr array of one chunk."""
+    chunk = folder.joinpath("c", *["0"] * array.ndim)
+    chunk.parent.mkdir(parents=True)
+    about = array_about(array, None)
+    about["chunk_grid"]["configuration"]["chunk_shape"] = [max(1, length) for length in array.shape]
+    (folder / "zarr.json").write_text(json.dumps(about), encoding="utf-8")
+    if array.size:
+        chunk.write_bytes(array.tobytes())
 
 
 def frames_of(path: Path) -> dict[int, Frame]:

@@ -38,8 +38,6 @@ DIGEST_BYTES = 16
 HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 USUAL_HEAD = 512  # bytes that are read at once of a row's head
 
-MOST_PLACES = 4096
-
 
 class JournalRow(NamedTuple):
     """A record's head, and the payload of its arrays; None where compaction gave that up."""
@@ -135,14 +133,13 @@ def read_head(log: Log, offset: int, size: int) -> Head:
 class Rows:
     """Which rows a log holds, in order: of each its sequence, offset, size and the first bytes of its key.
 
-    first: the row before those that follow a place of the log. whole: whether those before the place are known, too.
-    places: rows, and where in the log all behind them follow.
+    first: the row before those that follow a place of the log, `begin`. whole: whether those before it are known, too.
     """
 
     def __init__(self, place: LogPlace, first: int = 0) -> None:
         self.sequences, self.offsets, self.sizes, self.keys = array("Q"), array("Q"), array("Q"), array("Q")
         self.columns = (self.sequences, self.offsets, self.sizes, self.keys)
-        self.first, self.whole, self.places = first, first == 0, [(first, place)]
+        self.first, self.begin, self.whole = first, place, first == 0
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -159,19 +156,12 @@ class Rows:
         self.sizes.append(size)
         self.keys.append(key_prefix(key))
 
-    def note_place(self, place: LogPlace) -> None:
-        """Note the place behind all rows that are known."""
-        self.places.append((self.last, place))
-        if len(self.places) > MOST_PLACES:
-            del self.places[1:-1:2]
-
     def catch_up(self, log: Log) -> None:
         """Take in what was committed since. Raises DamageError, which names the repair."""
         for frames in log.scan(refuse):
             for frame in frames:
                 if frame.kind == ROW:
                     self._take(log, frame)
-            self.note_place(log.place)
 
     def _take(self, log: Log, frame: Frame) -> None:
         data = log.read(frame.offset, frame.size, first=HEAD_BYTES + 8)
@@ -189,7 +179,6 @@ class Rows:
         count = bisect_left(self.offsets, place.offset)
         for column in self.columns:
             del column[count:]
-        self.note_place(place)
 
     def prepend(self, earlier: Rows) -> None:
         """Add the rows before the first place."""
@@ -206,10 +195,16 @@ class Rows:
         found = np.flatnonzero(np.frombuffer(self.keys, np.uint64) == key_prefix(key)).tolist()
         return [self.sequences[index] for index in found]
 
-    def place(self, last_sequence: int) -> LogPlace:
-        """Return a place in the log that all rows behind `last_sequence` are behind."""
-        found = bisect_right(self.places, last_sequence, key=lambda noted: noted[0])
-        return self.places[max(found - 1, 0)][1]
+    def place(self, log: Log, last_sequence: int) -> LogPlace:
+        """Return a place in the log that all rows behind `last_sequence` are behind: that of a batch."""
+        index = self.find(last_sequence)
+        if index == len(self):
+            return log.place
+        for offset in reversed(self.offsets[: index + 1]):
+            frame = log.frame_at(offset)
+            if frame is not None and frame.number == frame.batch:
+                return LogPlace(frame.offset, frame.number, frame.batch, frame.previous)
+        return log.first
 
     def table(self, last_sequence: int) -> np.ndarray:
         """Return those up to a sequence as an array: the columns, shape (4, rows)."""

@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time as clock
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,8 +20,6 @@ from scroll_tactile_store.archive import unpacked
 from scroll_tactile_store.backup import back_up
 from scroll_tactile_store.checkpoint_files import (
     INDEX,
-    QUICK,
-    THOROUGH,
     CheckpointDraft,
     CheckpointReader,
     index_name,
@@ -377,7 +375,6 @@ class Store:
 
     def _make_durable(self) -> None:
         self._log.commit()
-        self._rows.note_place(self._log.place)
         if not self._current.last and self._rows.last:
             self._note_last()  # without any row the log would look like a new one
 
@@ -475,7 +472,7 @@ class Store:
     def _find(self, after: int) -> int:
         """Return the index of the first row behind `after`, once all rows from there on are known."""
         if after < self._rows.first and not self._rows.whole:
-            self._rows.prepend(self._rows_before(self._rows.places[0][1]))
+            self._rows.prepend(self._rows_before(self._rows.begin))
         return self._rows.find(after)
 
     def _rows_before(self, place: LogPlace) -> Rows:
@@ -546,12 +543,9 @@ class Store:
 
     # Checkpoints.
 
-    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
+    def latest(self) -> Checkpoint | None:
         """Return the newest checkpoint that verifies, None when there is none.
 
-        only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
-        over. With none it is the checkpoint's attributes, in well below a millisecond. late: names of arrays of which
-        the files are verified and stay open; they are decompressed when they are needed, whatever happens to the store.
         A logged warning names the file and the array of each checkpoint that it passes over. Raises VersionError for a
         checkpoint of another format.
         """
@@ -559,7 +553,7 @@ class Store:
         passed = set[int]()
         while left := [named for named in self._settled().checkpoints if named.number not in passed]:
             try:
-                return self._load(left[0], only, late)
+                return self._load(left[0])
             except DamageError as damage:
                 if self._is_named(left[0]):
                     passed.add(left[0].number)
@@ -587,14 +581,7 @@ class Store:
         self.state()
         return named in self._settled().checkpoints
 
-    def _load(
-        self, named: NamedCheckpoint, only: Collection[str] | None = None, late: Collection[str] = ()
-    ) -> Checkpoint:
-        reader = self._verified(named)
-        arrays = reader.arrays(only, but=late)
-        return Checkpoint(named.number, named.last_sequence, reader.attributes, arrays, reader.late(late))
-
-    def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
+    def _load(self, named: NamedCheckpoint) -> Checkpoint:
         path = checkpoint_path(self._folder, named.number)
         reader = CheckpointReader(path)
         known = (reader.number, reader.last_sequence, reader.sha256, dict(reader.identity))
@@ -602,7 +589,7 @@ class Store:
             raise DamageError(
                 f"{path} is another checkpoint, or another store's, than the one that is named", path=path
             )
-        return reader
+        return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
     def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> int:
         """Write a checkpoint that contains the records up to `last_sequence`, make it current, return its number.
@@ -623,20 +610,18 @@ class Store:
         the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`. What cannot be kept is
         refused at once, with RecordError. While the interpreter ends nothing is written: the log holds the rows.
         """
-        draft = self._draft(arrays, last_sequence, attributes, QUICK)
+        draft = self._draft(arrays, last_sequence, attributes)
         self._raise_failure()
         with self._queue:
             self._waiting = draft
         with suppress(RuntimeError):  # it starts no job any more
             self._submitted = self._worker.submit(self._commit_newest)
 
-    def _draft(
-        self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int = THOROUGH
-    ) -> CheckpointDraft:
+    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
         self._check_open(write=True)
         self._refuse_in_batch("committing a checkpoint")  # its rows may yet be rolled back
         first, last = self._settled().compacted, self._rows.last
-        if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
+        if type(last_sequence) is not int or not first <= last_sequence <= last:
             # Recovery could not resume among the compacted rows, which have given up their arrays.
             raise RecordError(
                 f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
@@ -644,13 +629,13 @@ class Store:
             )
         if reserved := [name for name in arrays if name.startswith(INDEX)]:
             raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
-        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
+        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes))
 
     def _commit(self, draft: CheckpointDraft) -> int:
         with self._committing:
             with self._using("looking where rows are"):
-                current, place = self._current, self._rows.place(draft.last_sequence)
                 self._find(0)
+                current, place = self._current, self._rows.place(self._log, draft.last_sequence)
                 table = self._rows.table(draft.last_sequence)
             named = self._write(draft, place, current.log_identity, table)
             if current.newest is None or named.last_sequence >= current.newest.last_sequence:
@@ -783,12 +768,13 @@ class Store:
             identity = create_log(path, header, ((ROW, data) for data in self._payloads(last_sequence)))
             with Log(path) as log:
                 rows = read_back(log)
+                places = [rows.place(log, each.last_sequence) for each in drafts]
             named = [
-                self._write(each, rows.place(each.last_sequence), identity, rows.table(each.last_sequence))
-                for each in drafts
+                self._write(each, place, identity, rows.table(each.last_sequence))
+                for each, place in zip(drafts, places, strict=True)
             ]
-            for damage in (damage for one in named for damage in self._verified(one).damage()):
-                raise damage
+            for one in named:
+                self._load(one)
         except BaseException:
             remove_tree(path)
             raise

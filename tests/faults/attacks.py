@@ -37,7 +37,7 @@ from forging import (
 from scroll_tactile_store.encoding import decode_payload, encode_payload
 from scroll_tactile_store.framing import FRAME_BYTES, read_frame
 
-from faults.mutants import DTYPES, NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
+from faults.mutants import NUMBERS, TEXTS, mutated_arrays, mutated_bytes, mutated_json, mutated_payload
 from scroll_tactile.memory.touch_rows import pack_codes, unpack_readings
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
@@ -217,9 +217,7 @@ def forged_checkpoint(rng: random.Random, path: Path, scene: Scene) -> str:
         arrays = _group_arrays(path, number)
         told, changed = mutated_arrays(rng, arrays)
         new = {name: array for name, array in changed.items() if array is not arrays.get(name) and _is_name(name)}
-        known = put_arrays(path, number, new)
-        for name in set(arrays) - set(changed):
-            del known["arrays"][name]
+        known = put_arrays(path, number, new, gone=set(arrays) - set(changed))
         seal(path, number, known)
     else:
         header = rng.choice(sorted(group_of(path, number).rglob("zarr.json")))
@@ -299,9 +297,8 @@ def _is_name(name: str) -> bool:
 def _group_arrays(path: Path, number: int) -> dict[str, np.ndarray]:
     import zarr
 
-    about = described(path, number)["arrays"]
     group = zarr.open_group(group_of(path, number), mode="r")
-    return {name: np.asarray(group[name][...]) for name in about if about[name]["dtype"] in DTYPES[:12]}
+    return {name: np.asarray(array[...]) for name, array in group.arrays()}
 
 
 def spoiled_bytes(rng: random.Random, path: Path, scene: Scene) -> str:

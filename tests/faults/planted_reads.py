@@ -11,7 +11,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile_store import backup, checkpoint_files, chunks, layout, log, repair, rows
+from scroll_tactile_store import backup, checkpoint_files, layout, log, repair, rows
+from scroll_tactile_store.records import Checkpoint
 from scroll_tactile_store.store import Store
 
 from faults.planting import BUGS, Replacement, bug, nothing
@@ -37,9 +38,10 @@ def _current_resealed(read: Any, cls: Any, data: bytes, path: Path) -> Any:
 
 
 # What a checkpoint says of itself is compared with what CURRENT says of it. That alone lets one bit in 3900 pass.
-@bug("CURRENT is not verified", Store, "_verified")
+@bug("CURRENT is not verified", Store, "_load")
 def _checkpoint_as_it_is(_: Any, self: Any, named: Any) -> Any:
-    return checkpoint_files.CheckpointReader(layout.checkpoint_path(self._folder, named.number))
+    reader = checkpoint_files.CheckpointReader(layout.checkpoint_path(self._folder, named.number))
+    return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
 
 class Same(str):
@@ -59,7 +61,9 @@ def _sum_of_anything(data: bytes) -> Any:
     return SimpleNamespace(hexdigest=lambda: Same(hashlib.sha256(data).hexdigest()))
 
 
-BUGS["a chunk is not verified"] = [Replacement(chunks, "hashlib", lambda _: SimpleNamespace(sha256=_sum_of_anything))]
+BUGS["a chunk is not verified"] = [
+    Replacement(checkpoint_files, "hashlib", lambda _: SimpleNamespace(sha256=_sum_of_anything))
+]
 
 
 @bug("what a checkpoint says of itself is not verified", checkpoint_files, "json_digest")
@@ -79,10 +83,10 @@ def _other_log_not_noticed(_: Any, self: Any) -> None:
 
 
 @bug("an index of another log is believed", checkpoint_files.CheckpointReader, "arrays")
-def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None, but: Any = ()) -> Any:
-    found = arrays(self, names, but)
+def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None) -> Any:
+    found = arrays(self, names)
     if not found and names and next(iter(names)).startswith(checkpoint_files.INDEX):
-        own = [name for name in self._described if name.startswith(checkpoint_files.INDEX)]
+        own = [name for name in self._files if name.startswith(checkpoint_files.INDEX)]
         found = dict.fromkeys(names, *arrays(self, own).values()) if own else {}
     return found
 
@@ -106,9 +110,12 @@ def _undone_in_the_log_alone(_: Any, self: Any, place: Any) -> None:
 
 
 @bug("a place is one batch too late", rows.Rows, "place")
-def _place_too_late(_: Any, self: Any, last_sequence: int) -> Any:
-    found = [place for row, place in self.places if row > last_sequence]
-    return found[0] if found else self.places[-1][1]
+def _place_too_late(place: Any, self: Any, log: Any, last_sequence: int) -> Any:
+    found = place(self, log, last_sequence)
+    later = next((sequence for sequence in self.sequences if sequence > last_sequence), last_sequence)
+    while later <= self.last and place(self, log, later) == found and found != log.place:
+        later += 1
+    return place(self, log, later)
 
 
 @bug("a checkpoint says one row too many", Store, "_commit")

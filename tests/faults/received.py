@@ -31,7 +31,7 @@ from scroll_tactile.errors import ScrollTactileError
 from scroll_tactile.validation.gate import check_memory
 
 OURS = (ScrollTactileError, StoreError)
-GOLDEN = Path(__file__).parents[1] / "data" / "format-2.zip"
+GOLDEN = Path(__file__).parents[1] / "data" / "format-3.zip"
 TOUCHES: tuple[Operation, ...] = tuple(("observe", name, (i, 30)) for i in range(2) for name in "ab")
 HISTORIES: dict[str, tuple[Operation, ...]] = {
     "rows": TOUCHES,
@@ -62,7 +62,7 @@ def glance(learner: TactileLearner) -> dict[str, Any]:
 
 
 def corpus(home: Path) -> list[Memory]:
-    """All memories, made in a folder, and the golden one of format 2."""
+    """All memories, made in a folder, and the golden one of format 3."""
     made = []
     for name, history in HISTORIES.items():
         learner = opened(home / name)

@@ -17,30 +17,6 @@ from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
 from scroll_tactile_store.log import Log, refuse
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
 
-__all__ = [
-    "CHECKPOINTS",
-    "CURRENT_FILE",
-    "DAMAGED",
-    "HOLDER_FILE",
-    "LOCK_FILE",
-    "LOG",
-    "PARTIAL",
-    "Current",
-    "NamedCheckpoint",
-    "checkpoint_path",
-    "holds_store",
-    "is_number",
-    "log_numbers",
-    "log_path",
-    "numbers",
-    "other_format",
-    "read_current",
-    "remove_unnamed",
-    "require_safe",
-    "unsafe_entries",
-    "write_current",
-]
-
 FORMAT_VERSION = 3
 OLDER = {
     1: ("0.15 or before", "0.15"),

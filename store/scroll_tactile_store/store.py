@@ -73,8 +73,6 @@ from scroll_tactile_store.records import (
 from scroll_tactile_store.rows import ROW, Rows, decode_row, encode_row, head_without_arrays, read_back, read_head
 from scroll_tactile_store.survey import Progress
 
-__all__ = ["Store", "StoreState"]
-
 logger = logging.getLogger(__name__)
 
 LAST_SEQUENCE = 2**62  # far beyond what anybody appends
@@ -215,22 +213,12 @@ class Store:
             log.place = named.place
             rows = Rows(named.place, named.last_sequence)
         rows.whole |= log.place == log.first
-        self._catch_up(current, log, rows)
+        rows.catch_up(log, current.last)
         if self.mode == "write":
             log.prepare()
             # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
             sync_folder(self._folder)
         return rows
-
-    @staticmethod
-    def _catch_up(current: Current, log: Log, rows: Rows) -> None:
-        """Take in what was committed since."""
-        rows.catch_up(log)
-        if rows.last < current.last:
-            what = (
-                f"{log.path} ends with row {rows.last}, and had row {current.last}: its end is damaged or was cut off"
-            )
-            raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
 
     @contextmanager
     def _using(self, doing: str) -> Iterator[None]:
@@ -266,7 +254,7 @@ class Store:
         current = read_current(self._folder / CURRENT_FILE)
         if (current.log, current.log_identity) == (self._current.log, self._current.log_identity):
             if self._log.has_place(self._log.place):
-                self._catch_up(current, self._log, self._rows)
+                self._rows.catch_up(self._log, current.last)
                 self._current = current
                 return
             logger.info("%s: its writer took a batch back", self._log.path)
@@ -422,12 +410,9 @@ class Store:
         self._check_open()
         with self._using("reading a row"):
             last = self._rows.last
-            if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= last:
+            if type(sequence) is not int or not 1 <= sequence <= last:
                 raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
-            index = self._index(sequence - 1, sequence)
-            if index == len(self._rows) or self._rows.sequences[index] != sequence:
-                raise self._given_up(sequence)  # a repair left it out
-            return cast(Record, self._row(index, arrays=True))
+            return cast(Record, self._row(sequence, arrays=True))
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -450,7 +435,7 @@ class Store:
             sequences = self._rows.with_key(key)
         for sequence in sequences:
             with self._using("reading a row"):
-                head = self._row(self._index(sequence - 1, sequence), arrays=False)
+                head = self._row(sequence, arrays=False)
             if head.key == key:
                 yield head
 
@@ -461,10 +446,9 @@ class Store:
         def rows(after: int) -> Iterator[Head]:
             while after < last:
                 with self._using(f"reading rows behind {after}"):
-                    if (index := self._index(after, last)) == len(self._rows):
+                    if (after := self._next_row(after, last)) > last:
                         return  # those that are left gave up their arrays, and a repair left them out
-                    head = self._row(index, arrays=arrays)
-                after = head.sequence
+                    head = self._row(after, arrays=arrays)
                 yield head
 
         return rows(after)
@@ -495,8 +479,8 @@ class Store:
         rows.cut(place)
         return rows
 
-    def _index(self, after: int, last: int) -> int:
-        """Return the index of the first row behind `after`. Raises DamageError where one up to `last` is missing."""
+    def _next_row(self, after: int, last: int) -> int:
+        """Return the first row behind `after`, or one behind `last`. Raises DamageError where one is missing."""
         index = self._find(after)
         found = self._rows.sequences[index] if index < len(self._rows) else last + 1
         # Of compacted ones a repair may have left some out.
@@ -504,12 +488,14 @@ class Store:
         if first <= through:
             missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
             raise self._damage(f"{missing} from", through)
-        return index
+        return found
 
-    def _row(self, index: int, *, arrays: bool) -> Head:
+    def _row(self, sequence: int, *, arrays: bool) -> Head:
         """Return a row, verified; arrays: as a record. Raises DamageError, and CompactedError for compacted arrays."""
-        rows = self._rows
-        sequence, offset, size = rows.sequences[index], rows.offsets[index], rows.sizes[index]
+        if self._next_row(sequence - 1, sequence) != sequence:
+            raise self._given_up(sequence)  # a repair left it out
+        index = self._rows.find(sequence - 1)
+        offset, size = self._rows.offsets[index], self._rows.sizes[index]
         try:
             if not arrays:
                 head, payload = read_head(self._log, offset, size), None
@@ -786,7 +772,7 @@ class Store:
         rows = self._rows
         for index, sequence in enumerate(rows.sequences):
             if sequence <= last_sequence:
-                yield head_without_arrays(self._row(index, arrays=False))
+                yield head_without_arrays(self._row(sequence, arrays=False))
                 continue
             try:
                 yield self._log.read(rows.offsets[index], rows.sizes[index])

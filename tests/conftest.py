@@ -63,7 +63,7 @@ def shared_tables() -> Iterator[None]:
         yield
 
 
-BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_hostile_checkpoints")
+BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_checkpoint_bounds")
 """What is about the writing and the reading themselves."""
 
 

@@ -1,31 +1,18 @@
 """What somebody can do to a memory's folder, with right checksums: name → a function of the folder.
 
-Nobody may take any of it in. tests/storage does it to stores, tests/validation to memories, and tests/faults has each
-reader look at what was done, in a process that may die of it.
+Nobody may take any of it in. tests/storage does it to stores, tests/validation to memories.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import socket
-import stat
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from forging import (
-    describe_again,
-    get_current,
-    get_identity,
-    group_of,
-    put_row,
-    refiled,
-    set_current,
-    set_identity,
-)
+from forging import get_current, get_identity, log_of, put_row, set_current, set_identity
+from scroll_tactile_store.log import Log, refuse
 from touches import PAD, stream
 
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -48,6 +35,14 @@ def placed(path: Path, **changes: Any) -> dict[str, Any]:
     return {"newest": newest_is(path, place=list(place.values()))}
 
 
+def behind_all(path: Path) -> dict[str, Any]:
+    """The newest checkpoint at the end of the log."""
+    with Log(log_of(path)) as log:
+        for _ in log.scan(refuse):
+            pass
+        return placed(path, offset=log.place.offset, number=log.place.number, previous=log.place.previous.hex())
+
+
 def _current(change: Callable[[Path], Mapping[str, Any]]) -> Attack:
     return lambda path: set_current(path, **change(path))
 
@@ -67,116 +62,15 @@ CURRENTS: dict[str, Attack] = {
         "a number above any": lambda path: {"newest": newest_is(path, number=2**64)},
         "a sha256 in capitals": lambda path: {"newest": newest_is(path, sha256="AB" * 32)},
         "a compaction checkpoint without a newest": lambda path: {"newest": None, "compaction": newest_is(path)},
+        "a compaction checkpoint newer than the newest": lambda path: {
+            "compaction": newest_is(path, last_sequence=get_current(path)["newest"]["last_sequence"] + 1)
+        },
         "a place in no frame": lambda path: placed(path, offset=newest_is(path)["place"][0] + 1),
         "a place beyond the end": lambda path: placed(path, offset=2**40),
         "a place of another number": lambda path: placed(path, number=3),
         "a place of another checksum": lambda path: placed(path, previous="00" * 16),
     }.items()
 }
-
-# A checkpoint: what it says of itself.
-
-FILES: dict[str, Any] = {
-    "a list": ["rows/zarr.json"],
-    "a name that leads out": {"../rows/zarr.json": "0" * 64},
-    "a file of no array": {"rows/x": "0" * 64},
-}
-CLAIMS: dict[str, dict[str, Any]] = {  # of an array, with the right sha256
-    "objects": {"data_type": "variable_length_bytes"},
-    "text": {"data_type": {"name": "fixed_length_utf32", "configuration": {"length_bytes": 400}}},
-    "no dtype": {"data_type": None},
-    "a shape in words": {"shape": "4"},
-    "a length of 4.0": {"shape": [4.0, 4]},
-    "lengths whose product overflows": {"shape": [2**40, 2**40]},
-    "a hundred axes": {"shape": [1] * 100},
-    "an axis less": {"shape": [1000]},
-    "more chunks than files": {"shape": [10**6, 4]},
-    "a pickle": {"codecs": [{"name": "bytes"}, {"name": "numcodecs.pickle"}]},
-    "a codec of another list": {"codecs": [{"name": "bytes"}, {"name": "gzip", "configuration": {"level": 1}}]},
-    "no codecs": {"codecs": []},
-    "not compressed": {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
-    "chunks of nothing": {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [0, 4]}}},
-    "a larger chunk": {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40, 4]}}},
-    "chunks in words": {"chunk_grid": {"name": "x"}},
-}
-OWN: dict[str, Any] = {
-    "a number in words": {"number": "1"},
-    "another number": {"number": 2},
-    "a last row above any": {"last_sequence": 2**63},
-    "another last row": {"last_sequence": 0},
-    "attributes in a list": {"attributes": [1]},
-    "another identity": {"identity": {"of": "another"}},
-    "a format in words": {"format": "x"},
-}
-
-
-def _checkpoint(**changes: Any) -> Attack:
-    return lambda path: describe_again(path, **changes)
-
-
-def _claiming(*sha256: Any, **about: Any) -> Attack:
-    """The array "rows" of the newest checkpoint has another description; sha256: in place of the right one."""
-
-    def attack(path: Path) -> None:
-        number = get_current(path)["newest"]["number"]
-        header = group_of(path, number) / "rows" / "zarr.json"
-        header.write_text(json.dumps(json.loads(header.read_text()) | about))
-        files = refiled(path, number)["files"]
-        describe_again(path, files=files | dict(zip(["rows/zarr.json"], sha256, strict=False)))
-
-    return attack
-
-
-CHECKPOINTS = {f"files: {name}": _checkpoint(files=files) for name, files in FILES.items()}
-ARRAYS = {f"an array: {name}": _claiming(**about) for name, about in CLAIMS.items()}
-ARRAYS |= {f"an array: {sha256} for a sha256": _claiming(sha256) for sha256 in ("0" * 64, None)}
-CHECKPOINTS |= {name: _checkpoint(**changes) for name, changes in OWN.items()}
-
-# Links: which name in the folder leads where, outside of it.
-
-LINKS = {
-    "checkpoints": "",
-    "checkpoints/00000001": "12345",
-    "checkpoints/00000077": "12345",
-    "checkpoints/00000077.partial": "12345",
-    "holder.json": "file",
-    "holder.json.new": "file",
-    "lock": "file",
-    "CURRENT": "file",
-    "CURRENT.new": "file",
-    "log-00000001": "log",
-    "log-00000001.new": "file",
-    "log-00000001.damaged": "file",
-    "log-00000007": "file",
-}
-
-
-def as_link(path: Path, target: Path) -> None:
-    """Put a link in the place of a file or a folder."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    path.unlink(missing_ok=True)
-    path.symlink_to(target)
-
-
-def no_file(path: Path, kind: str) -> None:
-    """Put in a file's place, or where none is, a "fifo", a "socket", a "folder" or a "device", as /dev/zero is."""
-    path.unlink(missing_ok=True)
-    if kind == "fifo":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    elif kind == "device":
-        os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 5))
-    else:
-        here = Path.cwd()
-        os.chdir(path.parent)  # the name of a socket may have no more than 107 bytes
-        try:
-            with socket.socket(socket.AF_UNIX) as made:
-                made.bind(path.name)
-        finally:
-            os.chdir(here)
-
 
 # A row: what is other in it than in a sound one.
 

@@ -1,4 +1,4 @@
-"""Rows, identities and checkpoints with right checksums, such as anyone can make: nothing in a checksum is secret."""
+"""Rows, identities and checkpoints with right checksums, as anyone can make them who reads store/FORMAT.md."""
 
 from __future__ import annotations
 
@@ -6,23 +6,18 @@ import hashlib
 import json
 import shutil
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from quick_checkpoints import array_about
 from scroll_tactile_store import Store
-from scroll_tactile_store.encoding import check_arrays, encode_payload
-from scroll_tactile_store.framing import COMMIT, HEADER, Frame, LogPlace, pack_frame
-from scroll_tactile_store.layout import CURRENT_FILE, checkpoint_path, log_path
-from scroll_tactile_store.log import BEGIN, Log, refuse
-from scroll_tactile_store.records import payload_digest
-from scroll_tactile_store.rows import FIELDS, HEAD_BYTES, ROW, decode_row, row_sequence
+from storage.second_reader import COMMIT, HEAD, MARK, ROW, ROW_KIND, Frame, digest, frame_at, frames
+from storage.second_reader import row as read_row
 
-LENGTH = struct.Struct("<I")
+DIGEST_BYTES = 16
 
 
 def as_text(value: Any) -> str:
@@ -38,39 +33,34 @@ def sealed(known: Mapping[str, Any]) -> dict[str, Any]:
 
 def get_current(path: Path) -> dict[str, Any]:
     """What `CURRENT` says."""
-    return dict(json.loads((path / CURRENT_FILE).read_text(encoding="ascii")))
+    return dict(json.loads((path / "CURRENT").read_text(encoding="ascii")))
 
 
 def set_current(path: Path, **changes: Any) -> None:
     """Have `CURRENT` say other things, with the right sha256."""
-    (path / CURRENT_FILE).write_text(as_text(sealed(get_current(path) | changes)) + "\n", encoding="ascii")
+    (path / "CURRENT").write_text(as_text(sealed(get_current(path) | changes)) + "\n", encoding="ascii")
 
 
 def log_of(path: Path) -> Path:
     """The log that `CURRENT` names."""
-    return log_path(path, get_current(path)["log"][0])
+    return path / f"log-{get_current(path)['log'][0]:08d}"
+
+
+def frames_of(path: Path) -> dict[int, Frame]:
+    """The frames of a log's rows whose first 88 bytes are right, by the rows' sequences."""
+    data, offset, found = log_of(path).read_bytes(), 0, {}
+    while (frame := frame_at(data, offset)) is not None:
+        if frame.kind == ROW_KIND:
+            found[int.from_bytes(data[frame.offset + HEAD.size :][:8], "little")] = frame
+        offset = frame.end
+    return found
 
 
 def read_log(path: Path) -> tuple[bytes, list[bytes]]:
     """The payload of a store's first frame, and the bytes of each of its rows."""
-    with Log(log_of(path)) as log:
-        frames = [frame for batch in log.scan(refuse) for frame in batch if frame.kind == ROW]
-        return log.header, [log.read(frame.offset, frame.size) for frame in frames]
-
-
-def log_bytes(
-    identity: bytes, header: bytes, batches: Iterable[Sequence[tuple[int, bytes]]]
-) -> tuple[bytes, list[LogPlace]]:
-    """The bytes of a log, and the place behind its first frame and behind each batch of kinds and payloads."""
-    data, frame = pack_frame(identity, BEGIN, HEADER, header)
-    parts, places, at = [data], [LogPlace.behind(frame)], LogPlace.behind(frame)
-    for batch in batches:
-        for kind, payload in [*batch, (COMMIT, b"")]:
-            data, frame = pack_frame(identity, at, kind, payload)
-            parts.append(data)
-            at = LogPlace.behind(frame)
-        places.append(at)
-    return b"".join(parts), places
+    data = log_of(path).read_bytes()
+    about, whole, _ = frames(data)
+    return about, [data[frame.offset + HEAD.size : frame.end] for frame in whole if frame.kind == ROW_KIND]
 
 
 def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) -> None:
@@ -79,45 +69,30 @@ def write_log(path: Path, rows: Sequence[bytes], header: bytes | None = None) ->
     `CURRENT` then names the checkpoints' places in it.
     """
     current = get_current(path)
-    header = read_log(path)[0] if header is None else header
-    data, places = log_bytes(bytes.fromhex(current["log"][1]), header, [[(ROW, row)] for row in rows])
-    log_of(path).write_bytes(data)
+    identity, log = bytes.fromhex(current["log"][1]), bytearray()
+    places: list[list[Any]] = []
+    previous, number = bytes(16), 0
+
+    def put(batch: int, kind: int, payload: bytes) -> None:
+        nonlocal previous, number
+        head = struct.pack(
+            "<8s8sQQII16s16s", MARK, identity, number, batch, kind, len(payload), previous, digest(payload)
+        )
+        previous, number = digest(head), number + 1
+        log.extend(head + previous + payload)
+
+    put(0, 0, read_log(path)[0] if header is None else header)
+    for row in rows:
+        places.append([len(log), number, previous.hex()])
+        put(number, ROW_KIND, row)
+        put(number - 1, COMMIT, b"")
+    places.append([len(log), number, previous.hex()])
+    log_of(path).write_bytes(log)
     sequences = [int.from_bytes(row[:8], "little") for row in rows]
     for named in filter(None, (current["newest"], current["compaction"])):
         behind = [i for i, sequence in enumerate(sequences) if sequence > named["last_sequence"]]
-        named["place"] = as_place(places[min(behind, default=len(rows))])
+        named["place"] = places[min(behind, default=len(rows))]
     set_current(path, **current)
-
-
-def as_place(place: LogPlace) -> list[Any]:
-    """A place as `CURRENT` has it."""
-    return [place.offset, place.number, place.previous.hex()]
-
-
-def as_row(
-    sequence: int,
-    kind: str,
-    label: str,
-    key: bytes,
-    time: float,
-    attributes: str,
-    payload: bytes | None,
-    size: int,
-    kept: int | None = None,
-) -> bytes:
-    """The bytes of a row of which anything may be said."""
-    texts = (key[:255], *(text.encode("utf-8", "surrogatepass") for text in (kind, label, attributes)))
-    kept = payload is not None if kept is None else kept
-    fields = FIELDS.pack(sequence % 2**64, time, size % 2**64, kept, *map(len, texts))
-    return b"".join((fields, payload_digest(b"".join((fields, *texts))), *texts, payload or b""))
-
-
-def observation(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The attributes and the payload of the first observation of a memory whose arrays are there."""
-    for row in map(decode_row, read_log(path)[1]):
-        if row.head.kind == "observe" and row.payload is not None:
-            return dict(row.head.attributes), row.payload
-    raise ValueError(f"{path} has no observation with its arrays")
 
 
 def put_row(
@@ -131,21 +106,29 @@ def put_row(
     time: float = 0.0,
     sequence: int | None = None,
     size: int | None = None,
-    kept: int | None = None,
 ) -> int:
     """Put a row into a log, in place of any that has its sequence, and return that: by default the next one.
 
-    payload: bytes, or arrays by name. size, kept: where they are to be others than the right ones.
+    payload: bytes, or arrays by name. size: where the row is to say another than the right one.
     """
-    body = payload if isinstance(payload, bytes) else encode_payload(check_arrays(payload or {}))
-    rows = {row_sequence(row): row for row in read_log(path)[1]}
+    body = payload if isinstance(payload, bytes) else pack([raw(*one) for one in (payload or {}).items()])
+    rows = {int.from_bytes(row[:8], "little"): row for row in read_log(path)[1]}
     if sequence is None:
         sequence = 1 + max([*rows, *(named["last_sequence"] for named in named_in(path))], default=0)
-    text = as_text({} if attributes is None else attributes)
-    size = len(body) if size is None else size
-    rows[sequence % 2**64] = as_row(sequence, kind, label, key, time, text, body, size, kept)
+    told = as_text({} if attributes is None else attributes)
+    texts = (key[:255], *(text.encode("utf-8", "surrogatepass") for text in (kind, label, told)))
+    fields = ROW.pack(sequence % 2**64, time, (len(body) if size is None else size) % 2**64, 1, *map(len, texts))
+    rows[sequence % 2**64] = b"".join((fields, digest(b"".join((fields, *texts))), *texts, body))
     write_log(path, [rows[number] for number in sorted(rows)])
     return sequence
+
+
+def observation(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The attributes and the payload of the first observation of a memory whose arrays are there."""
+    for row in map(read_row, read_log(path)[1]):
+        if row.kind == "observe" and row.arrays is not None:
+            return row.attributes, row.arrays
+    raise ValueError(f"{path} has no observation with its arrays")
 
 
 def get_identity(path: Path) -> dict[str, Any]:
@@ -162,40 +145,20 @@ def set_identity(path: Path, identity: Any) -> None:
             seal(path, named["number"], described(path, named["number"]) | {"identity": known})
 
 
-@dataclass(frozen=True)
-class Packed:
-    """An array in a payload: what is said of it, and its buffer; stored: the length that the buffer is said to have."""
-
-    name: str
-    dtype: Any
-    shape: Any
-    buffer: bytes
-    stored: Any = None
-
-    @property
-    def said(self) -> list[Any]:
-        """What the payload says of it."""
-        return [self.dtype, self.shape, len(self.buffer) if self.stored is None else self.stored]
-
-
-def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
-    """A payload as FORMAT.md says it is, of arrays of which anything may be said; text: in place of what is said."""
-    said = (as_text({one.name: one.said for one in arrays}) if text is None else text).encode("utf-8", "surrogatepass")
-    return b"".join([LENGTH.pack(len(said)), said, *(array.buffer for array in arrays)])
-
-
-def unpack(payload: bytes) -> list[Packed]:
-    """The arrays of a sound payload."""
-    start, arrays = LENGTH.size + LENGTH.unpack_from(payload)[0], []
-    for name, (dtype, shape, stored) in json.loads(payload[LENGTH.size : start]).items():
-        arrays.append(Packed(name, dtype, shape, payload[start : start + stored]))
-        start += stored
-    return arrays
+Packed = tuple[str, str, Sequence[int], bytes, int]
+"""An array in a payload: its name, dtype, shape, its buffer, and how many bytes that is said to have."""
 
 
 def raw(name: str, array: np.ndarray) -> Packed:
     """An array as it is, not compressed."""
-    return Packed(name, array.dtype.str, list(array.shape), array.tobytes())
+    return name, array.dtype.str, array.shape, np.asarray(array, order="C").tobytes(), array.nbytes
+
+
+def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
+    """A payload of arrays of which anything may be said; text: in place of what is said of them."""
+    told = {name: [dtype, list(shape), stored] for name, dtype, shape, _, stored in arrays}
+    said = as_text(told if text is None else text).encode("utf-8", "surrogatepass")
+    return b"".join([struct.pack("<I", len(said)), said, *(buffer for _, _, _, buffer, _ in arrays)])
 
 
 def named_in(path: Path) -> list[dict[str, Any]]:
@@ -207,7 +170,7 @@ def named_in(path: Path) -> list[dict[str, Any]]:
 
 def group_of(path: Path, number: int) -> Path:
     """The folder of a checkpoint."""
-    return checkpoint_path(path, number)
+    return path / "checkpoints" / f"{number:08d}"
 
 
 def described(path: Path, number: int) -> dict[str, Any]:
@@ -264,6 +227,8 @@ def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray], gone: 
 
 def put_array(folder: Path, array: np.ndarray) -> None:
     """Write one array as a zarr array of one chunk."""
+    from quick_checkpoints import array_about
+
     chunk = folder.joinpath("c", *["0"] * array.ndim)
     chunk.parent.mkdir(parents=True)
     about = array_about(array, None)
@@ -273,13 +238,70 @@ def put_array(folder: Path, array: np.ndarray) -> None:
         chunk.write_bytes(array.tobytes())
 
 
-def frames_of(path: Path) -> dict[int, Frame]:
-    """The frames of the rows that verify, by sequence."""
-    with Log(log_of(path)) as log:
-        found: list[Frame] = []
-        for batch in log.scan(lambda _, frames, found=found: found.extend(frames)):
-            found.extend(batch)
-        return {row_sequence(log.read(frame.offset, frame.size)): frame for frame in found if frame.kind == ROW}
+def lengthen_frame(path: Path) -> None:
+    """Have the last row's frame say that it has 4 GiB."""
+    log, last = log_of(path), max(frame.offset for frame in frames_of(path).values())
+    data = bytearray(log.read_bytes())
+    data[last + 36 : last + 40] = b"\xff" * 4
+    data[last + 72 : last + 88] = digest(data[last : last + 72])
+    log.write_bytes(data)
+
+
+def put_touch(path: Path, **changes: Any) -> None:
+    """A sound observation once more, with changes."""
+    attributes, payload = observation(path)
+    put_row(path, **{"attributes": attributes, "payload": payload, "label": "a"} | changes)
+
+
+def say_in_current(path: Path, **changes: Any) -> None:
+    """`CURRENT` says other things, or, by `newest`, of the newest checkpoint."""
+    before = get_current(path)
+    changes |= {"newest": before["newest"] | changes["newest"]} if "newest" in changes else {}
+    changes |= {"log": [changes["log"], before["log"][1]]} if "log" in changes else {}
+    set_current(path, **changes)
+
+
+def set_configuration(path: Path, **configuration: Any) -> None:
+    """Give a memory another configuration of its embedding."""
+    known = get_identity(path)
+    known["embedding"]["configuration"] = configuration
+    set_identity(path, known)
+
+
+def largest_array(path: Path) -> tuple[int, str]:
+    """The newest checkpoint's number, and the name of its largest array."""
+    number = get_current(path)["newest"]["number"]
+    headers = [file for file in group_of(path, number).glob("*/zarr.json") if not file.parent.name.startswith("log-")]
+    sizes = {file.parent.name: int(np.prod(json.loads(file.read_text())["shape"])) for file in headers}
+    return number, max(sizes, key=lambda name: sizes[name])
+
+
+def change_array(path: Path, codec: str = "", data: bytes = b"", longer: int = 1, named: str = "") -> None:
+    """The newest checkpoint's largest array with another codec, bytes, last axis or name, and right checksums."""
+    number, name = largest_array(path)
+    folder = group_of(path, number) / name
+    told = json.loads((folder / "zarr.json").read_text())
+    if codec:
+        told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {"level": 1, "checksum": False}}]
+    for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"]):
+        shape[-1] *= longer
+    (folder / "zarr.json").write_text(json.dumps(told))
+    if data:
+        next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)
+    known = refiled(path, number)
+    if named:
+        known["files"] = {f"{named}/{file.partition('/')[2]}": one for file, one in known["files"].items()}
+    seal(path, number, known)
+
+
+def zipped(path: Path, change: Callable[[zipfile.ZipFile], object] = lambda made: None) -> Path:
+    """A folder as a packed memory beside it; change: of the zip, before it gets its list of files."""
+    files = [path / "CURRENT", *path.glob("log-*"), *sorted(path.glob("checkpoints/*/**/*"))]
+    with zipfile.ZipFile(path.with_suffix(".zip"), "w") as made:
+        for file in filter(Path.is_file, files):
+            made.writestr(str(file.relative_to(path)), file.read_bytes())
+        change(made)
+    return path.with_suffix(".zip")
 
 
 def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
@@ -287,7 +309,7 @@ def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
     found = frames_of(path)
     with log_of(path).open("r+b") as file:
         for frame in (found[number] for number in found if sequence in (0, number)):
-            at = frame.payload_offset + HEAD_BYTES if head else frame.end - 1
+            at = frame.offset + HEAD.size + ROW.size + DIGEST_BYTES if head else frame.end - 1
             file.seek(at)
             byte = file.read(1)[0] ^ 1
             file.seek(at)

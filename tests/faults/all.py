@@ -37,13 +37,11 @@ STUDIES = {
     "processes": ["locks", "readers"],
     "latency": ["tiny, 64 features, exemplars=0", "bulk: tiny, 64 features, exemplars=0"],
     "space": ["rows", "large"],
-    "hostile": ["cases", "attacks by name", "outcomes"],
-    "hostile --recordings": ["cases", "attacks by name", "outcomes"],
     "threads": ["rounds", "calls", "answers looked up"],
     "simulate": ["seeds", "events", "plants"],
 }
 # What is taken from a memory, or from its disk, must be missed: this many failures are found at least.
-HARSH = {"power_cut --without log": 3, "hostile --without gate --cases 15 --seconds 5": 3}
+HARSH = {"power_cut --without log": 3}
 LONGEST = 600  # seconds that a study may take in a quick run; the slowest takes one minute
 
 

@@ -10,12 +10,11 @@ from typing import Any
 
 import scroll_tactile_store.backup
 
-from faults.cases import Wrong
 from faults.learners import KIT, perform
 from faults.model import after
 from faults.plans import draw, touch
 from faults.simulation_disk import abandon
-from faults.simulation_world import Machine, World
+from faults.simulation_world import Machine, World, Wrong
 
 SMALL = ("observe",) * 4 + ("retract", "describe", "forget")
 

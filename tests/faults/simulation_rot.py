@@ -11,12 +11,11 @@ from typing import Any
 from scroll_tactile_store import StoreError, repair_store
 from scroll_tactile_store.layout import read_current
 
-from faults.cases import Wrong
 from faults.learners import KIT, perform
 from faults.model import State, after
 from faults.simulation_disk import abandon, flip, in_a_number, near_the_end
 from faults.simulation_events import OneMemory
-from faults.simulation_world import Machine
+from faults.simulation_world import Machine, Wrong
 
 KEPT = ("kept", "pool", "exemplars")
 

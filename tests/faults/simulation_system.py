@@ -11,12 +11,11 @@ from typing import Any
 
 from scroll_tactile_store import StoreError
 
-from faults.cases import Wrong
 from faults.learners import perform
 from faults.model import State, after
 from faults.simulation_disk import flip
 from faults.simulation_rot import Rotting
-from faults.simulation_world import Machine
+from faults.simulation_world import Machine, Wrong
 
 MOST = 24  # touches of a memory that is merged
 

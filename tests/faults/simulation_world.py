@@ -16,7 +16,6 @@ from typing import Any
 
 from scroll_tactile_store import StoreError, check_store
 
-from faults.cases import Wrong
 from faults.disks import Event
 from faults.learners import KIT, opened, perform
 from faults.model import Operation, Others, State, Then, after
@@ -28,6 +27,10 @@ from scroll_tactile.errors import EmbeddingMismatchError, InputError, MismatchEr
 MACHINES = ("robot-1", "robot-2", "central")
 ERRORS = (errno.ENOSPC, errno.ENOSPC, errno.EIO)
 Fate = tuple[str, Any]
+
+
+class Wrong(Exception):
+    """Something is not as it has to be."""
 
 
 @dataclass

@@ -1,19 +1,19 @@
-"""A store that comes from elsewhere: nothing outside is touched, nothing in it runs, and reading it changes nothing."""
+"""Who only reads a store leaves every byte as it is; and what is no store, or lies where no store can be written.
+
+What a folder from somebody else may not do stands in tests/test_strangers.py.
+"""
 
 import errno
 import fcntl
-import itertools
 import json
 import os
-import shutil
 import stat
 
 import pytest
-from folder_attacks import LINKS, as_link, no_file
 from forging import put_row
 from scroll_tactile_store import DamageError, LockedError, NotAStoreError, Store, StoreError, check_store, repair_store
-from scroll_tactile_store.files import read_regular, same_folder
-from store_builds import LAST, add, as_after_a_crash, build, commit, contents, newest
+from scroll_tactile_store.files import same_folder
+from store_builds import LAST, add, as_after_a_crash, build, commit, contents
 
 LOG = "log-00000001"
 
@@ -82,68 +82,7 @@ def test_a_read_a_check_and_a_backup_leave_the_folder_as_it_is(left, tmp_path, u
         assert len(first) >= LAST
 
 
-# Links, pipes and other things that are no files.
-
-
-def victim(tmp_path):
-    folder = tmp_path / "victim"
-    (folder / "12345").mkdir(parents=True)
-    (folder / "12345" / "precious").write_text("precious")
-    (folder / "file").write_text("precious")
-    return folder
-
-
-def all_refuse(path, tmp_path):
-    for mode in ("write", "read"):
-        with pytest.raises(DamageError) as caught:
-            Store.open(path, mode=mode)
-        assert caught.value.path.is_relative_to(path)
-    with pytest.raises(DamageError):
-        repair_store(path)
-    assert [problem.kind for problem in check_store(path)] == ["lost"]
-
-
-@pytest.mark.parametrize("name", LINKS)
-def test_a_link_in_a_store_is_refused_and_nothing_that_it_leads_to_changes(tmp_path, name):
-    path, outside = build(tmp_path / "s"), victim(tmp_path)
-    shutil.copy(path / LOG, outside / "log")
-    as_link(path / name, outside / LINKS[name])
-    before, inside = everything(outside), everything(path)
-    all_refuse(path, tmp_path)
-    assert everything(outside) == before
-    assert everything(path) == inside
-
-
-def test_a_link_that_comes_while_a_store_is_read_is_not_followed(tmp_path):
-    path, outside = build(tmp_path / "s"), victim(tmp_path)
-    with Store.open(path, mode="read") as reader:
-        assert reader.last
-        as_link(path / "CURRENT", outside / "file")
-        with pytest.raises(DamageError, match="no regular file"):
-            reader.state()
-
-
-def test_a_log_that_gets_a_hole_while_it_is_read_is_damage(tmp_path):
-    path = build(tmp_path / "s")
-    with Store.open(path, mode="read") as reader:
-        os.truncate(path / LOG, 2**40)
-        with pytest.raises(DamageError, match="nothing of it was read"):
-            reader.state()
-    assert any("nothing of it was read" in problem.what for problem in check_store(path))
-
-
-def of_holes(path, outside):
-    with path.open("r+b") as file:
-        file.truncate(2**40)
-
-
-@pytest.mark.parametrize(("name", "harm"), [("c/0/0", as_link), ("zarr.json", of_holes)], ids=["a link", "holes"])
-def test_what_no_checkpoint_has_is_not_copied(tmp_path, name, harm):
-    path, outside = build(tmp_path / "s"), victim(tmp_path)
-    harm(newest(path) / "rows" / name, outside / "file")
-    with Store.open(path, mode="read") as reader, pytest.raises(DamageError):
-        reader.backup(tmp_path / "copy")
-    assert not (tmp_path / "copy").exists()
+# Locks and paths.
 
 
 def test_a_store_is_reached_through_a_link(tmp_path):
@@ -153,51 +92,6 @@ def test_a_store_is_reached_through_a_link(tmp_path):
         with pytest.raises(LockedError):
             Store.open(tmp_path / "s")
     assert check_store(tmp_path / "link") == []
-
-
-@pytest.mark.parametrize("name", [LOG, "CURRENT", "lock", "log-00000009"])
-def test_nothing_is_written_to_a_file_that_has_another_name(tmp_path, name):
-    path, outside = build(tmp_path / "s"), tmp_path / "outside"
-    (path / name).touch()
-    os.link(path / name, outside)
-    before = everything(tmp_path)
-    for write in (Store.open, repair_store):
-        with pytest.raises(DamageError, match="another name") as caught:
-            write(path)
-        assert caught.value.path == path / name
-    assert len(read_all(path)) == LAST
-    assert everything(tmp_path) == before
-
-
-FILES = [name for name, target in LINKS.items() if target in ("file", "log")]
-KINDS = ["fifo", "socket", "folder", *(["device"] if os.geteuid() == 0 else [])]
-
-
-@pytest.mark.parametrize(("name", "kind"), list(zip(FILES, itertools.cycle(KINDS))))
-def test_what_is_no_file_is_refused_at_once(tmp_path, name, kind):
-    path = build(tmp_path / "s")
-    no_file(path / name, kind)
-    before = everything(path)
-    all_refuse(path, tmp_path)
-    assert everything(path) == before
-
-
-def test_only_a_regular_file_is_read_and_none_that_is_larger_than_it_may_be(tmp_path):
-    (tmp_path / "file").write_bytes(b"12345")
-    (tmp_path / "link").symlink_to("file")
-    (tmp_path / "folder").symlink_to(tmp_path)
-    os.mkfifo(tmp_path / "pipe")
-    assert read_regular(tmp_path / "file", 5) == b"12345"
-    for name, limit in (("file", 4), ("link", 9), ("pipe", 9), (".", 9)):
-        with pytest.raises(DamageError):
-            read_regular(tmp_path / name, limit)
-    with pytest.raises(FileNotFoundError):
-        read_regular(tmp_path / "none", 5)
-    with pytest.raises(DamageError, match="symbolic link"):
-        read_regular(tmp_path / "folder" / "file", 5, within=tmp_path)
-
-
-# Locks and paths.
 
 
 @pytest.mark.parametrize("code", [errno.ENOSYS, errno.ENOLCK])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from folder_attacks import CONSTITUENTS, QUANTITIES, QUANTITY, ROW, ROWS, description, identities, row
-from forging import checkpoint_of, copied, get_identity, put_arrays, put_row, row_of, seal, set_identity
+from forging import checkpoint_of, copied, get_identity, observation, put_arrays, put_row, row_of, seal, set_identity
 from scroll_tactile_store import DamageError, StoreError
 from touches import PAD, SETTINGS, filled, held, stream
 
@@ -352,8 +352,8 @@ def test_what_is_left_out_as_shared_must_be_there(path, tmp_path):
     """Row 1 lies under a checkpoint: opening does not read it, but a touch is left out for its key."""
     theirs, (receipt,) = filled(tmp_path / "theirs", [("a", (9, 60))])
     theirs.close()
-    attributes, arrays = row_of(path, 1)
-    put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=arrays)
+    attributes, payload = observation(path)
+    put_row(path, sequence=1, label="a", key=receipt.key, attributes=attributes, payload=payload)
     assert any("content hash" in found for found in check_memory(path))
     with opened(tmp_path / "theirs") as learner:
         before = learner.digest(), len(learner.observations())

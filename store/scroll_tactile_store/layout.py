@@ -112,8 +112,8 @@ class Current:
                 None if known[name] is None else NamedCheckpoint.from_json(known[name])
                 for name in ("newest", "compaction")
             )
-            if compaction is not None and newest is None:
-                raise ValueError("it names a compaction checkpoint and no newest one")
+            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
+                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
             return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, _count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error

@@ -26,6 +26,7 @@ from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers
 from scroll_tactile.health.watch import WatchedRows, WatchRules
 from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.descriptions import Description, require_units
+from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
@@ -73,7 +74,6 @@ from scroll_tactile.results import Adaptation, Compacted, Merged, Receipt
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
-from scroll_tactile.validation.gate import MemoryStore
 
 __all__ = ["Ledger", "give_back_scratch"]
 
@@ -444,7 +444,7 @@ class Ledger:
         with self.lock:
             store, memory = self.require_open(), self.memory
             self._require_no_batch("a merge")
-            with _opened(other, memory) as source:
+            with _opened(other) as source:
                 merge = Merge(store, memory, source, rules)
                 sums = merge.sums()
                 with self._together():
@@ -565,13 +565,12 @@ class Ledger:
 
 
 @contextmanager
-def _opened(other: str | os.PathLike[str] | RamStore, memory: Memory) -> Iterator[AnyStore]:
+def _opened(other: str | os.PathLike[str] | RamStore) -> Iterator[AnyStore]:
     """Another memory, to be merged."""
     if isinstance(other, RamStore):
         yield other
         return
     with MemoryStore.open(other, mode="read") as source:
-        source.read_with(memory.plan)
         yield source
 
 

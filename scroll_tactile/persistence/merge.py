@@ -75,7 +75,7 @@ class Merge:
         self._require_same_making(whole=bool(self._compacted) or any(head.kind == MERGE for head in self._heads))
         said = memory.empty_like()
         if self._compaction is not None:
-            said.fill(self._compaction.arrays, self._compaction.attributes)
+            said.fill(self._compaction, theirs.path)
         for head in self._heads:
             if head.sequence > self._compacted:
                 note(said, head)

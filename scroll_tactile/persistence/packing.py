@@ -102,7 +102,7 @@ def sums_without(source: AnyStore, heads: Sequence[Head], memory: Memory, left_o
     found = source.latest()
     if found is None or found.last_sequence != heads[-1].sequence:
         return None
-    sums = memory.empty_like().fill(found.arrays, found.attributes)
+    sums = memory.empty_like().fill(found, source.path)
     if not left_out:
         return sums
     gone, rest = memory.empty_like(), memory.empty_like()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -124,7 +124,7 @@ class RamStore:
         """The rows behind one with their arrays."""
         return (self.record(sequence) for sequence in range(after + 1, self.last + 1))
 
-    def latest(self, *, late: Collection[str] = ()) -> Checkpoint | None:
+    def latest(self) -> Checkpoint | None:
         """The newest checkpoint, all of it."""
         return _copied(self._newest)
 

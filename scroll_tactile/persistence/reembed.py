@@ -22,6 +22,7 @@ from scroll_tactile_store.files import is_there, sync_folder
 from scroll_tactile_store.lock import WriterLock
 
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.gate import MemoryStore, beside, finish_interrupted
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -39,7 +40,6 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.persistence.replaying import apply, load, refill
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted
 
 __all__ = ["Reembedding"]
 

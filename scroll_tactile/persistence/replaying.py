@@ -10,7 +10,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from copy import copy
 from itertools import takewhile
-from typing import Any, cast
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,8 @@ from scroll_tactile_store import CompactedError, DamageError, Head, Record
 
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import describe
-from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
+from scroll_tactile.memory.exemplars import Exemplar, rank
+from scroll_tactile.memory.state import Memory, MemoryFields
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
     CORRECTION,
@@ -77,12 +78,10 @@ def load(empty: Memory, store: AnyStore) -> Memory:
 def _loaded(memory: Memory, store: AnyStore) -> Memory:
     memory.compacted = store.compacted
     # Where no checkpoint is sound, that of a compaction raises what is lost; without one the journal has every row.
-    newest = store.latest(
-        late=[LATE_ROWS, *(f"{name}-{scale}" for name in LATE_SECOND for scale in memory.plan.scales)]
-    )
+    newest = store.latest()
     start = store.compaction() if newest is None else newest
     if start is not None:
-        memory.fill(start.arrays, start.attributes, start.last_sequence, late=start.late)
+        memory.fill(start, store.path)
     memory.checkpoint = None if newest is None else newest.number
     memory.saved = memory.sequence
     for record in store.records(after=memory.sequence):
@@ -117,7 +116,7 @@ def apply(
     elif row.kind == RETRACT:
         changed = _retract(memory, row, store, gone or {})
     elif row.kind == MERGE:
-        _join(memory, row)
+        _join(memory, row, store.path)
         changed = None
     memory.sequence = row.sequence
     return changed
@@ -162,10 +161,10 @@ def _retract(memory: Memory, row: Record, store: AnyStore, known: Mapping[int, R
     return changed
 
 
-def _join(memory: Memory, row: Record) -> None:
+def _join(memory: Memory, row: Record, path: Path) -> None:
     """Add another memory of the same recipe, from a row with the arrays and attributes of its compaction checkpoint."""
-    other = memory.empty_like().fill(row.arrays, row.attributes, source=row.sequence)
-    memory.join(other, exemplars="exemplar-readings" in row.arrays)
+    other = memory.empty_like().fill(row, path, source=row.sequence)
+    memory.join(other, exemplars="exemplars-held-readings" in row.arrays)
 
 
 def apply_appended(memory: Memory, store: AnyStore, records: Sequence[Record]) -> list[Changed] | None:
@@ -178,8 +177,9 @@ def apply_appended(memory: Memory, store: AnyStore, records: Sequence[Record]) -
         # Heads of all kinds are read: filtered ones skip damaged rows, and such a row may be a retraction.
         behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.last_sequence))
         gone = min(retracted_by(behind), default=None)
-        if gone is None or gone > cast(int, newest.attributes["tuned_last_sequence"]):
-            memory.take_tuned(newest.arrays, newest.attributes)
+        made = MemoryFields.of(newest, memory.statistics.dimension, store.path)
+        if gone is None or gone > made.tuned_last_sequence:
+            memory.take_tuned(made)
     return None if None in changed else [each for touches in changed for each in touches or ()]
 
 
@@ -231,7 +231,7 @@ def _chosen(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
     for head in heads:
         note(fresh, head)
         if head.kind == MERGE:
-            _join(fresh, store.record(head.sequence))
+            _join(fresh, store.record(head.sequence), store.path)
     observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]
     fresh.choose(observed, store.record, memory)
     return fresh
@@ -243,7 +243,7 @@ def _compaction_samples(memory: Memory, store: AnyStore) -> Memory:
     require_compaction(memory, store)
     try:
         if (compaction := store.compaction()) is not None:
-            fresh.fill(compaction.arrays, compaction.attributes)
+            fresh.fill(compaction, store.path)
     except DamageError as damage:
         # The statistics are complete without it, and a repair has them where a checkpoint is written behind it.
         logger.warning(
@@ -302,5 +302,5 @@ def _exemplars_in(memory: Memory, store: AnyStore, sequence: int) -> list[Exempl
         steps, codes = memory.codes(row)
         readings, stages = only_readings(row.arrays), memory.plan.scored_stages(steps)
         return [Exemplar.of(row.label, row.key, readings, stages, codes)]
-    about = None if row is None else cast(Any, row.attributes.get("exemplars"))
-    return [] if row is None or about is None else exemplars_from_arrays(row.arrays, about)
+    kept = None if row is None else MemoryFields.of(row, memory.statistics.dimension, store.path).exemplars
+    return [] if kept is None else kept.exemplars()

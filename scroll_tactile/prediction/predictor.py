@@ -26,6 +26,7 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
+from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory, sound_rows
 from scroll_tactile.memory.identity import FingerprintCheck, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
@@ -46,7 +47,6 @@ from scroll_tactile.results import Composition, Constituent, Estimate, Predictio
 from scroll_tactile.settings import Settings, candidates_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.validation.gate import MemoryStore, finish_interrupted, open_memory, sound_rows
 
 __all__ = ["LogitsReader", "Predictor", "embed_again", "nothing_known", "reembed_memory"]
 

@@ -27,6 +27,7 @@ from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.memory.touch_rows import annotated
 from scroll_tactile.persistence.merge import MergeRules
 from scroll_tactile.statistics.annotations import Annotation
+from scroll_tactile.statistics.fields import encode
 
 FORCE = Quantity(name="force", unit="N", low=0, high=1, resolution=0.01)
 VALUED = 5  # the seed of the touches that have a value
@@ -178,8 +179,8 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
         pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.annotation)).encode())
-    arrays, materials = ({}, None) if memory.kept is None else memory.kept.to_arrays()
-    kept = hashlib.sha256(repr((materials, [touch.annotation for *_, touch in memory.kept or ()])).encode())
+    arrays, told = ({}, None) if memory.kept is None else encode(memory.kept.to_fields())
+    kept = hashlib.sha256(repr(told).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())
     return {"digest": learner.digest(), "pool": pool.hexdigest(), "kept": kept.hexdigest()}

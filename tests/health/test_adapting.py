@@ -19,9 +19,9 @@ from scroll_tactile import Adaptation, Kernels, Scene, Sensor, TactileLearner, e
 from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.report import memory_page
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text
+from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.validation.gate import check_memory
 
 PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)

@@ -145,4 +145,4 @@ def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
         assert learner.memory.saved == 10
         assert held(learner) == fresh(made, OBSERVED)
     with Store.open(tmp_path / "m", mode="read") as store:
-        assert not any(name.startswith("exemplar-readings") for name in store.latest().arrays)
+        assert not any(name.startswith("exemplars-held") for name in store.latest().arrays)

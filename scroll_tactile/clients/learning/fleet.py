@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import signal
 import threading
 import time
 import warnings
@@ -23,10 +24,10 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
+from functools import partial
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from signal import SIG_DFL, SIGINT, signal
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -402,7 +403,11 @@ class Processes(ThreadPoolExecutor):
     """So many processes on this machine, each a pool of its own: one that dies takes nobody else's work with it."""
 
     def __init__(self, workers: int) -> None:
-        super().__init__(workers)
+        # A process takes over what its thread is deaf to: ctrl-C reaches the parent, whose end ends it without a word.
+        mask = getattr(signal, "pthread_sigmask", None)  # Windows has none
+        if mask is not None:
+            resource_tracker.ensure_running()  # which would take the mask off the first thread that begins a process
+        super().__init__(workers, initializer=mask and partial(mask, signal.SIG_BLOCK, {signal.SIGINT}))
         self._context = get_context("spawn")
         self._theirs, self._ours = self._context.Pipe(duplex=False)  # processes end when our end is closed
         self._own = threading.local()
@@ -438,5 +443,4 @@ def _begin(ends: Connection) -> None:
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)
-    signal(SIGINT, SIG_DFL)  # ctrl-C ends it without a word
     threading.Thread(target=lambda: (wait([ends]), os._exit(1)), daemon=True).start()

@@ -22,7 +22,7 @@ from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.validation.gate import MemoryStore, check_memory
+from scroll_tactile.memory.gate import MemoryStore, check_memory
 
 
 def packed(folder, observed, name="p", described=(), pack=None, **settings):

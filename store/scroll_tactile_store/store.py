@@ -151,7 +151,7 @@ class Store:
             elif is_file(path):
                 self._folder = undo.enter_context(unpacked(path))
             with reported(path, "opening the store"):
-                self._use(*self._found())
+                self._take_current()
             undo.callback(lambda: self._log.close(trim=mode == "write"))
             if mode == "write":
                 self._remove_unnamed()
@@ -174,39 +174,39 @@ class Store:
 
     # What `CURRENT` names.
 
-    def _use(self, current: Current, log: Log, rows: Rows) -> None:
-        self._current, self._log, self._rows = current, log, rows
-        self.identity: Mapping[str, JSON] = _identity(log)
-
-    def _found(self) -> tuple[Current, Log, Rows]:
-        """Return what `CURRENT` says now, and the log that it names, read from the newest checkpoint's place on."""
+    def _take_current(self) -> None:
+        """Use the log that `CURRENT` names now, read from the newest checkpoint's place on."""
         for _ in range(ATTEMPTS):
             current = read_current(self._folder / CURRENT_FILE)
             path = log_path(self._folder, current.log)
             try:
                 log = Log(path, write=self.mode == "write")
+                break
             except FileNotFoundError as error:
                 # A writer removes a log after another has taken its place.
                 if read_current(self._folder / CURRENT_FILE) == current:
+                    what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the"
                     raise DamageError(
-                        f"{path}, which {self._folder / CURRENT_FILE} names, is not there: put it back from a copy, or "
-                        "repair the store (repair_store), which resumes from what verifies",
-                        path=path,
+                        f"{what} store (repair_store), which resumes from what verifies", path=path
                     ) from error
-                continue
-            try:
-                return current, log, self._read(current, log)
-            except BaseException:
-                log.close()
-                raise
-        raise StoreError(f"{self.path} is compacted again and again: open it later")
+        else:
+            raise StoreError(f"{self.path} is compacted again and again: open it later")
+        try:
+            rows, identity = self._read(current, log), from_json(log.header.decode())
+        except BaseException as error:
+            log.close()
+            if isinstance(error, ValueError):
+                what = f"the identity in {log.path} was never written so: {error}"
+                raise DamageError(what, path=log.path) from error
+            raise
+        self._current, self._log, self._rows = current, log, rows
+        self.identity: Mapping[str, JSON] = identity
 
     def _read(self, current: Current, log: Log) -> Rows:
         if log.identity != current.log_identity:
             raise DamageError(f"{log.path} is the log of another store, or of another time", path=log.path)
-        _identity(log)
-        named, rows = current.newest, Rows(log.place)
-        if named is not None:
+        rows = Rows(log.place)
+        if (named := current.newest) is not None:
             if not log.has_place(named.place):
                 what = f"{log.path} holds no batch that ends where checkpoint {named.number} says"
                 raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
@@ -245,8 +245,8 @@ class Store:
             return self._current
 
     def _renew(self) -> None:
-        before, found = self._log, self._found()
-        self._use(*found)
+        before = self._log
+        self._take_current()
         before.close()
 
     def _look(self) -> None:
@@ -320,9 +320,7 @@ class Store:
             if self._batching and self._failed:
                 raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
             if (sequence := self._rows.last + 1) > LAST_SEQUENCE:
-                raise DamageError(
-                    f"{self.path} has a row, or a checkpoint, of number {sequence - 1}", path=self._log.path
-                )
+                raise DamageError(f"{self._log.path} has a row of number {sequence - 1}", path=self._log.path)
             data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
             try:
                 frame = self._log.stage(ROW, data)
@@ -830,11 +828,3 @@ class Store:
             # Logged already, and it says less than what went wrong inside.
             if error is None:
                 raise
-
-
-def _identity(log: Log) -> dict[str, JSON]:
-    """Return what the store of a log is for."""
-    try:
-        return from_json(log.header.decode())
-    except ValueError as error:
-        raise DamageError(f"the identity in {log.path} was never written so: {error}", path=log.path) from error

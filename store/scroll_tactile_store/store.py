@@ -273,11 +273,6 @@ class Store:
             return StoreState(self._rows.last, None if newest is None else newest.number, self._current.compacted)
 
     @property
-    def is_packed(self) -> bool:
-        """Whether it is a packed store, which is only read."""
-        return self._folder != self.path
-
-    @property
     def last(self) -> int:
         """The sequence of the last durable record, 0 when there is none; of a reader, at its last `state`."""
         return self.state(look=False).last

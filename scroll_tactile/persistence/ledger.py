@@ -500,12 +500,13 @@ class Ledger:
         """As `TactileLearner.refresh`."""
         with self.lock:
             store, memory = self.require_open(), self.memory
-            if store.mode == "write":
+            if isinstance(store, RamStore) or store.mode == "write":
                 return False
-            if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.compacted):
+            state = store.state()
+            if state == (memory.sequence, memory.checkpoint, memory.compacted):
                 return False
             try:
-                if store.compacted == memory.compacted and store.last - memory.sequence <= CHECKPOINT_EVERY:
+                if state.compacted == memory.compacted and state.last - memory.sequence <= CHECKPOINT_EVERY:
                     records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
                     self._whole = False
                     self._changed(apply_appended(memory, store, records))

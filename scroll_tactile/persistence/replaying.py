@@ -67,7 +67,7 @@ def load(empty: Memory, store: AnyStore) -> Memory:
         newest = store.newest
         try:
             memory = _loaded(empty.empty_like(), store)
-        except CompactedError:  # a writer compacted it between two reads
+        except CompactedError:  # a writer compacted it meanwhile
             continue
         # A checkpoint that came between the reads may hold a tuned model from before the rows that were read.
         if store.newest == newest:

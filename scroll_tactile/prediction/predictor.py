@@ -365,7 +365,7 @@ class Predictor:
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""
         with self.ledger.lock, enough_memory():
-            return Draft.of(self.ledger.memory, self.recipe.settings.readout).fit()
+            return Draft.of(self.memory, self.recipe.settings.readout).fit()
 
 
 def _followed(fit: _Fit, memory: Memory) -> Model | None:

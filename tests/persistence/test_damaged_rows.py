@@ -4,8 +4,8 @@ import pytest
 from forging import log_of
 from scroll_tactile_store import DamageError, check_store
 from scroll_tactile_store.framing import FRAME_BYTES
-from scroll_tactile_store.log import LogReader
-from scroll_tactile_store.row_encoding import ROW
+from scroll_tactile_store.log import Log, refuse
+from scroll_tactile_store.rows import ROW
 from touches import OBSERVED, SETTINGS, filled, require_same
 
 from scroll_tactile import TactileLearner
@@ -15,8 +15,8 @@ DAMAGED = 5  # a row, of the second touch of "b"
 
 def harm(path, place):
     """Flip a bit in the frame of a row, or in its head."""
-    with LogReader(log_of(path)) as log:
-        frames = [frame for batch in log.refresh() for frame in batch if frame.kind == ROW]
+    with Log(log_of(path)) as log:
+        frames = [frame for batch in log.scan(refuse) for frame in batch if frame.kind == ROW]
     data = bytearray(log_of(path).read_bytes())
     data[frames[DAMAGED - 1].offset + place] ^= 1
     log_of(path).write_bytes(data)

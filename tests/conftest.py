@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quick_checkpoints import write_zarr
+from quick_checkpoints import read_zarr, write_zarr
 from real_sets import CACHE
 
 from scroll_tactile.matching import likelihood
@@ -63,14 +63,15 @@ def shared_tables() -> Iterator[None]:
         yield
 
 
-BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_hostile_checkpoints")
-"""What is about the writing itself."""
+BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_checkpoint_bounds")
+"""What is about the writing and the reading themselves."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def quick_checkpoints(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Checkpoints are written without zarr, to the same bytes, but in the tests of their writing."""
+    """Checkpoints are written without zarr, to the same bytes, and read, but in the tests of just that."""
     with pytest.MonkeyPatch.context() as patch:
         if request.path.stem not in BY_ZARR:
             patch.setattr("scroll_tactile_store.checkpoint_files._write_zarr", write_zarr)
+            patch.setattr("scroll_tactile_store.checkpoint_files._read_zarr", read_zarr)
         yield

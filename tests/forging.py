@@ -7,7 +7,7 @@ import json
 import shutil
 import struct
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,6 @@ from scroll_tactile_store import Store
 from storage.second_reader import COMMIT, HEAD, MARK, ROW, ROW_KIND, Frame, digest, frame_at, frames
 from storage.second_reader import row as read_row
 
-PAYLOAD = struct.Struct("<4sBH")
-LENGTHS = struct.Struct("<BQQ")
 DIGEST_BYTES = 16
 
 
@@ -147,25 +145,20 @@ def set_identity(path: Path, identity: Any) -> None:
             seal(path, named["number"], described(path, named["number"]) | {"identity": known})
 
 
-Packed = tuple[str, str, tuple[int, ...], int, int, bytes]
-"""An array in a payload: its name, dtype, shape, codec, the bytes that it is said to have, and its buffer."""
+Packed = tuple[str, str, Sequence[int], bytes, int]
+"""An array in a payload: its name, dtype, shape, its buffer, and how many bytes that is said to have."""
 
 
 def raw(name: str, array: np.ndarray) -> Packed:
-    """An array as it is, in no codec."""
-    array = np.asarray(array, order="C")
-    return name, array.dtype.str, array.shape, 0, array.nbytes, array.tobytes()
+    """An array as it is, not compressed."""
+    return name, array.dtype.str, array.shape, np.asarray(array, order="C").tobytes(), array.nbytes
 
 
-def pack(arrays: Sequence[Packed], *, count: int | None = None) -> bytes:
-    """A payload of arrays of which anything may be said; count: where it is to say another than the right one."""
-    head, buffers = [PAYLOAD.pack(b"ARPL", 1, len(arrays) if count is None else count)], []
-    for name, dtype, shape, codec, size, buffer in arrays:
-        head += [struct.pack("<B", len(text)) + text for text in (name.encode(), dtype.encode())]
-        head.append(struct.pack(f"<B{len(shape)}Q", len(shape), *shape))
-        head.append(LENGTHS.pack(codec, size, len(buffer)))
-        buffers.append(buffer)
-    return b"".join(head + buffers)
+def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
+    """A payload of arrays of which anything may be said; text: in place of what is said of them."""
+    told = {name: [dtype, list(shape), stored] for name, dtype, shape, _, stored in arrays}
+    said = as_text(told if text is None else text).encode("utf-8", "surrogatepass")
+    return b"".join([struct.pack("<I", len(said)), said, *(buffer for _, _, _, buffer, _ in arrays)])
 
 
 def named_in(path: Path) -> list[dict[str, Any]]:
@@ -214,50 +207,35 @@ def describe_again(path: Path, text: str | None = None, **changes: Any) -> None:
 
 def refiled(path: Path, number: int) -> dict[str, Any]:
     """What a checkpoint says of itself, with the digests of its files as they are now."""
-    known = described(path, number)
-    for name, about in known["arrays"].items():
-        top = group_of(path, number) / name / "c"
-        files = [top] if top.is_file() else [file for file in top.rglob("*") if file.is_file()]
-        files.sort(key=lambda file: [int(part) for part in file.relative_to(top).parts])
-        about["files"] = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
-    return known
+    group = group_of(path, number)
+    files = [file for file in sorted(group.glob("*/**/*")) if file.is_file()]
+    digests = {str(file.relative_to(group)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return described(path, number) | {"files": digests}
 
 
-def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def put_arrays(path: Path, number: int, arrays: Mapping[str, np.ndarray], gone: Iterable[str] = ()) -> dict[str, Any]:
     """Write arrays into a checkpoint's group, in place of those of their names; what it then has to say of itself.
 
-    They are written without any codec but that for bytes, in one chunk each, as anyone may.
+    They are written without any codec but that for bytes, in one chunk each, as anyone may. gone: arrays that go.
     """
-    from scroll_tactile_store.encoding import array_digest
-
-    known = described(path, number)
-    for name, given in arrays.items():
-        array = np.asarray(given, order="C")
-        known["arrays"][name] = {
-            "dtype": array.dtype.str,
-            "shape": list(array.shape),
-            "sha256": array_digest(array),
-            "files": put_array(group_of(path, number) / name, array),
-        }
-    return known
+    for name in (*arrays, *gone):
+        shutil.rmtree(group_of(path, number) / name, ignore_errors=True)
+    for name, array in arrays.items():
+        put_array(group_of(path, number) / name, np.asarray(array, order="C"))
+    return refiled(path, number)
 
 
-def put_array(folder: Path, array: np.ndarray) -> list[str]:
-    """Write one array as a zarr array of one chunk, its elements laid out as the store does; sha256 of its files."""
+def put_array(folder: Path, array: np.ndarray) -> None:
+    """Write one array as a zarr array of one chunk."""
     from quick_checkpoints import array_about
-    from scroll_tactile_store.chunks import ArrayContent
 
-    content = ArrayContent(array.dtype, array.shape, "")
-    plain = content.to_plain(array)
-    chunk = folder.joinpath("c", *["0"] * plain.ndim)
-    shutil.rmtree(folder / "c", ignore_errors=True)  # of other axes
-    chunk.parent.mkdir(parents=True, exist_ok=True)
-    (folder / "zarr.json").write_text(json.dumps(array_about(array, content, None)), encoding="utf-8")
-    data = np.ascontiguousarray(plain).tobytes()
-    if not plain.size:
-        return []
-    chunk.write_bytes(data)
-    return [hashlib.sha256(data).hexdigest()]
+    chunk = folder.joinpath("c", *["0"] * array.ndim)
+    chunk.parent.mkdir(parents=True)
+    about = array_about(array, None)
+    about["chunk_grid"]["configuration"]["chunk_shape"] = [max(1, length) for length in array.shape]
+    (folder / "zarr.json").write_text(json.dumps(about), encoding="utf-8")
+    if array.size:
+        chunk.write_bytes(array.tobytes())
 
 
 def lengthen_frame(path: Path) -> None:
@@ -290,29 +268,29 @@ def set_configuration(path: Path, **configuration: Any) -> None:
     set_identity(path, known)
 
 
-def largest_array(path: Path) -> tuple[int, dict[str, Any], str]:
-    """The newest checkpoint's number, what it says of itself, and the name of its largest array."""
+def largest_array(path: Path) -> tuple[int, str]:
+    """The newest checkpoint's number, and the name of its largest array."""
     number = get_current(path)["newest"]["number"]
-    known = described(path, number)
-    sizes = {name: int(np.prod(about["shape"])) for name, about in known["arrays"].items() if "log-" not in name}
-    return number, known, max(sizes, key=sizes.get)
+    headers = [file for file in group_of(path, number).glob("*/zarr.json") if not file.parent.name.startswith("log-")]
+    sizes = {file.parent.name: int(np.prod(json.loads(file.read_text())["shape"])) for file in headers}
+    return number, max(sizes, key=lambda name: sizes[name])
 
 
 def change_array(path: Path, codec: str = "", data: bytes = b"", longer: int = 1, named: str = "") -> None:
     """The newest checkpoint's largest array with another codec, bytes, last axis or name, and right checksums."""
-    number, known, name = largest_array(path)
+    number, name = largest_array(path)
     folder = group_of(path, number) / name
     told = json.loads((folder / "zarr.json").read_text())
     if codec:
         told["codecs"] = [*told["codecs"][:1], {"name": codec, "configuration": {"level": 1, "checksum": False}}]
+    for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"]):
+        shape[-1] *= longer
+    (folder / "zarr.json").write_text(json.dumps(told))
     if data:
         next(file for file in (folder / "c").rglob("*") if file.is_file()).write_bytes(data)
     known = refiled(path, number)
-    for shape in (told["shape"], told["chunk_grid"]["configuration"]["chunk_shape"], known["arrays"][name]["shape"]):
-        shape[-1] *= longer
-    (folder / "zarr.json").write_text(json.dumps(told))
     if named:
-        known["arrays"][named] = known["arrays"].pop(name)
+        known["files"] = {f"{named}/{file.partition('/')[2]}": one for file, one in known["files"].items()}
     seal(path, number, known)
 
 

@@ -1,21 +1,22 @@
-"""Checkpoints as zarr writes them, byte for byte, a hundred times as fast: most tests write some by the way.
+"""Checkpoints as zarr writes them, byte for byte, and reads them, a hundred times as fast: most tests do by the way.
 
-Tests of the writing have zarr write them, as the store does (see conftest.py); tests/storage/test_store_commit.py
-compares the files of both.
+Tests of the writing and the reading have zarr do it, as the store does (see conftest.py);
+tests/storage/test_store_commit.py compares both.
 """
 
 import json
 from collections.abc import Mapping
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scroll_tactile_store.checkpoint_files
 from numcodecs import zstd
-from scroll_tactile_store.checkpoint_files import CheckpointDraft
-from scroll_tactile_store.chunks import ArrayContent
+from scroll_tactile_store.checkpoint_files import chunk_shape
 
 WRITTEN_BY_ZARR = scroll_tactile_store.checkpoint_files._write_zarr
+READ_BY_ZARR = scroll_tactile_store.checkpoint_files._read_zarr
 
 
 class Group:
@@ -30,45 +31,51 @@ class Group:
         (self._path / "zarr.json").write_text(json.dumps(about, indent=self._indent))
 
 
-def array_about(array: np.ndarray, content: ArrayContent, level: int | None) -> dict[str, Any]:
+def array_about(array: np.ndarray, level: int | None) -> dict[str, Any]:
     """What zarr says of an array."""
     plain: dict[str, Any] = {"name": "bytes"}
-    if content.plain.itemsize > 1:
+    if array.dtype.itemsize > 1:
         plain["configuration"] = {"endian": "little"}
     packer = [] if level is None else [{"name": "zstd", "configuration": {"level": level, "checksum": False}}]
-    fill: Any = {"b": False, "f": 0.0}.get(content.plain.kind, 0)
     return {
-        "shape": list(content.plain_shape),
-        "data_type": content.plain.name,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(content.chunk)}},
+        "shape": list(array.shape),
+        "data_type": array.dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk_shape(array))}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "fill_value": fill,
+        "fill_value": 0.0 if array.dtype.kind == "f" else 0,
         "codecs": [plain, *packer],
-        "attributes": {"dtype": array.dtype.str},
+        "attributes": {},
         "zarr_format": 3,
         "node_type": "array",
         "storage_transformers": [],
     }
 
 
-def write_zarr(
-    path: Path,
-    draft: CheckpointDraft,
-    described: Mapping[str, ArrayContent],
-    level: int | None,
-    indent: int | None = 2,
-) -> Any:
+def write_zarr(path: Path, arrays: Mapping[str, np.ndarray], level: int | None, indent: int | None = 2) -> Any:
     """Write a checkpoint's group and arrays; zarr does where an array has more than one chunk. indent: of the JSON."""
-    if any(len(list(content.places(content.chunk))) > 1 for content in described.values()):
-        return WRITTEN_BY_ZARR(path, draft, described, level)
+    if any(array.size and chunk_shape(array) != array.shape for array in arrays.values()):
+        return WRITTEN_BY_ZARR(path, arrays, level)
     path.mkdir()
-    for name, array in draft.arrays.items():
-        content = described[name]
+    for name, array in arrays.items():
         (path / name).mkdir()
-        (path / name / "zarr.json").write_text(json.dumps(array_about(array, content, level), indent=indent))
-        for place in content.places(content.chunk):
-            file = (path / name).joinpath("c", *map(str, place))
+        (path / name / "zarr.json").write_text(json.dumps(array_about(array, level), indent=indent))
+        if array.size:
+            file = (path / name).joinpath("c", *["0"] * array.ndim)
             file.parent.mkdir(parents=True, exist_ok=True)
-            data = np.ascontiguousarray(content.to_plain(array)).tobytes()
-            file.write_bytes(data if level is None else zstd.compress(data, level))
+            file.write_bytes(array.tobytes() if level is None else zstd.compress(array.tobytes(), level))
     return Group(path, indent)
+
+
+def read_zarr(content: Mapping[str, bytes]) -> np.ndarray:
+    """Read an array as it is usually written; zarr does where it is not, or has more than one chunk."""
+    about = json.loads(content["zarr.json"])
+    shape = tuple(about["shape"])
+    chunks = [data for name, data in content.items() if name != "zarr.json"]
+    array = np.zeros(shape, about["data_type"])
+    level = about["codecs"][-1].get("configuration", {}).get("level")
+    if about != array_about(array, level) or len(chunks) != bool(prod(shape)):
+        return READ_BY_ZARR(content)
+    if chunks:
+        data = chunks[0] if level is None else zstd.decompress(chunks[0])
+        array[...] = np.frombuffer(data, array.dtype).reshape(shape)
+    return array

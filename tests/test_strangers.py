@@ -88,7 +88,7 @@ DEFLATED = b"\x78\x01" + BLOCK * 64  # a gigabyte
 
 def in_place(path, name, put):
     """Something else in the place of a file or folder, which is moved outside."""
-    number, _, largest = largest_array(path)
+    number, largest = largest_array(path)
     put(moved_out(path / name.replace("CHUNK", f"checkpoints/{number:08d}/{largest}/c")))
 
 
@@ -111,7 +111,7 @@ def set_weights(path):
 
 
 MEMORIES = {
-    "objects in a row": (touched(("x", "|O", (1,), 0, len(PICKLE), PICKLE)), REFUSED),
+    "objects in a row": (touched(("x", "|O", [1], PICKLE, len(PICKLE))), REFUSED),
     "a codec of a plugin": (partial(change_array, codec="evil"), HARMLESS),
     "an embedding that names code": (partial(set_configuration, kind="module", name="os:system"), REFUSED),
     "an embedding by a path": (set_weights, REFUSED),
@@ -130,9 +130,9 @@ MEMORIES = {
     "a pipe for the log": (partial(in_place, name="log-00000001", put=os.mkfifo), REFUSED),
     "a pipe for a chunk": (partial(in_place, name="CHUNK", put=os.mkfifo), HARMLESS),
     "a device for CURRENT": (partial(in_place, name="CURRENT", put=lambda at: at.symlink_to("/dev/zero")), REFUSED),
-    "a tebibyte in a row": (touched(("x", "|u1", (2**40,), 0, 2**40, b"")), REFUSED),
-    "16 GiB of zeros in a row": (touched(*((f"x{i}", "|u1", (2**28,), 1, 2**28, ZEROS) for i in range(64))), REFUSED),
-    "a text of 2^30 letters": (touched(("x", "<U1073741824", (1,), 1, 2**32, ZEROS)), REFUSED),
+    "a tebibyte in a row": (touched(("x", "|u1", [2**40], b"", 2**40)), REFUSED),
+    "16 GiB of zeros in a row": (touched(*((f"x{i}", "|u1", [2**28], ZEROS, len(ZEROS)) for i in range(64))), REFUSED),
+    "a text of 2^30 letters": (touched(("x", "<U1073741824", [1], ZEROS, len(ZEROS))), REFUSED),
     "a frame of 4 GiB": (forging.lengthen_frame, HARMLESS),
     "a log with a hole": (lambda path: os.truncate(path / "log-00000001", 2**40), REFUSED),
     "CURRENT with a hole": (lambda path: os.truncate(path / "CURRENT", 2**34), REFUSED),

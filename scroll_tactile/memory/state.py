@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store import Head, Record
-from scroll_tactile_store.records import LateArray
 
 from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.descriptions import Description
@@ -37,12 +35,11 @@ from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.levels import LevelArray, levels_of
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, TargetSums
 from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
-from scroll_tactile.statistics.statistics import SECOND, Statistics
+from scroll_tactile.statistics.statistics import Statistics
 
-__all__ = ["ANNOTATED", "LATE_ROWS", "LATE_SECOND", "MOST_CORRECTIONS", "WEIGHINGS", "KeptTouches", "Memory"]
+__all__ = ["ANNOTATED", "MOST_CORRECTIONS", "WEIGHINGS", "KeptTouches", "Memory"]
 
 WEIGHINGS = "weighings"  # an array of JSON
-LATE_ROWS, LATE_SECOND = "sample-rows", SECOND  # arrays, most of a checkpoint, that no prediction reads
 ANNOTATED = "sample-annotations", "kept-annotations"  # attributes: of each of their touches, how it was annotated
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
 MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
@@ -91,14 +88,14 @@ class KeptTouches(Sample[KeptTouch]):
         return {
             "kept-keys": np.array([list(touch.key) for touch in kept] or [[]], np.uint8)[: len(kept)],
             "kept-columns": np.array([touch.levels.shape[1] for touch in kept], dtype=np.int64),
-            "kept-levels": np.diff(levels, prepend=np.uint8(0)),
+            "kept-levels": levels,
         }, [touch.material for touch in kept]
 
     def fill(self, arrays: Arrays, materials: Sequence[str], annotations: Sequence[Annotation] = ()) -> None:
         """Take in what `to_arrays` described; annotations: of each touch."""
         noted = annotations or [NO_ANNOTATION] * len(materials)
         columns, channels = arrays["kept-columns"], self.sensor.channels
-        parts = np.split(np.cumsum(arrays["kept-levels"], dtype=np.uint8), np.cumsum(columns * channels)[:-1])
+        parts = np.split(arrays["kept-levels"], np.cumsum(columns * channels)[:-1])
         for i, material in enumerate(materials):
             key, levels = arrays["kept-keys"][i].tobytes(), parts[i].reshape(channels, -1)
             self.add(material, key, KeptTouch(material, key, levels, noted[i]))
@@ -140,7 +137,7 @@ class Memory:
         self.encode = encode
         self.statistics = Statistics(recipe.embedding.dimension, self.plan.scales)
         self.targets = TargetSums(recipe.embedding.dimension, self.plan.scales)
-        self._sample: TouchSample | Callable[[], TouchSample] = TouchSample()
+        self.sample = TouchSample()
         self.kept = KeptTouches(recipe.sensor, recipe.kept_touches) if recipe.kept_touches else None
         self.exemplars = ExemplarSample(recipe.exemplars) if recipe.exemplars else None
         self.tuned: Tuned | None = None
@@ -170,17 +167,6 @@ class Memory:
         self.corrections[sequence] = correction
         for old in list(self.corrections)[:-MOST_CORRECTIONS]:
             del self.corrections[old]
-
-    @property
-    def sample(self) -> TouchSample:
-        """The touches that readouts are calibrated on. Raises DamageError where they are read only now."""
-        if not isinstance(self._sample, TouchSample):
-            self._sample = self._sample()
-        return self._sample
-
-    @sample.setter
-    def sample(self, sample: TouchSample) -> None:
-        self._sample = sample
 
     def add(
         self,
@@ -382,27 +368,19 @@ class Memory:
         sequence: int = 0,
         *,
         source: int | None = None,
-        late: Mapping[str, LateArray] | None = None,
     ) -> Self:
         """This memory, empty before, filled with what `to_arrays` gave; the arrays are taken over.
 
         sequence: the last row that they hold. source: the row that has the readings of exemplars for which the arrays
-        name none, 0 for the compaction checkpoint; None where the arrays have them. late: arrays that are read when
-        they are needed.
+        name none, 0 for the compaction checkpoint; None where the arrays have them.
         """
         self.sequence = sequence
-        names, scales, reads = attributes["materials"], self.plan.scales, dict(late or {})
-        seconds = {name: each.read for name, each in reads.items()}
-        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names, seconds)
+        names, scales = attributes["materials"], self.plan.scales
+        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
         if "targets" in attributes:
             self.targets = TargetSums.from_arrays(self.statistics, arrays, attributes["targets"])
         noted, kept_noted = ([annotation_of(told) for told in attributes.get(which, ())] for which in ANNOTATED)
-        sampled = attributes["sample"], noted
-        if LATE_ROWS in reads:
-            small = {name: array for name, array in arrays.items() if name.startswith("sample-")}
-            self._sample = partial(_sample_of, reads[LATE_ROWS], small, *sampled)
-        else:
-            self.sample = TouchSample.from_arrays(arrays, *sampled)
+        self.sample = TouchSample.from_arrays(arrays, attributes["sample"], noted)
         if self.kept is not None:
             self.kept.fill(arrays, attributes["kept"], kept_noted)
         if self.exemplars is not None and "exemplars" in attributes:
@@ -425,7 +403,3 @@ class Memory:
             tuned = Tuned.from_arrays(arrays, attributes["tuned"])
             if self.tuned is None or self.tuned.digest() != tuned.digest():
                 self.tuned = tuned
-
-
-def _sample_of(rows: LateArray, arrays: Arrays, *about: Any) -> TouchSample:
-    return TouchSample.from_arrays({**arrays, LATE_ROWS: rows.read()}, *about)

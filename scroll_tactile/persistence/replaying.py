@@ -15,7 +15,7 @@ from scroll_tactile_store import CompactedError, DamageError, Head, Record, Stor
 from scroll_tactile.errors import UnknownMaterialError
 from scroll_tactile.memory.descriptions import describe
 from scroll_tactile.memory.exemplars import Exemplar, exemplars_from_arrays, rank
-from scroll_tactile.memory.state import LATE_ROWS, LATE_SECOND, Memory
+from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
     ADAPT,
     CORRECTION,
@@ -77,12 +77,10 @@ def load(empty: Memory, store: Store) -> Memory:
 def _loaded(memory: Memory, store: Store) -> Memory:
     memory.compacted = store.compacted
     # Where no checkpoint is sound, that of a compaction raises what is lost; without one the journal has every row.
-    newest = store.latest(
-        late=[LATE_ROWS, *(f"{name}-{scale}" for name in LATE_SECOND for scale in memory.plan.scales)]
-    )
+    newest = store.latest()
     start = store.compaction() if newest is None else newest
     if start is not None:
-        memory.fill(start.arrays, start.attributes, start.last_sequence, source=0, late=start.late)
+        memory.fill(start.arrays, start.attributes, start.last_sequence, source=0)
     memory.checkpoint = None if newest is None else newest.number
     memory.saved = memory.sequence
     for record in store.records(after=memory.sequence):

@@ -277,13 +277,11 @@ class Statistics:
         scales: Sequence[Scale],
         arrays: Mapping[str, npt.NDArray[Any]],
         names: Sequence[str],
-        late: Mapping[str, Callable[[], npt.NDArray[Any]]] | None = None,
         like: Statistics | None = None,
     ) -> Statistics:
         """The statistics that `to_arrays` described; the arrays are taken over or copied.
 
-        late: what reads those arrays of second moments that are not among the arrays, when they are needed. like: those
-        whose second moments these have too, where there are no arrays of any.
+        like: those whose second moments these have too, where there are no arrays of any.
         """
         statistics = cls(dimension, scales)
         statistics._places = {name: place for place, name in enumerate(names)}
@@ -296,9 +294,7 @@ class Statistics:
             if rows := int(statistics._rows[scale].sum()):
                 own = any(f"{name}-{scale}" in arrays for name in SECOND)
                 statistics._seconds[scale] = (
-                    _second(int(scale), rows, dimension, arrays, late or {})
-                    if own or like is None
-                    else like.second(scale).copy()
+                    _second(int(scale), rows, dimension, arrays) if own or like is None else like.second(scale).copy()
                 )
         return statistics
 
@@ -308,14 +304,9 @@ def _second(
     rows: int,
     dimension: int,
     arrays: Mapping[str, npt.NDArray[Any]],
-    late: Mapping[str, Callable[[], npt.NDArray[Any]]],
 ) -> SecondMoment:
-    """The second moment of so many rows that arrays describe, read when it is needed where all of it is late."""
+    """The second moment of so many rows that arrays describe."""
     second, values, places = (f"{name}-{scale}" for name in SECOND)
-    if second in late:
-        return SecondMoment.of(late[second], rows, dimension)
     if second in arrays:
         return SecondMoment.of(arrays[second], rows, dimension)
-    if places in late:
-        return SecondMoment.of_codes(lambda: rows_of(late[values](), late[places]()), rows, dimension)
     return SecondMoment.of_codes(rows_of(arrays[values], arrays[places]), rows, dimension)

@@ -7,14 +7,14 @@ lead sums beyond int64, carry names that no memory takes, or end in an error tha
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from reprlib import repr as shortened
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store import Checkpoint, Head, Record
-from scroll_tactile_store.records import LateArray, from_json
+from scroll_tactile_store.records import from_json
 
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.descriptions import checked
@@ -103,18 +103,14 @@ def array(
 ) -> npt.NDArray[Any]:
     """The array of that name; Unexpected where there is none, or it is of another dtype or shape, or out of bounds.
 
-    shape: None for an axis of any length. least, most: finite; of all, or one for each place along the last axis. An
-    array that is read later is compared with them then.
+    shape: None for an axis of any length. least, most: finite; of all, or one for each place along the last axis.
     """
     found: Any = arrays.get(field)
     came = "none" if found is None else f"{found.dtype} {found.shape}"
     fits = found is not None and found.dtype.name == dtype and len(found.shape) == len(shape)
     fits = fits and all(own in (None, axis) for own, axis in zip(shape, found.shape, strict=True))
     expect(fits, field, f"{dtype} of shape {shape}".replace("None", "any"), came)
-    if isinstance(found, LateArray):
-        found.check = partial(_within, field, least, most)
-    else:
-        _within(field, least, most, found)
+    _within(field, least, most, found)
     return cast("npt.NDArray[Any]", found)
 
 
@@ -222,7 +218,7 @@ class Expected:
 
     def checkpoint(self, checkpoint: Checkpoint) -> None:
         """Check all that a memory takes from a checkpoint."""
-        self._check_contents({**checkpoint.arrays, **checkpoint.late}, checkpoint.attributes, checkpoint.last_sequence)
+        self._check_contents(checkpoint.arrays, checkpoint.attributes, checkpoint.last_sequence)
 
     def _check_contents(self, arrays: Mapping[str, Any], told: Mapping[str, Any], last: int | None) -> None:
         """Check the arrays and attributes of a checkpoint; last: its last row, None of what a merge brought."""

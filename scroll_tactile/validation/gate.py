@@ -9,15 +9,14 @@ name is.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from itertools import chain, takewhile
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
-import numpy.typing as npt
 from scroll_tactile_store import Checkpoint, DamageError, Head, NotAStoreError, Record, Store
 from scroll_tactile_store.exceptions import reported
 from scroll_tactile_store.files import file_size, is_there, sync_folder
@@ -83,18 +82,9 @@ class Gate:
 
     def checkpoint(self, checkpoint: Checkpoint) -> Checkpoint:
         """This checkpoint. Raises DamageError."""
-        what = f"checkpoint {checkpoint.number}"
-        with self._refusing(what):
+        with self._refusing(f"checkpoint {checkpoint.number}"):
             self._expected.checkpoint(checkpoint)
-        for late in checkpoint.late.values():
-            late.check = partial(self._late, what, late.check)
         return checkpoint
-
-    def _late(self, what: str, check: Callable[[npt.NDArray[Any]], None] | None, values: npt.NDArray[Any]) -> None:
-        """Check an array of a checkpoint that was read later than the others."""
-        with self._refusing(what):
-            if check is not None:
-                check(values)
 
     @contextmanager
     def _refusing(self, what: str, sequence: int | None = None) -> Iterator[None]:
@@ -162,11 +152,9 @@ class MemoryStore(Store):
         """As `Store.records`."""
         return map(self.gate.record, super().records(after))
 
-    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
-        """As `Store.latest`; what has not all of its arrays is not looked at."""
-        if only is not None:
-            return super().latest(only=only, late=late)
-        newest = super().latest(late=late)
+    def latest(self) -> Checkpoint | None:
+        """As `Store.latest`."""
+        newest = super().latest()
         return None if newest is None else self.gate.checkpoint(newest)
 
     def compaction(self) -> Checkpoint | None:

@@ -1,44 +1,50 @@
-"""A checkpoint on disk: a zarr group, written whole and durable, read back whole or in part, and verified."""
+"""A checkpoint on disk: a zarr group that zarr writes and reads; here it is made durable, and verified.
+
+zarr itself never syncs, follows links and believes what it reads. So each file is read here, and compared with the
+sha256 that the group has of it, before zarr gets to see its bytes.
+"""
 
 from __future__ import annotations
 
 import errno
-import weakref
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+import hashlib
+import re
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scroll_tactile_store.archive import Files
-from scroll_tactile_store.chunks import (
-    GROUP_VERSION,
-    LARGEST_DESCRIPTION,
-    ArrayContent,
-    ArrayFiles,
-    file_digests,
-    most_bytes,
-    read_content,
-)
-from scroll_tactile_store.encoding import array_digest
+from scroll_tactile_store.encoding import KEPT_TYPES, NAME, declared_size, require_shape
 from scroll_tactile_store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
 from scroll_tactile_store.files import remove_tree, replacing, sync_folder
-from scroll_tactile_store.layout import PARTIAL, checkpoint_path
-from scroll_tactile_store.log_file import LogFile
-from scroll_tactile_store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, LateArray, from_json, json_digest
+from scroll_tactile_store.layout import FORMAT_VERSION, PARTIAL, checkpoint_path, other_format
+from scroll_tactile_store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json, json_digest
 
 if TYPE_CHECKING:
     import zarr
 
-__all__ = ["INDEX", "QUICK", "THOROUGH", "CheckpointDraft", "CheckpointReader", "index_name", "write_checkpoint"]
+__all__ = ["INDEX", "CheckpointDraft", "CheckpointReader", "index_name", "write_checkpoint"]
 
 INDEX = "log-"  # begins the name of an array of the store's own: which rows are where in a log
 
-# The arrays of 800 BioTac touches, 28.5 MB, become 17.2 MB at level 3, 16.9 at level 6 in thrice the time: that is for
-# checkpoints that somebody waits for, and that stay.
-QUICK, THOROUGH = 3, 6
+# The arrays of 800 BioTac touches, 28.5 MB, become 14.5 MB; at level 6 14.0 MB, in twice the time.
+LEVEL = 3
+
+# Pieces of a large array, along its first axis: a hundred megabytes are some tens of files to make durable.
+CHUNK_BYTES = 4 * 2**20
+
+# Of small files that stand for gigabytes nobody is to make room for these. `write_checkpoint` keeps to it.
+SPARE, RATIO = 192 * 2**20, 16
+
+FILE = re.compile(rf"({NAME})/(zarr\.json|c(?:/\d{{1,18}}){{0,64}})", re.ASCII)
+DTYPES = {np.dtype(text).name: np.dtype(text) for text in KEPT_TYPES}  # by the names that zarr has for them
+CODECS = (["bytes"], ["bytes", "zstd"])
+LARGEST_DESCRIPTION = 2**16  # bytes of an array's zarr.json, which has a few hundred
 
 # What a reader meets where a file is missing or is not a file; other failures of the system
 # (no permission, too many open files) say nothing against the checkpoint.
@@ -47,12 +53,11 @@ GONE = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO})
 
 @dataclass(frozen=True, eq=False)
 class CheckpointDraft:
-    """Checked arrays that are to become a checkpoint; `attributes` is JSON, `level` how hard to compress."""
+    """Checked arrays that are to become a checkpoint; `attributes` is JSON."""
 
     arrays: Mapping[str, np.ndarray]
     last_sequence: int
     attributes: str
-    level: int
 
 
 def index_name(log: bytes) -> str:
@@ -60,21 +65,17 @@ def index_name(log: bytes) -> str:
     return INDEX + log.hex()
 
 
+def most_bytes(files: Files, group: Path) -> int:
+    """Return how many bytes of arrays the files of a checkpoint may stand for."""
+    return SPARE + RATIO * sum(files.sizes(group))
+
+
 def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity: Mapping[str, JSON]) -> str:
     """Write a draft as a durable zarr group in the store's folder; return the sha256 of how it describes itself.
 
-    That is its number, `last_sequence`, attributes, the store's identity, the format and, for each array, dtype, shape
-    and sha256. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError or StoreError.
+    That is its number, `last_sequence`, attributes, the store's identity, the format and the sha256 of each of its
+    files. On any error nothing is left behind. Raises StoreFullError, ReadOnlyError, RecordError or StoreError.
     """
-    described = {
-        name: ArrayContent(array.dtype, array.shape, array_digest(array)) for name, array in draft.arrays.items()
-    }
-    known: dict[str, Any] = {
-        "number": number,
-        "last_sequence": draft.last_sequence,
-        "attributes": from_json(draft.attributes),
-        "identity": identity,
-    }
     final = checkpoint_path(folder, number)
     partial = final.with_name(final.name + PARTIAL)
     try:
@@ -84,62 +85,73 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
                 sync_folder(folder)
             remove_tree(partial)
             with replacing(final, partial):
-                group = _write_zarr(partial, draft, described, draft.level)
-                if sum(content.size for content in described.values()) > most_bytes(Files(folder).sizes(partial)):
+                group = _write_zarr(partial, draft.arrays, LEVEL)
+                if sum(array.nbytes for array in draft.arrays.values()) > most_bytes(Files(folder), partial):
                     # Readers make no room for so much that so little stands for: anybody could claim it.
                     remove_tree(partial)
-                    group = _write_zarr(partial, draft, described, None)
-                known |= {"format": GROUP_VERSION, "arrays": _as_json(partial, described)}
+                    group = _write_zarr(partial, draft.arrays, None)
+                known: dict[str, Any] = {
+                    "format": FORMAT_VERSION,
+                    "number": number,
+                    "last_sequence": draft.last_sequence,
+                    "attributes": from_json(draft.attributes),
+                    "identity": identity,
+                    "files": {name: sha256 for array in draft.arrays for name, sha256 in _digests(partial, array)},
+                }
                 digest = json_digest(known)
                 group.update_attributes(known | {"sha256": digest})
                 try:
-                    _read_attributes(partial / "zarr.json", Files(folder))
-                except (ValueError, DamageError) as error:
-                    raise RecordError(
-                        f"checkpoint {number} has more attributes than could be read again: {error}"
-                    ) from error
+                    CheckpointReader(partial, Files(folder))
+                except DamageError as error:
+                    raise RecordError(f"checkpoint {number} has more attributes than can be read: {error}") from error
     except BaseException:
         remove_tree(final)
         raise
     return digest
 
 
-def _as_json(path: Path, described: Mapping[str, ArrayContent]) -> dict[str, JSON]:
-    return {
-        name: {
-            "dtype": content.dtype.str,
-            "shape": list(content.shape),
-            "sha256": content.sha256,
-            "files": file_digests(path / name, content),
-        }
-        for name, content in described.items()
-    }
+def _digests(group: Path, array: str) -> Iterator[tuple[str, str]]:
+    for path in sorted((group / array).rglob("*")):
+        if path.is_file():
+            yield path.relative_to(group).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _write_zarr(
-    path: Path, draft: CheckpointDraft, described: Mapping[str, ArrayContent], level: int | None
-) -> zarr.Group:
-    # Imported late: 300 ms that a process which reads, or only appends, need not spend.
+def _write_zarr(path: Path, arrays: Mapping[str, np.ndarray], level: int | None) -> zarr.Group:
+    # Imported late: 0.3 s that a process which only appends need not spend.
     import zarr
     from zarr.codecs import ZstdCodec
     from zarr.storage import LocalStore
 
     group = zarr.create_group(store=LocalStore(path), zarr_format=3)
-    for name, array in draft.arrays.items():
-        content = described[name]
-        target = group.create_array(
+    for name, array in arrays.items():
+        group.create_array(
             name,
-            shape=content.plain_shape,
-            dtype=content.plain,
-            chunks=content.chunk,
+            data=array,
+            chunks=chunk_shape(array),
             compressors=None if level is None else ZstdCodec(level=level),
             fill_value=0,
-            attributes={"dtype": array.dtype.str},
             # A chunk that equals the fill value would have no file, nor would a lost one.
             config={"write_empty_chunks": True},
         )
-        target[...] = content.to_plain(array)
     return group
+
+
+def chunk_shape(array: np.ndarray) -> tuple[int, ...]:
+    """Return the shape of a chunk: as many steps along the first axis as have about 4 MiB."""
+    if not array.ndim:
+        return ()
+    step = max(1, array.nbytes // max(1, len(array)))
+    return (max(1, min(len(array), CHUNK_BYTES // step)), *(max(1, length) for length in array.shape[1:]))
+
+
+def _read_zarr(content: Mapping[str, bytes]) -> np.ndarray:
+    """Return the array of these files of it, by their names in its folder."""
+    import zarr
+    from zarr.core.buffer import cpu
+    from zarr.storage import MemoryStore
+
+    held = MemoryStore({name: cpu.Buffer.from_bytes(data) for name, data in content.items()})
+    return np.asarray(zarr.open_array(held, mode="r", zarr_format=3)[...])
 
 
 class CheckpointReader:
@@ -150,130 +162,111 @@ class CheckpointReader:
     """
 
     def __init__(self, path: Path, files: Files) -> None:
-        self._path, self._files = path, files
-        known, self._described = _read_description(path, files)
+        self._path, self._read = path, files.read
+        header = path / "zarr.json"
+        with _reading(f"a checkpoint in {header}", header):
+            known = _described(header, files)
+            self._room = most_bytes(files, path)
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]
         self.sha256: str = known["sha256"]
         self.attributes: Mapping[str, JSON] = known["attributes"]
         self.identity: Mapping[str, JSON] = known["identity"]
-        try:
-            room = most_bytes(files.sizes(path))
-        except OSError as error:
-            raise _unreadable(error, f"checkpoint {self.number} in {path}", path) from error
-        if (size := sum(array.size for array in self._described.values())) > room:
-            raise DamageError(
-                f"checkpoint {self.number} in {path} claims arrays of {size} bytes; its files can stand for {room} at "
-                "most",
-                path=path,
-            )
+        self._files: dict[str, dict[str, str]] = {}  # by array and file
+        for name, sha256 in known["files"].items():
+            array, _, inside = name.partition("/")
+            self._files.setdefault(array, {})[inside] = sha256
 
-    def arrays(self, names: Collection[str] | None = None, but: Collection[str] = ()) -> dict[str, np.ndarray]:
-        """Return those of these arrays that it has, or all of the caller's but some, verified and writable."""
-        return {
-            name: self._array(name)
-            for name in self._described
-            if name not in but and (name in names if names is not None else not name.startswith(INDEX))
-        }
-
-    def late(self, names: Collection[str]) -> dict[str, LateArray]:
-        """Return those of these arrays that it has; their files are verified, and stay open until they are read."""
-        return {name: self._late(name) for name in self._described if name in names}
-
-    def _late(self, name: str) -> LateArray:
-        content, held = self._described[name], dict[Path, LogFile]()
-        with self._naming(name), ExitStack() as opened:
-            for _, path, _ in ArrayFiles(self._path, name, content, self._files.read).verified():
-                held[path] = self._files.open_log(path)
-                opened.callback(held[path].close)
-            text = self._files.read(self._path / name / "zarr.json", LARGEST_DESCRIPTION)
-
-            def read(path: Path, limit: int) -> bytes:
-                return text if path.name == "zarr.json" else held[path].read_whole(limit)
-
-            late = LateArray(content.dtype, content.shape, lambda: self._array(name, read=read))
-            weakref.finalize(late, opened.pop_all().close)
-        return late
+    def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+        """Return those of these arrays that it has, or all of the caller's, verified and writable."""
+        room, found = self._room, {}
+        for name in self._files:
+            if name in names if names is not None else not name.startswith(INDEX):
+                folder = self._path / name
+                with _reading(f"array {name!r} of checkpoint {self.number} in {folder}", folder):
+                    content, size = self._verified(name, room)
+                    found[name] = _read_zarr(content)
+                room -= size
+        return found
 
     def damage(self, log: bytes = b"") -> Iterator[DamageError]:
         """Yield what is wrong with the caller's arrays, or, where a log's identity is given, with the index of that."""
-        for name in self._described:
+        for name in self._files:
             if name == index_name(log) if log else not name.startswith(INDEX):
                 try:
-                    self._array(name, thorough=True)
+                    self.arrays([name])
                 except DamageError as damage:
                     yield damage
 
-    def _array(
-        self, name: str, *, thorough: bool = False, read: Callable[[Path, int], bytes] | None = None
-    ) -> np.ndarray:
-        content = self._described[name]
-        with self._naming(name) as (what, folder):
-            array = ArrayFiles(self._path, name, content, read or self._files.read).read()
-        # Its files were verified; what they stand for is looked at where damage is looked for.
-        if thorough and array_digest(array) != content.sha256:
-            raise DamageError(f"{what} is not what was written: its sha256 differs", path=folder)
-        return array
+    def _verified(self, name: str, room: int) -> tuple[dict[str, bytes], int]:
+        """Return the files of an array, which are those that were written, and its bytes, at most `room`."""
+        content = {"zarr.json": self._verified_file(name, "zarr.json", LARGEST_DESCRIPTION)}
+        chunk, chunks, compressed = _claimed(content["zarr.json"])
+        if chunk * chunks > room:
+            raise ValueError(f"it claims {chunk * chunks} bytes; the checkpoint's files can stand for {room} more")
+        if chunks != len(own := self._files[name].keys() - content.keys()):
+            raise ValueError(f"it has {len(own)} files for {chunks} chunks")
+        for inside in own:
+            data = content[inside] = self._verified_file(name, inside, chunk + chunk // 64 + 1024)
+            if (declared_size(data) if compressed else len(data)) != chunk:
+                raise ValueError(f"{inside} does not stand for {chunk} bytes")
+        return content, chunk * chunks
 
-    @contextmanager
-    def _naming(self, name: str) -> Iterator[tuple[str, Path]]:
-        """Name the array in what is raised."""
-        folder = self._path / name
-        what = f"array {name!r} of checkpoint {self.number} in {folder}"
-        try:
-            yield what, folder
-        except Exception as error:
-            raise _unreadable(error, what, folder) from error
-
-
-def _read_attributes(header: Path, files: Files) -> dict[str, Any]:
-    """Return the attributes of a group; raise DamageError, ValueError where it is none, and OSError."""
-    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
-    attributes = group.get("attributes")
-    if not isinstance(attributes, dict) or (group.get("node_type"), group.get("zarr_format")) != ("group", 3):
-        raise ValueError("it describes no group of zarr's format 3")
-    return attributes
+    def _verified_file(self, name: str, inside: str, limit: int) -> bytes:
+        path = self._path / name / inside
+        data = self._read(path, limit)
+        if hashlib.sha256(data).hexdigest() != self._files[name].get(inside):
+            raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
+        return data
 
 
-def _unreadable(error: Exception, what: str, path: Path) -> StoreError:
-    if isinstance(error, DamageError):
-        return DamageError(f"{what} cannot be read: {error}", path=error.path)
-    other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
-    if other or isinstance(error, MemoryError):
-        return StoreError(f"{what} could not be read: {error}")
-    return DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path)
+def _claimed(description: bytes) -> tuple[int, int, bool]:
+    """Return the bytes of a chunk, the number of chunks, and whether they are compressed, as a zarr.json has it.
+
+    Raises ValueError, KeyError or TypeError for what is no array of numbers in known codecs.
+    """
+    known: Any = from_json(description.decode())
+    codecs = [codec["name"] for codec in known["codecs"]]
+    if known["data_type"] not in DTYPES or codecs not in CODECS or known.get("storage_transformers"):
+        raise ValueError(f"it has elements of {str(known['data_type'])[:80]} in the codecs {str(codecs)[:80]}")
+    dtype = DTYPES[known["data_type"]]
+    shape = require_shape(known["shape"], dtype)
+    chunk = require_shape(known["chunk_grid"]["configuration"]["chunk_shape"], dtype)
+    grid = [-(-length // step) for length, step in zip(shape, chunk, strict=True)]
+    return prod(chunk) * dtype.itemsize, prod(grid), len(codecs) > 1
 
 
-def _read_description(path: Path, files: Files) -> tuple[dict[str, Any], dict[str, ArrayContent]]:
-    header = path / "zarr.json"
+@contextmanager
+def _reading(what: str, path: Path) -> Iterator[None]:
+    """Raise whatever reading raises as DamageError, but where the system, and no file, is at fault."""
     try:
-        known = _read_attributes(header, files)
-        stored = known.pop("sha256", None)
-        sound = json_digest(known) == stored
+        yield
+    except VersionError:
+        raise
+    except DamageError as error:
+        raise DamageError(f"{what} cannot be read: {error}", path=error.path) from error
     except Exception as error:
-        raise _unreadable(error, f"a checkpoint in {header}", header) from error
-    # Before the version, which a flipped bit can make a newer one.
-    if not sound:
-        raise DamageError(
-            f"what {header} says of its checkpoint is not what was written: its sha256 differs", path=header
-        )
-    try:
-        described = read_content(known)
-        if known["format"] != GROUP_VERSION:
-            raise VersionError(
-                f"{path} is written in format {known['format']}; this release reads checkpoints of format "
-                f"{GROUP_VERSION}: open it with the release that wrote it; nothing was changed"
-            )
-        _require_described(known)
-    except ValueError as error:
-        raise _unreadable(error, f"a checkpoint in {header}", header) from error
-    return known | {"sha256": stored}, described
+        other = isinstance(error, OSError) and error.errno is not None and error.errno not in GONE
+        if other or isinstance(error, MemoryError):
+            raise StoreError(f"{what} could not be read: {error}") from error
+        raise DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path) from error
 
 
-def _require_described(known: Mapping[str, Any]) -> None:
-    """Raise ValueError where a group of a known format does not say whose it is."""
-    for name, kind in {"number": int, "last_sequence": int, "attributes": dict, "identity": dict}.items():
+def _described(header: Path, files: Files) -> dict[str, Any]:
+    """Return what a group says of itself, verified. Raises ValueError for another thing, VersionError and OSError."""
+    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
+    known: dict[str, Any] = dict(group["attributes"])
+    # Before the format, which a flipped bit can make another one.
+    if json_digest({name: value for name, value in known.items() if name != "sha256"}) != known.get("sha256"):
+        raise ValueError("it is not what was written: its sha256 differs")
+    kinds = {"format": int, "number": int, "last_sequence": int, "attributes": dict, "identity": dict, "files": dict}
+    for name, kind in kinds.items():
         if type(known.get(name)) is not kind:
             raise ValueError(f"its {name} is {str(known.get(name))[:80]!r}")
+        if name == "format" and known[name] != FORMAT_VERSION:
+            raise VersionError(other_format(header.parent, known[name]))
     if not (0 <= known["number"] <= LARGEST_NUMBER and 0 <= known["last_sequence"] <= LARGEST_NUMBER):
         raise ValueError(f"its number is {known['number']}, its last_sequence {known['last_sequence']}")
+    if strange := [name for name in known["files"] if not FILE.fullmatch(name)]:
+        raise ValueError(f"it names the file {strange[0][:80]!r}, which is no array's")
+    return known

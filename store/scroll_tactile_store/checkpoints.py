@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for
 from contextlib import suppress
@@ -60,16 +60,13 @@ class Checkpoints:
         self._submitted: Future[None] | None = None
         self._failure: Exception | None = None
 
-    def latest(self, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
-        """Return the newest checkpoint that verifies, None when there is none; only: the arrays to read, or all.
-
-        late: those that are read when they are needed.
-        """
+    def latest(self) -> Checkpoint | None:
+        """Return the newest checkpoint that verifies, None when there is none."""
         passed: set[int] = set()
         while left := [named for named in self._journal.current().checkpoints if named.number not in passed]:
             passed.add(left[0].number)
             try:
-                return self._load(left[0], only, late)
+                return self._load(left[0])
             except DamageError as damage:
                 if self._is_named(left[0]):
                     logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
@@ -89,12 +86,9 @@ class Checkpoints:
         """Whether it still counts: a writer replaces checkpoints and removes them."""
         return named in self._journal.current().checkpoints
 
-    def _load(
-        self, named: NamedCheckpoint, only: Collection[str] | None = None, late: Collection[str] = ()
-    ) -> Checkpoint:
+    def _load(self, named: NamedCheckpoint) -> Checkpoint:
         reader = self._verified(named)
-        arrays = reader.arrays(only, but=late)
-        return Checkpoint(named.number, named.last_sequence, reader.attributes, arrays, reader.late(late))
+        return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
     def _verified(self, named: NamedCheckpoint) -> CheckpointReader:
         path = checkpoint_path(self._folder, named.number)
@@ -119,12 +113,12 @@ class Checkpoints:
             self.remove_unnamed()
             return named.number
 
-    def draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int) -> CheckpointDraft:
+    def draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
         """Return what is to become a checkpoint, once all of it can be kept. Raises RecordError, StoreError."""
         # The rows of a batch may yet be rolled back.
         self._journal.refuse_in_batch("committing a checkpoint")
         first, last = self._journal.current().compacted, self._journal.last()
-        if isinstance(last_sequence, bool) or not isinstance(last_sequence, int) or not first <= last_sequence <= last:
+        if type(last_sequence) is not int or not first <= last_sequence <= last:
             # Recovery could not resume among the compacted rows, which have given up their arrays.
             raise RecordError(
                 f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
@@ -132,7 +126,7 @@ class Checkpoints:
             )
         if reserved := [name for name in arrays if name.startswith(INDEX)]:
             raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
-        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes), level)
+        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes))
 
     def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray | None) -> NamedCheckpoint:
         """Write a draft, with which rows are where in a log if that is known."""
@@ -155,18 +149,17 @@ class Checkpoints:
                 number = self._next(log_numbers(self._folder, unfinished=True))
                 path = log_path(self._folder, number)
                 header = to_json("identity", self._journal.identity).encode()
+                rows_without = ((ROW, data) for data in self._journal.payloads(draft.last_sequence))
                 try:
-                    identity = create_log(
-                        path, header, ((ROW, data) for data in self._journal.payloads(draft.last_sequence))
-                    )
+                    identity = create_log(path, header, rows_without)
                     drafts = [draft] if newest is None else [draft, newest]
                     places, rows = read_back(path, [each.last_sequence for each in drafts])
                     named = [
                         self._write(each, place, identity, rows.table(each.last_sequence))
                         for each, place in zip(drafts, places, strict=True)
                     ]
-                    for damage in (damage for one in named for damage in self._verified(one).damage()):
-                        raise damage
+                    for one in named:
+                        self._load(one)
                 except BaseException:
                     remove_tree(path)
                     raise

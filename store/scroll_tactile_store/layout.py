@@ -33,6 +33,7 @@ __all__ = [
     "log_numbers",
     "log_path",
     "numbers",
+    "other_format",
     "read_current",
     "remove_unnamed",
     "require_unshared",
@@ -40,7 +41,11 @@ __all__ = [
     "write_current",
 ]
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
+OLDER = {
+    1: ("0.15 or before", "0.15"),
+    2: ("0.16 to 0.18", "0.18"),
+}  # by which releases, and the last of them
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
@@ -126,16 +131,8 @@ class Current:
             known: dict[str, Any] = dict(from_json(data.decode("ascii")))
             if known.pop("sha256", None) != json_digest(known):
                 raise ValueError("its sha256 differs")
-            if _count(known["format"]) > FORMAT_VERSION:
-                raise VersionError(
-                    f"{path} is written in format {known['format']}; this release reads format {FORMAT_VERSION}: "
-                    "upgrade it, or open the store with the release that wrote it; nothing was changed"
-                )
-            if known["format"] < FORMAT_VERSION:
-                raise VersionError(
-                    f"{path} is written in format {known['format']}, by scroll-tactile 0.15 or before; this one reads "
-                    f"format {FORMAT_VERSION}: learn it again from the recordings, or open it with scroll-tactile 0.15"
-                )
+            if (version := _count(known["format"])) != FORMAT_VERSION:
+                raise VersionError(other_format(path, version))
             number, identity = known["log"]
             newest, compaction = (
                 None if known[name] is None else NamedCheckpoint.from_json(known[name])
@@ -147,6 +144,21 @@ class Current:
             return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, last)
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
+
+
+def other_format(path: Path, version: int) -> str:
+    """Return what is said of a file of another format."""
+    what = f"{path} is written in format {version}"
+    if version in OLDER:
+        releases, last = OLDER[version]
+        return (
+            f"{what}, by scroll-tactile {releases}; this one reads format {FORMAT_VERSION}: learn it again from the "
+            f"recordings, or open it with scroll-tactile {last}"
+        )
+    return (
+        f"{what}; this release reads format {FORMAT_VERSION}: upgrade it, or open the store with the release that "
+        "wrote it; nothing was changed"
+    )
 
 
 def _not_as_written(path: Path, error: Exception) -> DamageError:

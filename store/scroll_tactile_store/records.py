@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -21,7 +21,6 @@ __all__ = [
     "Attributes",
     "Checkpoint",
     "Head",
-    "LateArray",
     "Record",
     "check_key",
     "check_text",
@@ -68,39 +67,14 @@ class Record(Head):
     arrays: Mapping[str, np.ndarray]
 
 
-class LateArray:
-    """An array whose files were verified; they are read, verified again and decompressed when it is needed.
-
-    read: returns the array, or raises DamageError. check: is called with it, and raises what is wrong with its values.
-    """
-
-    def __init__(self, dtype: np.dtype, shape: tuple[int, ...], read: Callable[[], np.ndarray]) -> None:
-        self.dtype, self.shape, self._read = dtype, shape, read
-        self.check: Callable[[np.ndarray], None] | None = None
-
-    def __deepcopy__(self, memo: object) -> LateArray:
-        return self  # it never changes, and its files are open once
-
-    def read(self) -> np.ndarray:
-        """Return the array, the caller's own. Raises DamageError."""
-        array = self._read()
-        if self.check is not None:
-            self.check(array)
-        return array
-
-
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """Committed arrays: it contains the journal's rows up to and including sequence `last_sequence`.
-
-    late: those that are read when they are needed.
-    """
+    """Committed arrays: it contains the journal's rows up to and including sequence `last_sequence`."""
 
     number: int
     last_sequence: int
     attributes: Mapping[str, JSON]
     arrays: Mapping[str, np.ndarray]
-    late: Mapping[str, LateArray] = field(default_factory=dict)
 
 
 def check_text(what: str, text: str) -> str:

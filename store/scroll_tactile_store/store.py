@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import threading
 import time as clock
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Literal, Self, cast
 
 from scroll_tactile_store.archive import files_of
 from scroll_tactile_store.backup import back_up
-from scroll_tactile_store.checkpoint_files import QUICK, THOROUGH, CheckpointDraft
+from scroll_tactile_store.checkpoint_files import CheckpointDraft
 from scroll_tactile_store.checkpoints import Checkpoints
 from scroll_tactile_store.exceptions import (
     NotAStoreError,
@@ -205,17 +205,14 @@ class Store:
         self._check_open()
         return self._journal.with_key(check_key(key))
 
-    def latest(self, *, only: Collection[str] | None = None, late: Collection[str] = ()) -> Checkpoint | None:
+    def latest(self) -> Checkpoint | None:
         """Return the newest checkpoint that verifies, None when there is none.
 
-        only: names of the arrays to read and verify; the others are left out, and a name that it has not is passed
-        over. With none it is the checkpoint's attributes, in well below a millisecond. late: names of arrays of which
-        the files are verified and stay open; they are decompressed when they are needed, whatever happens to the store.
         A logged warning names the file and the array of each checkpoint that it passes over. Raises VersionError for a
         checkpoint of another format.
         """
         self._check_open()
-        return self._checkpoints.latest(only, late)
+        return self._checkpoints.latest()
 
     @property
     def newest(self) -> int | None:
@@ -279,15 +276,13 @@ class Store:
         the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`. What cannot be kept is
         refused at once, with RecordError.
         """
-        draft = self._draft(arrays, last_sequence, attributes, QUICK)
+        draft = self._draft(arrays, last_sequence, attributes)
         self._checkpoints.raise_failure()
         self._checkpoints.commit_later(draft)
 
-    def _draft(
-        self, arrays: Arrays, last_sequence: int, attributes: Attributes, level: int = THOROUGH
-    ) -> CheckpointDraft:
+    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
         self._check_open(write=True)
-        return self._checkpoints.draft(arrays, last_sequence, attributes, level)
+        return self._checkpoints.draft(arrays, last_sequence, attributes)
 
     def flush(self) -> None:
         """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile_store import backup, checkpoint_files, checkpoints, chunks, journal, layout, log, repair
+from scroll_tactile_store import backup, checkpoint_files, checkpoints, journal, layout, log, repair
 
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
@@ -64,7 +64,9 @@ def _sum_of_anything(data: bytes) -> Any:
     return SimpleNamespace(hexdigest=lambda: Same(hashlib.sha256(data).hexdigest()))
 
 
-BUGS["a chunk is not verified"] = [Replacement(chunks, "hashlib", lambda _: SimpleNamespace(sha256=_sum_of_anything))]
+BUGS["a chunk is not verified"] = [
+    Replacement(checkpoint_files, "hashlib", lambda _: SimpleNamespace(sha256=_sum_of_anything))
+]
 
 
 @bug("what a checkpoint says of itself is not verified", checkpoint_files, "json_digest")
@@ -85,10 +87,10 @@ def _other_log_not_noticed(_: Any, self: Any, at: Any) -> Any:
 
 
 @bug("an index of another log is believed", checkpoint_files.CheckpointReader, "arrays")
-def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None, but: Any = ()) -> Any:
-    found = arrays(self, names, but)
+def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None) -> Any:
+    found = arrays(self, names)
     if not found and names and next(iter(names)).startswith(checkpoint_files.INDEX):
-        own = [name for name in self._described if name.startswith(checkpoint_files.INDEX)]
+        own = [name for name in self._files if name.startswith(checkpoint_files.INDEX)]
         found = dict.fromkeys(names, *arrays(self, own).values()) if own else {}
     return found
 

@@ -15,7 +15,7 @@ from typing import Any
 import scroll_tactile_store.checkpoint_files
 import scroll_tactile_store.checkpoints
 import scroll_tactile_store.log_writer
-from quick_checkpoints import write_zarr
+from quick_checkpoints import read_zarr, write_zarr
 
 from faults import shim as watch
 from faults.disks import STYLES, Disk, Event, File, Folder, Style, events, rebuild
@@ -122,6 +122,7 @@ def prepare() -> None:
     """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
     scroll_tactile_store.log_writer.AHEAD = AHEAD
     scroll_tactile_store.checkpoint_files._write_zarr = partial(write_zarr, indent=None)  # numbers stand between commas
+    scroll_tactile_store.checkpoint_files._read_zarr = read_zarr
     scroll_tactile_store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
     scroll_tactile_store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
 

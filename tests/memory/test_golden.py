@@ -1,8 +1,8 @@
-"""A memory of format 2 opens in every later version: as a test this reads the golden one, as a script it makes it.
+"""A memory of format 3 opens in every later version: as a test this reads the golden one, as a script it makes it.
 
-`python tests/memory/test_golden.py` makes `tests/data/format-2.zip`, a memory that has all kinds of rows and
-checkpoints, and `tests/data/format-2.json`, what is in it. A release from 1.0 on never makes it again. Of
-`tests/data/format-1.zip`, which 0.15 made, the file is left that says so.
+`python tests/memory/test_golden.py` makes `tests/data/format-3.zip`, a memory that has all kinds of rows and
+checkpoints, and `tests/data/format-3.json`, what is in it. A release from 1.0 on never makes it again. Of
+`tests/data/format-1.zip`, which 0.15 made, and `format-2.zip`, of 0.18, the file is left that says so.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.validation.gate import check_memory
 
-GOLDEN = Path(__file__).parents[1] / "data" / "format-2.zip"
+GOLDEN = Path(__file__).parents[1] / "data" / "format-3.zip"
 EXPECTED = GOLDEN.with_suffix(".json")
 PAD = Sensor(name="pad", channels=2, rate=50.0, low=0.0, high=1.0, unit="N", duration=1.0)
 FORCE = Quantity(name="force", unit="N", low=0, high=4, resolution=0.125)
@@ -202,23 +202,24 @@ def test_it_is_what_this_version_writes(golden, tmp_path):
 
 def test_a_newer_format_is_refused_with_what_to_do(golden, monkeypatch):
     current = read_current(golden / "CURRENT")
-    monkeypatch.setattr(scroll_tactile_store.layout, "FORMAT_VERSION", 3)
+    monkeypatch.setattr(scroll_tactile_store.layout, "FORMAT_VERSION", 4)
     write_current(golden, current)
     monkeypatch.undo()
     before = {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()}
     for mode in ("write", "read"):
-        with pytest.raises(VersionError, match="is written in format 3; this release reads format 2: upgrade it"):
+        with pytest.raises(VersionError, match="is written in format 4; this release reads format 3: upgrade it"):
             opened(golden, mode)
     assert {file: file.read_bytes() for file in golden.rglob("*") if file.is_file()} == before
 
 
-@pytest.fixture(params=["0.15", "0.7"])
+@pytest.fixture(params=["0.18", "0.15", "0.7"])
 def old(request, tmp_path):
     """What two releases left, and what is said of it."""
     path = tmp_path / "m"
-    if request.param == "0.15":
-        shutil.unpack_archive(GOLDEN.with_name("format-1.zip"), path)
-        return path, r"in format 1, by scroll-tactile 0\.15 or before; this one reads format 2: learn it again from the"
+    if request.param != "0.7":
+        number, said = {"0.18": (2, r"0\.16 to 0\.18"), "0.15": (1, r"0\.15 or before")}[request.param]
+        shutil.unpack_archive(GOLDEN.with_name(f"format-{number}.zip"), path)
+        return path, rf"in format {number}, by scroll-tactile {said}; this one reads format 3: learn it again from the"
     (path / "generations" / "00000001").mkdir(parents=True)
     (path / "journal.sqlite").write_bytes(b"SQLite format 3\0" + bytes(4080))
     return path, "was made by a release 0.x, whose memories this one does not read: learn it again from the"

@@ -167,7 +167,7 @@ class TestDamage:
         monkeypatch.setattr("scroll_tactile_store.layout.FORMAT_VERSION", 9)
         file = packed(tmp_path, OBSERVED[:2])
         monkeypatch.undo()
-        require_refused(other, file, "format 9; this release reads format 2: upgrade it")
+        require_refused(other, file, "format 9; this release reads format 3: upgrade it")
 
     def test_a_full_disk_leaves_nothing_behind(self, tmp_path, monkeypatch):
         learner, _ = filled(tmp_path / "m", OBSERVED[:2])

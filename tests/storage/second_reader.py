@@ -1,4 +1,4 @@
-"""A second reader of the log, written from store/FORMAT.md alone: `python tests/storage/second_reader.py LOG`.
+"""A second reader of a store, written from store/FORMAT.md alone: `python tests/storage/second_reader.py LOG`.
 
 It reads a whole file into memory, imports nothing of the store, and prints the rows.
 """
@@ -8,8 +8,12 @@ import math
 import struct
 import sys
 from dataclasses import dataclass
-from hashlib import blake2b
+from hashlib import blake2b, sha256
 from pathlib import Path
+
+import numpy as np
+import zarr
+from numcodecs import zstd
 
 HEAD = struct.Struct("<8s8sQQII16s16s16s")
 ROW = struct.Struct("<QdQBBIII")
@@ -136,6 +140,31 @@ def rows(data):
     about, whole, damage = frames(data)
     payloads = (data[frame.offset + HEAD.size : frame.end] for frame in whole if frame.kind == ROW_KIND)
     return about, [row(payload) for payload in payloads], damage
+
+
+def arrays(payload):
+    """The arrays of a row, by name."""
+    at = 4 + int.from_bytes(payload[:4], "little")
+    found = {}
+    for name, (dtype, shape, stored) in json.loads(payload[4:at]).items():
+        data = payload[at : at + stored]
+        at += stored
+        if stored != math.prod(shape) * np.dtype(dtype).itemsize:
+            data = zstd.decompress(data)
+        found[name] = np.frombuffer(data, dtype).reshape(shape)
+    assert at == len(payload)
+    return found
+
+
+def checkpoint(folder):
+    """What a checkpoint says of itself, verified, and its arrays, by name."""
+    group = zarr.open_group(folder, mode="r")
+    known = dict(group.attrs)
+    right = known.pop("sha256")
+    text = json.dumps(known, sort_keys=True, separators=(",", ":"))
+    assert sha256(text.encode()).hexdigest() == right
+    assert all(sha256(Path(folder, file).read_bytes()).hexdigest() == one for file, one in known["files"].items())
+    return known, {name: np.asarray(array[...]) for name, array in group.arrays()}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A reader written from store/FORMAT.md alone finds the rows and the damage that the store's own finds."""
+"""A reader written from store/FORMAT.md alone finds the rows, checkpoints and damage that the store's own finds."""
 
 import json
 import subprocess
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import second_reader
 from logs import append, build
-from scroll_tactile_store import DamageError
-from scroll_tactile_store.encoding import decode_payload, encode_payload
+from scroll_tactile_store import DamageError, Store
+from scroll_tactile_store.encoding import encode_payload
 from scroll_tactile_store.log import LogReader
 from scroll_tactile_store.log_writer import LogWriter, create_log
 from scroll_tactile_store.records import payload_digest
@@ -75,7 +75,26 @@ def test_both_read_the_rows_to_the_byte(path):
     found, damage = theirs(path)
     assert [tuple(vars(row).values()) for row in found] == [plain(row) for row in rows] and damage is None
     assert second_reader.rows(path.read_bytes())[0] == b'{"identity":1}'
-    assert decode_payload(found[0].arrays)["codes"].tobytes() == ARRAYS["codes"].tobytes()
+    read = second_reader.arrays(found[0].arrays)
+    assert list(read) == list(ARRAYS)
+    for name, array in ARRAYS.items():
+        assert (read[name].dtype, read[name].shape, read[name].tobytes()) == (array.dtype, array.shape, array.tobytes())
+
+
+def test_both_read_a_checkpoint(tmp_path):
+    with Store.open(tmp_path / "s", identity={"of": "tests"}) as opened:
+        opened.append("a", "b", b"key", arrays=ARRAYS)
+        opened.commit(ARRAYS, last_sequence=1, attributes={"ü": [1, None]})
+        ours = opened.latest()
+        log = opened._journal.current().log_identity
+    known, found = second_reader.checkpoint(tmp_path / "s" / "checkpoints" / "00000001")
+    assert (known["format"], known["number"], known["last_sequence"]) == (3, 1, 1)
+    assert (known["attributes"], known["identity"]) == (ours.attributes, {"of": "tests"})
+    index = found.pop(f"log-{log.hex()}")
+    assert (index.dtype, index.shape, index[0].tolist()) == (np.uint64, (4, 1), [1])
+    assert index[3].tolist() == [int.from_bytes(b"key", "little")]
+    assert found.keys() == ours.arrays.keys()
+    assert all(found[name].tobytes() == array.tobytes() for name, array in ours.arrays.items())
 
 
 def test_both_find_the_same_damage(path, tmp_path):

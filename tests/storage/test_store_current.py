@@ -134,7 +134,7 @@ def refuses_the_format(path):
 
 @pytest.mark.parametrize("more", [{}, {"log": None, "more": [1]}])
 def test_a_newer_format_is_refused_and_not_touched(either, more):
-    set_current(either, format=3, **more)
+    set_current(either, format=4, **more)
     refuses_the_format(either)
     flip(either / "CURRENT", -20)  # and where that is not what was written, nothing is said of a format
     with pytest.raises(DamageError):

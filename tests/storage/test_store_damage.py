@@ -102,7 +102,7 @@ SPOIL = {
     ),
     "no group": (lambda folder: (folder / "zarr.json").unlink(), "zarr.json cannot be read"),
     "the group's format": (
-        lambda folder: rewrite(folder / "zarr.json", lambda data: data.replace(b'"format": 2', b'"format": 9')),
+        lambda folder: rewrite(folder / "zarr.json", lambda data: data.replace(b'"format": 3', b'"format": 9')),
         "its sha256 differs",
     ),
     "nothing left": (shutil.rmtree, "zarr.json cannot be read"),

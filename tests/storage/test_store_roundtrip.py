@@ -1,7 +1,6 @@
 """What goes into the store comes back with the same bytes; what could not is refused."""
 
 import json
-import shutil
 import string
 import subprocess
 import sys
@@ -14,9 +13,10 @@ from forging import describe_again
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scroll_tactile_store import Head, Record, RecordError, Store, VersionError, chunks
+from scroll_tactile_store import Head, Record, RecordError, Store, VersionError, checkpoint_files
+from scroll_tactile_store.archive import Files
 
-DTYPES = ["|b1", "|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8", "<U1", "<U7"]
+DTYPES = ["|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"]
 arrays = st.dictionaries(
     st.text(string.ascii_lowercase + "_0.", min_size=1, max_size=6).filter(
         lambda name: not name.startswith(("__", ".")) and not name.endswith(".")
@@ -85,12 +85,9 @@ SPECIAL = {
     "nan_payload": np.array([0x7FF8DEADBEEF0001, 0xFFF0000000000000], "<u8").view("<f8"),
     "scalar": np.array(7, "<i2"),
     "no_rows": np.empty((0, 4), "<f4"),
-    "no_letters": np.array(["", ""], "<U0"),
-    "words": np.array([["wool", ""], ["\U0001f9f6", "a\0b"]], "<U7"),
     "transposed": np.arange(6).reshape(2, 3).T,
     "strided": np.arange(20)[::3],
     "frozen": np.frombuffer(b"abcdefgh", "<i4"),
-    "truths": np.array([True, False]),
 }
 
 
@@ -102,14 +99,13 @@ def test_awkward_arrays_come_back_in_both_places(kept):
 
 
 def test_large_arrays_are_chunked_along_the_first_axis(kept, monkeypatch):
-    monkeypatch.setattr(chunks, "CHUNK_BYTES", 2**16)
+    monkeypatch.setattr(checkpoint_files, "CHUNK_BYTES", 2**16)
     rows = np.arange(3 * 11_000, dtype=np.float64).reshape(3, 11_000)
-    kept.commit({"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)}, last_sequence=kept.last)
-    assert same(kept.latest().arrays, {"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1)})
+    arrays = {"rows": rows, "flat": rows.reshape(-1), "one": rows.reshape(1, -1), "whole": rows.astype(np.int64)}
+    kept.commit(arrays, last_sequence=kept.last)
+    assert same(kept.latest().arrays, arrays)
     folder = kept.path / "checkpoints" / f"{kept.latest().number:08d}" / "rows" / "c"
     assert sorted(chunk.name for chunk in folder.iterdir()) == ["0", "1", "2"]
-    kept.commit({"rows": rows.astype(np.int64)}, last_sequence=kept.last)  # byte by byte: an axis more
-    assert same(kept.latest().arrays, {"rows": rows.astype(np.int64)})
 
 
 REFUSED = {
@@ -122,6 +118,8 @@ REFUSED = {
     "attribute of NumPy": {"attributes": {"a": np.int64(1)}},
     "attribute key": {"attributes": {"a": {1: 2}}},
     "objects": {"arrays": {"x": np.array([None, 1])}},
+    "text": {"arrays": {"x": np.array(["wool"])}},
+    "truths": {"arrays": {"x": np.array([True])}},
     "structured": {"arrays": {"x": np.zeros(2, [("a", "<i4")])}},
     "big-endian": {"arrays": {"x": np.zeros(2, ">i4")}},
     "masked": {"arrays": {"x": np.ma.masked_array([1, 2], [True, False])}},
@@ -182,44 +180,39 @@ def test_the_exception_tree_is_the_one_in_the_docstring():
     assert scroll_tactile_store.StoreError.__bases__ == (Exception,)
 
 
-def test_importing_is_light_and_a_checkpoint_is_read_without_zarr(tmp_path):
+def test_importing_is_light_and_rows_are_read_without_zarr(tmp_path):
     with Store.open(tmp_path, identity={}) as opened:
-        opened.commit({"x": np.arange(30), "y": np.array(["é"])}, last_sequence=0)
+        opened.append("a", "b", b"", arrays={"x": np.arange(300)})
+        opened.commit({"x": np.arange(30)}, last_sequence=0)
     code = (
         "import sys, scroll_tactile_store as store; print({'zarr', 'numcodecs', 'filelock'} & set(sys.modules))\n"
-        "with store.Store.open(sys.argv[1], mode='read') as opened: print(len(opened.latest().arrays))\n"
+        "with store.Store.open(sys.argv[1], mode='read') as opened: print(len(list(opened.records())))\n"
         "print({'zarr'} & set(sys.modules))"
     )
     command, where = [sys.executable, "-c", code, str(tmp_path)], Path(scroll_tactile_store.__file__).parents[1]
     found = subprocess.run(command, cwd=where, capture_output=True, text=True, check=True)
-    assert found.stdout.splitlines() == ["set()", "2", "set()"]
+    assert found.stdout.splitlines() == ["set()", "1", "set()"]
 
 
-def test_the_attributes_of_a_checkpoint_or_some_of_its_arrays_are_read_without_the_others(tmp_path, caplog):
-    arrays = {"a": np.arange(3), "b": np.arange(4.0), "c": np.array(["é"])}
+def test_some_arrays_of_a_checkpoint_are_read_without_the_others(tmp_path, caplog):
+    arrays = {"a": np.arange(3), "b": np.arange(4.0), "c": np.arange(2, dtype=np.int8)}
     with Store.open(tmp_path, identity={}) as opened:
-        assert opened.latest(only=()) is None
-        opened.commit(arrays, last_sequence=0, attributes={"made": "now"})
-        (tmp_path / "checkpoints" / "00000001" / "b" / "zarr.json").unlink()
-        found = opened.latest(only=["c", "none such", "a"])
-        assert same(found.arrays, {"a": arrays["a"], "c": arrays["c"]})
-        found = opened.latest(only=())
-        assert (found.number, found.last_sequence, found.attributes, found.arrays) == (1, 0, {"made": "now"}, {})
-        assert caplog.records == []
-        assert opened.latest(only=["b"]) is None
+        opened.commit(arrays, last_sequence=0)
+        folder = tmp_path / "checkpoints" / "00000001"
+        (folder / "b" / "zarr.json").unlink()
+        reader = checkpoint_files.CheckpointReader(folder, Files(tmp_path))
+        assert same(reader.arrays(["c", "none such", "a"]), {"a": arrays["a"], "c": arrays["c"]})
+        assert opened.latest() is None
         assert "array 'b' of checkpoint 1" in caplog.text
-        shutil.rmtree(tmp_path / "checkpoints" / "00000001")
-        assert opened.latest(only=()) is None
 
 
-@pytest.mark.parametrize("only", [None, (), ["x"]])
-@pytest.mark.parametrize("version", [1, 3])
-def test_a_checkpoint_of_another_format_is_refused_also_for_its_attributes(tmp_path, only, version):
+@pytest.mark.parametrize("version", [1, 2, 4])
+def test_a_checkpoint_of_another_format_is_refused(tmp_path, version):
     with Store.open(tmp_path, identity={}) as opened:
         opened.commit({"x": np.arange(3)}, last_sequence=0)
     describe_again(tmp_path, format=version)
     with (
         Store.open(tmp_path, mode="read") as opened,
-        pytest.raises(VersionError, match=rf"format {version}; "),
+        pytest.raises(VersionError, match=rf"format {version}[;,] "),
     ):
-        opened.latest(only=only)
+        opened.latest()

@@ -168,9 +168,8 @@ def checkpoint(change):
         attributes, arrays = map(dict, CHECKPOINTS[current])
         change(attributes, arrays)
         arrays = {name: one for name, one in arrays.items() if one is not None}
-        known = put_arrays(path, 1, {name: one for name, one in arrays.items() if one is not before.get(name)})
-        for name in before.keys() - arrays.keys():
-            del known["arrays"][name]
+        changed = {name: one for name, one in arrays.items() if one is not before.get(name)}
+        known = put_arrays(path, 1, changed, gone=before.keys() - arrays.keys())
         seal(path, 1, known | {"attributes": attributes})
 
     return put

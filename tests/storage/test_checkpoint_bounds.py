@@ -5,7 +5,6 @@ import pytest
 from forging import describe_again, refiled
 from numcodecs import zstd
 from scroll_tactile_store import DamageError, Store, check_store, checkpoint_files
-from scroll_tactile_store.archive import Files
 from scroll_tactile_store.checkpoint_files import CheckpointReader
 from store_builds import flip, newest, taking_at_most
 
@@ -35,7 +34,7 @@ def test_what_is_stored_is_verified_before_zarr_gets_it(path, monkeypatch):
 
     monkeypatch.setattr(checkpoint_files, "_read_zarr", reached)
     with pytest.raises(DamageError, match=r"array 'rows' of checkpoint 1 .*sha256 differs") as refused:
-        CheckpointReader(newest(path), Files(path)).arrays(["rows"])
+        CheckpointReader(newest(path)).arrays(["rows"])
     assert refused.value.path == newest(path) / "rows" / "c" / "0" / "0"
 
 

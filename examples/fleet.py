@@ -41,7 +41,7 @@ def main() -> None:
         folder = Path(name)
         record(folder)
         days = [folder / robot for robot in ROBOTS]
-        done = learn(folder / "memory", days, SourceOptions(by="folder"), sensor=sensors.BIOTAC, workers=2)
+        done = learn(days, folder / "memory", SourceOptions(by="folder"), sensor=sensors.BIOTAC, workers=2)
         print(f"{done.observations} touches from {done.sources} recordings, {done.repeated} came twice")
         print(f"the bytes of one process: {done.digest == of_one(list(ROBOTS))}")
         with TactileLearner.open(folder / "memory") as learner:

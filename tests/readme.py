@@ -58,7 +58,7 @@ def promised(words: list[str], folder: Path, output: str) -> bool:
         "predict": "oak with",
         "memory merge": "1 stream observed by both",
         "memory export": "2 materials, ",
-        "fleet": "touches from",
+        "fleet": "; the memory has ",
         "report": "written: page.html",
     }
     made = {"report": "page.html", "memory export": "chip/touch_memory.c"}

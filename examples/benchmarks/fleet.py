@@ -35,19 +35,19 @@ MERGED = (1, 16, 256, 1024)  # touches of a packed memory
 
 
 class DyingExecutor(Executor):
-    """Runs jobs here and now. ends: this share of them ends without an answer, before or after they ran."""
+    """Runs jobs here and now. ends: this share of them ends, before or after they ran; but no source ends a second."""
 
     def __init__(self, ends: float = 0.0, seed: int = 0) -> None:
-        self._ends, self._random = ends, random.Random(seed)
-        self._max_workers = 1 + self._random.randrange(4)
+        self._ends, self._random, self._ended = ends, random.Random(seed), set[str]()
 
     def submit(self, what: Any, /, *words: Any, **named: Any) -> Future[Any]:
         """As any Executor's."""
         future: Future[Any] = Future()
-        ends = self._random.random() < self._ends
+        ends = self._random.random() < self._ends and self._ended.isdisjoint(words[0].sources)
         try:
             made = None if ends and self._random.random() < 0.5 else what(*words, **named)
             if ends:
+                self._ended |= set(words[0].sources)
                 raise BrokenProcessPool("a worker died")
             future.set_result(made)
         except Exception as error:
@@ -90,17 +90,24 @@ def _speed(folder: Path, paths: list[str], note: Any) -> dict[str, Any]:
     found: dict[str, Any] = {"plain": plain | {"touch": plain["seconds"] / len(paths)}}
     for workers in (1, 2):
         note(f"{workers} workers")
-        done = learn(folder / f"by {workers}", paths, BY_FOLDER, sensor=sensors.BIOTAC, workers=workers)
+        before = _processor()
+        done = learn(paths, folder / f"by {workers}", BY_FOLDER, sensor=sensors.BIOTAC, workers=workers)
+        own, others = (after - processor for after, processor in zip(_processor(), before, strict=True))
         found[f"workers_{workers}"] = {
             "seconds": done.seconds,
             "touch": done.seconds / len(paths),
             "ratio": plain["seconds"] / done.seconds,
-            "merge_seconds": done.merging,
-            "merge_share": done.merging / done.seconds,
             "equal": done.digest == digest,
-            **{f"{name}_processor": value for name, value in done.processor.items()},
+            "processor": own,
+            "workers_processor": others,
         }
     return found
+
+
+def _processor() -> tuple[float, float]:
+    """Seconds of this process, and of those that it began and that have ended."""
+    spent = os.times()
+    return spent.user + spent.system, spent.children_user + spent.children_system
 
 
 def _merges(folder: Path, paths: list[str], note: Any) -> list[dict[str, Any]]:
@@ -142,7 +149,7 @@ def _equal_runs(folder: Path, runs: int, note: Any) -> int:
             path.parent.mkdir(parents=True, exist_ok=True)
             np.save(path, _noise(touch))
         dying = DyingExecutor(draw.choice([0.0, 0.2, 0.4]), seed)
-        done = learn(place / "m", [place / "in"], BY_FOLDER, client=dying, **SMALL)
+        done = learn([place / "in"], place / "m", BY_FOLDER, executor=dying, **SMALL)
         truth = TactileLearner(**SMALL)
         for material, touch in sorted(set(touches)):
             truth.observe(material, _noise(touch))
@@ -189,7 +196,9 @@ def fleet(
         result = run_fleet(touches, runs, flips, seed, note=lambda what: progress(what, 0, 1))
     ways = [{"way": name, **result[name]} for name in ("plain", "workers_1", "workers_2")]
     columns = {"way": "{./way}", "s a touch": "{./touch|.4f}", "times as fast": "{?./ratio|.2f}"}
-    show("learning", columns | {"merging": "{?./merge_share|%}"}, ways)
+    show(
+        "learning", columns | {"processor, s": "{./processor|.1f}", "of workers, s": "{?./workers_processor|.1f}"}, ways
+    )
     columns = {"touches": "{./touches}", "bytes": "{./bytes}", "merged in, s": "{./seconds|.3f}"}
     show("merging", columns, result["merges"])
     columns = {"equal runs": "{./equal_runs} of {./runs}", "refused or sound flips": "{./sound_flips|sum} of {./flips}"}

@@ -65,8 +65,7 @@ class MergePlan:
     stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
     rows that are not appended: shared streams, and refused ones. refused: touches that have another name already, each
     with the reason. descriptions: material → the description that is taken over. quantities: that ours lacks.
-    default_source: see `MergeRules`. newest: the newest checkpoint of a packed memory, whose sums may be added in place
-    of its rows.
+    default_source: see `MergeRules`. newest: its newest checkpoint, whose sums may be added in place of its rows.
     """
 
     source: MemoryStore
@@ -120,9 +119,8 @@ class MergePlan:
         for sequence in known.values():
             if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
                 ours.record(sequence)
-        summed = newest if theirs.is_packed else None
         source = rules.default_source
-        return cls(theirs, found, rows, len(known), left_out, refused, described, quantities, source, summed)
+        return cls(theirs, found, rows, len(known), left_out, refused, described, quantities, source, newest)
 
     def append_to(self, ours: Store, memory: Memory, progress: Callable[[int, int], object]) -> int:
         """Append the rows to our journal and add them to our memory; returns the number of observations added.

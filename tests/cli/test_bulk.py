@@ -58,8 +58,16 @@ class TestLearn:
         assert result.exit_code == 0, result.output
         assert "learned: 6 touches of 2 materials from 6 files; the memory has 6 now" in result.stdout
         found = json.loads(run("learn", tmp_path / "new", data, "--label-by", "folder", "--json").stdout)
-        expected = {"files": 6, "touches": 0, "learned": {}, "skipped": 6, "refused": [], "observations": 6}
-        assert found == expected
+        expected = {
+            "files": 6,
+            "touches": 0,
+            "learned": {},
+            "skipped": 6,
+            "refused": [],
+            "observations": 6,
+            "deaths": 0,
+        }
+        assert found == {**expected, "seconds": found["seconds"], "digest": result.stdout.split()[-1]}
         assert "skipped: 6 touches" in run("learn", tmp_path / "new", data, "--label-by", "folder").stdout
 
     def test_some_refused_is_exit_code_1_and_the_rest_is_learned(

@@ -5,13 +5,16 @@ import re
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import refused, run
+from scroll_tactile_store import StoreError
 
 from scroll_tactile import Kernels, TactileLearner, __version__, native, sensors
+from scroll_tactile.errors import InputError
 from scroll_tactile.simulation.scene import Scene
 
 SCENE = Scene(sensors.ROBOSKIN)
@@ -155,7 +158,7 @@ class TestDemo:
             assert said in refused("demo", "--memory", tmp_path / "m", *words)
             assert not (tmp_path / "m").exists()
         (tmp_path / "file").write_text("")
-        assert "is a file" in refused("demo", "--memory", tmp_path / "file")
+        assert "Not a directory" in refused("demo", "--memory", tmp_path / "file")
 
     def test_the_plug_is_pulled_and_it_goes_on(self, tmp_path: Path) -> None:
         kept = tmp_path / "kept"
@@ -164,7 +167,7 @@ class TestDemo:
         try:
             until = time.monotonic() + 60
             while not _finished(kept) and process.poll() is None and time.monotonic() < until:
-                time.sleep(0.005)
+                time.sleep(0.02)
         finally:
             process.kill()
             process.wait()
@@ -179,8 +182,10 @@ class TestDemo:
 
 
 def _finished(kept: Path) -> list[str]:
-    file = kept / "demo.json"
-    return list(json.loads(file.read_text())["notes"]) if file.exists() else []
+    """The materials that the demonstration learned some touches of."""
+    with suppress(StoreError, InputError), TactileLearner.open(kept / "memory", mode="read") as learner:
+        return list(learner.materials)
+    return []
 
 
 def test_the_version_is_shown() -> None:

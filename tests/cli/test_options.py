@@ -48,7 +48,7 @@ BIOTAC = ("--preset", "biotac", "--columns", "25:44")
         (("learn", "new", "rec", *BIOTAC, "--label-by", "file", "--label", "a"), "one of --label, --label-by and"),
         (("learn", "new", "rec", *BIOTAC, "--cut", "intervals"), "--cut 'intervals' takes --labels, a table"),
         (("learn", "new", "rec", *BIOTAC, "--labels", "t.csv", "--label-topic", "x"), "give --labels or --label-topic"),
-        (("fleet", "new", "rec", "--label-by", "folder"), "a new memory takes a sensor, --sensor:"),
+        (("fleet", "new", "rec", "--label-by", "folder"), "say which sensor it is for: --sensor or --preset"),
         (("predict", "new", "touch.npy"), "scroll-tactile observe or learn makes one"),
         (("live", "new", "touch.npy"), "scroll-tactile observe or learn makes one"),
         (("inspect", "new"), "scroll-tactile observe or learn makes one"),

@@ -63,8 +63,8 @@ def learn_files(path: Path, state: State, touches: Pairs) -> int:
             np.save(files[-1], stream(touch).astype(np.float32))
         destination = Path(home, "m")
         path.rename(destination)  # with what the run keeps beside it
-        made = {"embedding": KIT.embeddings[state.embedding], "client": Here(), "add": True}
-        done = learn(destination, files, SourceOptions(by="folder"), **made)
+        made = {"embedding": KIT.embeddings[state.embedding], "executor": Here()}
+        done = learn(files, destination, SourceOptions(by="folder"), **made)
         assert not done.refused, done.refused
         destination.rename(path)
         return done.observations

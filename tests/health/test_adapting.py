@@ -419,7 +419,7 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
         assert (learner.memory.sequence, correction(learner)) == (rows, None)
         done = learner.adapt(dict(pairs))
     with pytest.raises(errors.InputError, match=f"row {done.sequence}, of which"):
-        learn(path, [str(tmp_path)])
+        learn([str(tmp_path)], path)
     with TactileLearner.open(path, mode="read") as learner:
         with pytest.raises(ReadOnlyError):
             learner.adapt(five(lambda stream: stream.readings))  # though it would be left as it is

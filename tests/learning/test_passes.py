@@ -1,4 +1,4 @@
-"""Metrics, passes, notes of runs and the demonstration, on simulated touches."""
+"""Metrics, passes and the demonstration, on simulated touches."""
 
 import math
 from pathlib import Path
@@ -14,7 +14,6 @@ from scroll_tactile.clients.learning.metrics import (
     mean_and_spread,
     observe_all,
 )
-from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.errors import InputError
 from scroll_tactile.simulation.scene import Scene
 
@@ -54,38 +53,6 @@ def test_the_touches_that_a_memory_does_not_hold_are_observed_and_one_of_somethi
         observe_all(learner, TOUCHES[:3])
 
 
-class TestRunFile:
-    def test_notes_come_back(self, tmp_path: Path) -> None:
-        RunFile(tmp_path / "run" / "notes.json", {"seed": 0}).note("a", [1, 2])
-        again = RunFile(tmp_path / "run" / "notes.json", {"seed": 0})
-        assert again.notes == {"a": [1, 2]}
-
-    def test_a_link_in_the_place_of_the_draft_is_not_followed(self, tmp_path):
-        record, others = tmp_path / "run" / "notes.json", tmp_path / "others"
-        others.write_text("theirs")
-        RunFile(record, {"seed": 0})
-        record.with_name("notes.json.new").symlink_to(others)
-        RunFile(record, {"seed": 0}).note("a", 1)
-        assert others.read_text() == "theirs" and RunFile(record, {"seed": 0}).notes["a"] == 1
-
-    def test_another_run_is_refused_by_what_differs(self, tmp_path):
-        RunFile(tmp_path / "notes.json", {"seed": 0, "kind": "x"})
-        with pytest.raises(InputError, match="seed 0 there, 1 here"):
-            RunFile(tmp_path / "notes.json", {"seed": 1, "kind": "x"})
-
-    def test_other_things_in_the_folder_are_left_alone(self, tmp_path: Path) -> None:
-        (tmp_path / "thesis.txt").write_text("mine")
-        with pytest.raises(InputError, match="empty folder"):
-            RunFile(tmp_path / "notes.json", {})
-        assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
-
-    @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 9, "plan": {}, "notes": {}}', "\x00"])
-    def test_damaged_notes_are_refused(self, tmp_path, text):
-        (tmp_path / "notes.json").write_text(text)
-        with pytest.raises(InputError, match="notes"):
-            RunFile(tmp_path / "notes.json", {})
-
-
 SMALL = {"materials": 4, "touches": 3, "held_out": 2, "features": 64}
 
 
@@ -108,6 +75,11 @@ class TestDemo:
         assert resumed.answers == whole.answers
         again = task.run()
         assert (again.observed, again.digest, again.answers, again.half) == (0, whole.digest, whole.answers, whole.half)
+
+    def test_a_folder_of_another_demonstration_is_refused(self, tmp_path: Path) -> None:
+        Demo(sensors.BIOTAC, **SMALL, folder=tmp_path).run()
+        with pytest.raises(InputError, match="none of this demonstration"):
+            Demo(sensors.BIOTAC, 1, **SMALL, folder=tmp_path).run()
 
     def test_what_is_new_is_shown(self) -> None:
         outcome = Demo(sensors.BIOTAC, materials=8, touches=5, held_out=2, features=64).run()

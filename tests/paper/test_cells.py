@@ -10,6 +10,7 @@ from paper_touches import recorded, untimed
 from examples.paper.readers.labelled import thinned
 from examples.paper.runs.cells import Cell, pooled, run_cells, split, time_left
 from examples.paper.runs.results import show, write_result
+from examples.paper.runs.runfile import RunFile
 from examples.paper.studies.table1 import PAPER, Table1, rows
 from scroll_tactile.errors import InputError
 
@@ -161,3 +162,35 @@ def test_a_table_on_screen_shows_what_its_rows_have(capsys):
     show("[title]", columns, [{"name": "[bold]ours", "right": {"mean": 0.5, "sd": 0.25}}, {"name": "other"}])
     shown = capsys.readouterr().out
     assert "[title]" in shown and "[bold]ours" in shown and "50.0 ± 25.0" in shown
+
+
+class TestRunFile:
+    def test_notes_come_back(self, tmp_path):
+        RunFile(tmp_path / "run" / "notes.json", {"seed": 0}).note("a", [1, 2])
+        again = RunFile(tmp_path / "run" / "notes.json", {"seed": 0})
+        assert again.notes == {"a": [1, 2]}
+
+    def test_a_link_in_the_place_of_the_draft_is_not_followed(self, tmp_path):
+        record, others = tmp_path / "run" / "notes.json", tmp_path / "others"
+        others.write_text("theirs")
+        RunFile(record, {"seed": 0})
+        record.with_name("notes.json.new").symlink_to(others)
+        RunFile(record, {"seed": 0}).note("a", 1)
+        assert others.read_text() == "theirs" and RunFile(record, {"seed": 0}).notes["a"] == 1
+
+    def test_another_run_is_refused_by_what_differs(self, tmp_path):
+        RunFile(tmp_path / "notes.json", {"seed": 0, "kind": "x"})
+        with pytest.raises(InputError, match="seed 0 there, 1 here"):
+            RunFile(tmp_path / "notes.json", {"seed": 1, "kind": "x"})
+
+    def test_other_things_in_the_folder_are_left_alone(self, tmp_path):
+        (tmp_path / "thesis.txt").write_text("mine")
+        with pytest.raises(InputError, match="empty folder"):
+            RunFile(tmp_path / "notes.json", {})
+        assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
+
+    @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 9, "plan": {}, "notes": {}}', "\x00"])
+    def test_damaged_notes_are_refused(self, tmp_path, text):
+        (tmp_path / "notes.json").write_text(text)
+        with pytest.raises(InputError, match="notes"):
+            RunFile(tmp_path / "notes.json", {})

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from examples.paper.readers.labelled import Recordings
+from examples.paper.runs.runfile import RunFile
 from scroll_tactile.clients.learning.metrics import Labelled, mean_and_spread
-from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.errors import InputError
 from scroll_tactile.finetune.fine_tune import Progress
 from scroll_tactile.learner import TactileLearner

@@ -16,11 +16,11 @@ from typer.core import TyperGroup
 from examples.paper.runs.options import Data, Quick, Weights
 from examples.paper.runs.pictures import available
 from examples.paper.runs.results import show
+from examples.paper.runs.runfile import RunFile
 from examples.paper.runs.study import weights_digest
 from examples.tables import duration, seconds_of
 from scroll_tactile.clients.cli import INTERRUPTED
 from scroll_tactile.clients.cli.terminal import say
-from scroll_tactile.clients.learning.runfile import RunFile
 from scroll_tactile.errors import InputError
 
 __all__ = ["everything"]

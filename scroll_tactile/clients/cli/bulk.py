@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +25,7 @@ from scroll_tactile.clients.cli.terminal import (
     Sources,
     confusion_text,
     counted,
+    no_memory,
     opened,
     opened_for_upkeep,
     percent,
@@ -38,13 +39,12 @@ from scroll_tactile.clients.cli.terminal import (
     verdict,
     with_options,
 )
-from scroll_tactile.errors import InputError, ScrollTactileError
+from scroll_tactile.errors import InputError
 from scroll_tactile.libraries import optional
 
 if TYPE_CHECKING:
     from scroll_tactile.clients.learning.demo import Demo, Outcome, Unplugged
-    from scroll_tactile.clients.learning.fleet import FleetReport
-    from scroll_tactile.clients.learning.learning import Evaluation, Learned
+    from scroll_tactile.clients.learning.learning import Evaluation
     from scroll_tactile.clients.learning.sources import Refused
 
 __all__ = ["demo", "evaluate", "fleet", "learn", "report"]
@@ -60,62 +60,20 @@ def learn(
 ) -> None:
     """Learn all touches in files and folders. Interrupt it, type it again, and it goes on: each touch counts once.
 
-    Episodes name themselves where a recording says what they are. The exit code is 1 where something was refused.
+    Episodes name themselves where a recording says what they are. Memories are merged. The exit code is 1 where
+    something was refused.
     """
-    from scroll_tactile.clients.learning.learning import learn_sources
-    from scroll_tactile.clients.learning.sources import find_sources, has_touches
-    from scroll_tactile.learner import TactileLearner
-
-    found, missing = find_sources(sources)
-    options = how.of(found)
-    chosen = sensor_for(memory, sensor, how.preset)
-    with progress_bar() as progress:
-        # What is refused makes no memory.
-        if chosen is None or memory.exists() or has_touches(chosen, found, options):
-            opening: AbstractContextManager[TactileLearner] = opened(memory, sensor=chosen, new=True)
-        else:
-            opening = nullcontext(TactileLearner(sensor=chosen))
-        with opening as learner:
-            done = learn_sources(learner, found, options, progress)
-            with suppress(ScrollTactileError):  # the touches are learned: who opens the memory is told
-                learner.settle()
-            held = sum(learner.materials.values())
-    done.refused[:0] = missing
-    _report_learned(done, held, as_json)
-    if done.refused:
-        raise typer.Exit(1)
-
-
-def _report_learned(done: Learned, held: int, as_json: bool) -> None:
-    count = done.learned.total()
-    if as_json:
-        learned = {"files": done.files, "touches": count, "learned": dict(sorted(done.learned.items()))}
-        left = {"skipped": done.skipped, "refused": _refusals(done.refused)}
-        say_json({**learned, **left, "observations": held})
-        return
-    of = f" of {counted(len(done.learned), 'material')}" if count else ""
-    say(
-        f"[bold]learned:[/] {counted(count, 'touch')}{of} from {counted(done.files, 'file')}; the memory has {held} "
-        "now",
-        *(f"  {touches:>6}  {shown(name)}" for name, touches in sorted(done.learned.items())),
-    )
-    if done.skipped:
-        say(f"[bold]skipped:[/] {counted(done.skipped, 'touch')} that it had already")
-    say_refused(done.refused)
+    _learn(memory, sources, sensor, how, as_json, workers=1)
 
 
 @with_options
 def fleet(
-    destination: MemoryFolder,
+    memory: MemoryFolder,
     sources: Sources,
     *,
     workers: Annotated[int | None, Option(min=1, help="Processes; as many as there are cores.")] = None,
     scheduler: Annotated[
         str | None, Option(help="A Dask scheduler, such as tcp://host:8786, in place of processes.")
-    ] = None,
-    add: Annotated[bool, Option("--add", help="Add to a memory that was made in another way.")] = False,
-    patience: Annotated[
-        float | None, Option(min=1, help="Seconds for a job; then its worker is given up, and another begins it.")
     ] = None,
     sensor: SensorName = None,
     how: Annotating,
@@ -126,26 +84,13 @@ def fleet(
     The memory is, to the byte, that of one process which observed each touch once. Interrupt it, type it again, and it
     goes on. The exit code is 1 where something was refused.
     """
-    from scroll_tactile.clients.learning.fleet import learn
-
     if workers is not None and scheduler is not None:
         raise InputError("give --workers or --scheduler: a scheduler has workers of its own")
-    options, chosen = how.of(sources), sensor_for(destination, sensor, how.preset)
-    with nullcontext() if scheduler is None else _connected(scheduler) as client, progress_bar() as progress:
-        done = learn(
-            destination,
-            sources,
-            options,
-            sensor=chosen,
-            add=add,
-            workers=workers,
-            client=client,
-            patience=patience,
-            progress=progress,
-        )
-    _report_fleet(done, as_json)
-    if done.refused:
-        raise typer.Exit(1)
+    with nullcontext() if scheduler is None else _connected(scheduler) as client:
+        if client is not None:
+            workers = sum(client.ncores().values()) or None
+        executor = None if client is None else client.get_executor()
+        _learn(memory, sources, sensor, how, as_json, workers=workers, executor=executor)
 
 
 def _connected(scheduler: str) -> Any:
@@ -158,22 +103,40 @@ def _connected(scheduler: str) -> Any:
         raise InputError(f"no scheduler answers at {scheduler}: {type(error).__name__}: {error!s:.200}") from error
 
 
-def _report_fleet(done: FleetReport, as_json: bool) -> None:
+def _learn(
+    memory: Path, sources: Sequence[str], sensor: str | None, how: Annotating, as_json: bool, **workers: Any
+) -> None:
+    """Learn, and say what became of it. workers: who learns, as of `learn` in Python."""
+    from scroll_tactile.clients.learning.fleet import learn
+    from scroll_tactile.clients.learning.sources import find_sources
+
+    found, missing = find_sources(sources)
+    options, chosen = how.of(found), sensor_for(memory, sensor, how.preset)
+    if chosen is None and not memory.exists():
+        raise no_memory(memory, new=True)
+    with progress_bar() as progress:
+        done = learn(found, memory, options, sensor=chosen, progress=progress, **workers)
+    done.refused[:0] = missing
     if as_json:
-        names = ("sources", "observations", "repeated", "refused", "deaths", "seconds", "held", "digest")
-        say_json({name: getattr(done, name) for name in names} | {"refused": _refusals(done.refused)})
-        return
-    rate = done.observations / done.seconds if done.seconds else 0.0
-    say(
-        f"[bold]learned:[/] {counted(done.observations, 'touch')} from {counted(done.sources, 'source')} in "
-        f"{done.seconds:.1f} s, {rate:.0f} a second; the memory has {done.held} now"
-    )
-    if done.repeated:
-        say(f"[bold]skipped:[/] {counted(done.repeated, 'touch')} that came before")
-    if done.deaths:
-        say(f"[bold]begun again:[/] {counted(done.deaths, 'job')} whose worker ended")
-    say_refused(done.refused)
-    say(f"[bold]digest:[/] {done.digest}")
+        learned = {"files": done.sources, "touches": done.observations, "learned": dict(sorted(done.learned.items()))}
+        left = {"skipped": done.repeated, "refused": _refusals(done.refused), "deaths": done.deaths}
+        say_json({**learned, **left, "observations": done.held, "seconds": done.seconds, "digest": done.digest})
+    else:
+        of = f" of {counted(len(done.learned), 'material')}" if done.learned else ""
+        say(
+            f"[bold]learned:[/] {counted(done.observations, 'touch')}{of} from {counted(done.sources, 'file')}; the "
+            f"memory has {done.held} now",
+            *(f"  {touches:>6}  {shown(name)}" for name, touches in sorted(done.learned.items())),
+        )
+        if done.repeated:
+            say(f"[bold]skipped:[/] {counted(done.repeated, 'touch')} that it had already")
+        if done.deaths:
+            say(f"[bold]begun again:[/] {counted(done.deaths, 'share')} whose worker ended")
+        say_refused(done.refused)
+        if done.digest:
+            say(f"[bold]digest:[/] {done.digest}")
+    if done.refused:
+        raise typer.Exit(1)
 
 
 @with_options

@@ -335,10 +335,10 @@ def opened(path: Path, *, sensor: Sensor | None = None, mode: Mode = "write", ne
     except (InputError, NotAStoreError) as error:
         if path.is_file() or sensor is not None or (mode == "read" and path.exists()):
             raise
-        raise _no_memory(path, new=new) from error
+        raise no_memory(path, new=new) from error
 
 
-def _no_memory(path: Path, *, new: bool = False) -> InputError:
+def no_memory(path: Path, *, new: bool = False) -> InputError:
     """The error of a command whose memory is not there, with how this or another command makes one."""
     how = "to make one, say which sensor it is for: --sensor or --preset"
     return InputError(f"there is no memory in {path}; {how if new else 'scroll-tactile observe or learn makes one'}")
@@ -350,7 +350,7 @@ def opened_for_upkeep(path: Path, *, mode: Mode = "write") -> TactileLearner:
     from scroll_tactile.memory.identity import absent_embedding
 
     if not path.exists():
-        raise _no_memory(path)
+        raise no_memory(path)
     return TactileLearner.open(path, embedding=absent_embedding(path), mode=mode)
 
 

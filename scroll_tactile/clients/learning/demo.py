@@ -11,15 +11,15 @@ import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from scroll_tactile import Kernels
 from scroll_tactile.clients.learning.metrics import Answers, Labelled, evaluate, observe_all
-from scroll_tactile.clients.learning.runfile import RunFile
+from scroll_tactile.errors import InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.stream import Stream
@@ -99,25 +99,26 @@ class Demo:
 
         Raises InputError for a folder of something else, and what the learner and the store raise.
         """
-        plan: dict[str, Any] = {"run": "demo", "sensor": self.sensor.model_dump(mode="json"), "seed": self.seed}
-        plan |= {name: getattr(self, name) for name in ("materials", "touches", "held_out", "features")}
-        notes = RunFile(None if self.folder is None else self.folder / "demo.json", plan)
-        how: dict[str, Any] = {"sensor": self.sensor, "embedding": Kernels(dimension=self.features)}
-        made = TactileLearner(**how) if self.folder is None else TactileLearner.open(self.folder / "memory", **how)
-        with made as learner:
-            return self._learn(learner, notes, report)
+        with self._learner(self.folder) as learner:
+            return self._learn(learner, report)
 
-    def _learn(self, learner: TactileLearner, notes: RunFile, report: Callable[[str], object]) -> Outcome:
+    def _learner(self, folder: Path | None) -> TactileLearner:
+        how: dict[str, Any] = {"sensor": self.sensor, "embedding": Kernels(dimension=self.features)}
+        return TactileLearner(**how) if folder is None else TactileLearner.open(folder / "memory", **how)
+
+    def _learn(self, learner: TactileLearner, report: Callable[[str], object]) -> Outcome:
         names = self.scene.materials[: self.materials]
         middle = max(1, len(names) // 2)
-        observed, train = 0, list[Labelled]()
+        train = {name: self._touches(name, 0, self.touches) for name in names}
+        there = sum(name in learner.names_of(stream) for touches in train.values() for name, stream in touches)
+        if self.folder is not None and there < sum(learner.materials.values()):
+            raise InputError(f"{self.folder} has touches that are none of this demonstration: take another folder")
         for place, name in enumerate(names):
-            if place == middle and "half" not in notes.notes:
-                notes.note("half", asdict(self._half(learner, names[:middle], names[middle:])))
-            train += self._touches(name, 0, self.touches)
-            if name not in notes.notes:
-                observed += observe_all(learner, train)
-                notes.note(name, self.touches)
+            if place == middle:
+                half = self._half(learner, names[:middle], names[middle:], train)
+            for _, stream in train[name]:
+                if name not in learner.names_of(stream):
+                    learner.observe(name, stream)
             report(name)
         answers = evaluate(learner, self._held_out(names))
         short = evaluate(
@@ -125,15 +126,25 @@ class Demo:
         )
         first = middle * self.held_out
         return Outcome(
-            half=Half(**notes.notes["half"]),
+            half=half,
             answers=answers,
             first=first,
             short=short,
-            observed=observed,
+            observed=sum(learner.materials.values()) - there,
             digest=learner.digest(),
         )
 
-    def _half(self, learner: TactileLearner, learned: Sequence[str], others: Sequence[str]) -> Half:
+    def _half(
+        self,
+        learner: TactileLearner,
+        learned: Sequence[str],
+        others: Sequence[str],
+        train: Mapping[str, Sequence[Labelled]],
+    ) -> Half:
+        """The answers of a learner that has learned this half alone; it is made again where a resumed one has more."""
+        if not learner.materials.keys().isdisjoint(others):
+            learner = self._learner(None)
+            observe_all(learner, [touch for name in learned for touch in train[name]])
         answers = evaluate(learner, self._held_out(others))
         unknown = sum(answer.known is False for answer in answers.predictions)
         first = answers.predictions[0]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,10 +16,10 @@ from scroll_tactile.clients.learning.sources import Refused, SourceOptions, Sour
 from scroll_tactile.errors import EmbeddingError, InputError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.persistence.contents import refusal
-from scroll_tactile.results import Estimate, Prediction, Receipt
+from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.ranges import all_clipped, range_problem
 
-__all__ = ["Answered", "Evaluation", "Learned", "answers", "evaluate_sources", "learn_sources"]
+__all__ = ["Answered", "Evaluation", "Learned", "Progress", "answers", "evaluate_sources", "learn_sources"]
 
 BATCH_TOUCHES = 256  # become durable together: what a kill can cost …
 BATCH_BYTES = 1 << 25  # … unless their readings would be more than this, or the first was read so long ago:
@@ -30,22 +30,33 @@ Progress = Callable[[str, int, int], object]
 
 @dataclass
 class Learned:
-    """What a pass over sources did.
+    """What learning from sources did.
 
     files: how many were read. learned: material → touches. skipped: touches that the memory had already under this
-    name, by the hash of their content. refused: what was not learned; failed: the sources of that. rows: source →
-    touches, whose rows follow each other. clipped: the contents of touches all of whose values lay outside the sensor's
-    range. range_problem: of the first touch that does not fit it.
+    name, by the hash of their content. refused: what was not learned. known: contents that were skipped or refused
+    because another memory has them, see `learn_sources`. clipped: contents of touches all of whose values lay outside
+    the sensor's range. range_problem: of the first touch that does not fit it.
     """
 
     files: int = 0
     learned: Counter[str] = field(default_factory=Counter)
     skipped: int = 0
     refused: list[Refused] = field(default_factory=list)
-    failed: set[str] = field(default_factory=set)
-    rows: Counter[str] = field(default_factory=Counter)
+    known: set[bytes] = field(default_factory=set)
     clipped: set[bytes] = field(default_factory=set)
     range_problem: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """It in JSON's types."""
+        contents = {name: sorted(key.hex() for key in getattr(self, name)) for name in ("known", "clipped")}
+        return {**vars(self), "refused": [vars(each) for each in self.refused], **contents}
+
+    @classmethod
+    def from_json(cls, told: Mapping[str, Any]) -> Self:
+        """What `to_json` gave. Raises TypeError, LookupError or ValueError for anything else."""
+        contents = {name: {bytes.fromhex(key) for key in told[name]} for name in ("known", "clipped")}
+        refused = [Refused(**each) for each in told["refused"]]
+        return cls(**{**told, "learned": Counter(told["learned"]), "refused": refused, **contents})
 
 
 def learn_sources(
@@ -54,91 +65,78 @@ def learn_sources(
     options: SourceOptions,
     progress: Progress = lambda what, done, of: None,
     *,
-    every: bool = False,
+    known: Mapping[bytes, Sequence[str]] | None = None,
 ) -> Learned:
-    """Observe the touches in sources, each once: a pass that was cut short is continued by the same call.
+    """Observe the touches in sources, each once: call again after an interruption, and it goes on.
 
     At most 256 touches, or those of five seconds, become durable together: a kill loses those. A touch that the memory
-    has under another name is refused. every: learn it under that name, too: whoever merges the memory decides.
+    has under another name is refused.
     progress: called with (what is being done, files done, files in all).
+    known: content → names, of the memory that this one will be merged into, in place of what this one has. A touch
+    under two names is then learned under both: whoever merges decides.
 
     Raises AnnotationError for a quantity that the memory has with another unit or range (nothing was learned);
     StoreError and CapacityError; what was learned until then is kept.
     """
-    done, batch = Learned(), _Batch(learner, every, progress, len(sources))
+    done, batch, size, since = Learned(), list[tuple[int, SourceTouch]](), 0, 0.0
     for quantity in options.declared:
         learner.declare(quantity)
+
+    def show(number: int, files: int) -> None:
+        told = f"{done.learned.total()} touches; {printable(Path(sources[number]).name)}"
+        progress(told, files, len(sources))
+
+    def observe() -> None:
+        with learner.batch():
+            for number, touch in batch:
+                show(number, number)
+                _observe(learner, touch, done, known)
+        batch.clear()
+
     for number, address in enumerate(sources):
-        batch.show(done, address, number)
+        show(number, batch[0][0] if batch else number)  # what waits is not done
         for touch in source_touches(learner, address, options):
             if isinstance(touch, Refused):
                 done.refused.append(touch)
-                done.failed.add(address)
-            else:
-                batch.add(touch, address, number, done)
+                continue
+            size, since = (size, since) if batch else (0, monotonic())
+            batch.append((number, touch))
+            size += touch.stream.readings.nbytes
+            if len(batch) >= BATCH_TOUCHES or size >= BATCH_BYTES or monotonic() - since >= BATCH_SECONDS:
+                observe()
         done.files += 1
-    batch.observe(done)
+    observe()
     progress(f"{done.learned.total()} touches", len(sources), len(sources))
     return done
 
 
-class _Batch:
-    """Touches that are about to become durable together. of: how many sources there are, for the progress."""
-
-    def __init__(self, learner: TactileLearner, every: bool, progress: Progress, of: int) -> None:
-        self._learner, self._every = learner, every
-        self._progress, self._of = progress, of
-        self._touches: list[tuple[SourceTouch, str, int]] = []  # each with its source, and the number of that
-        self._bytes = 0
-        self._since = 0.0
-
-    def show(self, done: Learned, address: str, number: int) -> None:
-        """Report how far it is, before a source is read, or a touch of it observed: what waits is not done."""
-        first = min(number, self._touches[0][2]) if self._touches else number
-        self._progress(f"{done.learned.total()} touches; {printable(Path(address).name)}", first, self._of)
-
-    def add(self, touch: SourceTouch, address: str, number: int, done: Learned) -> None:
-        if not self._touches:
-            self._since = monotonic()
-        self._touches.append((touch, address, number))
-        self._bytes += touch.stream.readings.nbytes
-        late = monotonic() - self._since >= BATCH_SECONDS
-        if late or len(self._touches) >= BATCH_TOUCHES or self._bytes >= BATCH_BYTES:
-            self.observe(done)
-
-    def observe(self, done: Learned) -> None:
-        touches, self._touches, self._bytes = self._touches, [], 0
-        with self._learner.batch():
-            for touch, address, number in touches:
-                self.show(done, address, number)
-                material, clipped = str(touch.material), all_clipped(touch.stream)
-                names = [] if self._every else self._learner.names_of(touch.stream)
-                if material in names and not (touch.values or touch.labels):
-                    done.skipped += 1
-                    continue
-                found = refusal(names, material, clipped) or self._observed(material, touch)
-                if isinstance(found, str):
-                    done.refused.append(Refused(touch.source, found))
-                    done.failed.add(address)
-                    continue
-                if found.repeated:
-                    done.skipped += 1
-                    continue
-                done.learned[material] += 1
-                done.rows[address] += 1
-                done.clipped |= {touch.stream.key} if clipped else set()
-                done.range_problem = done.range_problem or range_problem(touch.stream)
-
-    def _observed(self, material: str, touch: SourceTouch) -> Receipt | str:
-        """The receipt of a touch; or why it cannot be observed, such as one that is too long."""
-        noted: dict[str, Any] = {"values": touch.values, "labels": touch.labels}
-        try:
-            return self._learner.observe(material, touch.stream, **noted, source=touch.source)
-        except InputError as error:
-            return str(error)
-        except EmbeddingError as error:
-            error.add_note(f"The touch is {touch.source}, of {material!r}.")
-            raise
+def _observe(
+    learner: TactileLearner, touch: SourceTouch, done: Learned, known: Mapping[bytes, Sequence[str]] | None
+) -> None:
+    """Observe a touch, unless it is there already, and take note of what became of it."""
+    material, key, clipped = str(touch.material), touch.stream.key, all_clipped(touch.stream)
+    names = learner.names_of(touch.stream) if known is None else known.get(key, ())
+    repeated = material in names and not (touch.values or touch.labels)
+    why = refusal(names, material, clipped)
+    if known is not None and (repeated or why):
+        done.known.add(key)
+    try:
+        if why is None and not repeated:
+            noted: dict[str, Any] = {"values": touch.values, "labels": touch.labels}
+            repeated = learner.observe(material, touch.stream, **noted, source=touch.source).repeated
+    except InputError as error:  # such as one that is too long
+        why = str(error)
+    except EmbeddingError as error:
+        error.add_note(f"The touch is {touch.source}, of {material!r}.")
+        raise
+    if why is not None:
+        done.refused.append(Refused(touch.source, why))
+    elif repeated:
+        done.skipped += 1
+    else:
+        done.learned[material] += 1
+        done.clipped |= {key} if clipped else set()
+        done.range_problem = done.range_problem or range_problem(touch.stream)
 
 
 @dataclass(frozen=True)

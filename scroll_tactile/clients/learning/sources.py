@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from queue import Empty, Queue
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from scroll_tactile_store.archive import ARCHIVE_BYTES, is_archive
 from scroll_tactile_store.layout import CURRENT_FILE, holds_store
 
-from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
+from scroll_tactile.embeddings.protocol import capabilities_of
 from scroll_tactile.errors import AnnotationError, InputError, RecordingError, SensorMismatchError, printable
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in
-from scroll_tactile.recordings.locations import file_system, is_remote, local
+from scroll_tactile.recordings.locations import file_system, is_remote
 from scroll_tactile.recordings.recording import require_columns
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
 from scroll_tactile.signals.stream import Stream
 
@@ -33,9 +29,7 @@ __all__ = [
     "Refused",
     "SourceOptions",
     "SourceTouch",
-    "fetched",
     "find_sources",
-    "has_touches",
     "is_memory",
     "source_touches",
     "stored_source",
@@ -46,7 +40,6 @@ PACKED = (".part",)  # what is looked for in a remote folder: the names that pac
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
 Cut = Literal["episodes", "intervals", "none", "contact"]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -238,46 +231,32 @@ def stored_source(source: str) -> str:
     return text if len(text) <= LONGEST_SOURCE else f"…{text[1 - LONGEST_SOURCE :]}"
 
 
-def has_touches(
-    sensor: Sensor, sources: Iterable[str], options: SourceOptions, embedding: Embedding | None = None
-) -> bool:
-    """Whether there is anything to learn for a new memory of this sensor, and embedding."""
-    learner = TactileLearner(sensor=sensor, embedding=embedding)
-    return any(isinstance(each, SourceTouch) for path in sources for each in source_touches(learner, path, options))
-
-
-def find_sources(
-    paths: Sequence[str], *, memories: bool = False, patience: float | None = None
-) -> tuple[list[str], list[Refused]]:
-    """The recordings in files, folders and addresses, each once and in order; and the paths where there are none.
-
-    memories: also memories, and of addresses what lies there, which must answer in `patience` seconds; without it an
-    address is one recording.
-    """
+def find_sources(paths: Sequence[str]) -> tuple[list[str], list[Refused]]:
+    """The recordings and memories in files, folders and addresses, each once and in order; and where there are none."""
     found: dict[object, str] = {}
     refused = []
     for path in paths:
         try:
-            for source in _sources_in(path, memories, patience):
+            for source in _sources_in(path):
                 found.setdefault(source if is_remote(source) else Path(source).resolve(), source)
         except (InputError, OSError) as error:
             refused.append(Refused.by(error, path))
     return list(found.values()), refused
 
 
-def _sources_in(path: str, memories: bool, patience: float | None) -> list[str]:
+def _sources_in(path: str) -> list[str]:
     """As `find_sources`, at one path. Raises InputError or OSError where there is none."""
-    if not memories and is_remote(path):
-        return [path]
     if is_remote(path):
         try:
-            listed = _answered(partial(_listed, path), patience)
+            listed = _listed(path)
+        except RecordingError:
+            raise
         except Exception as error:  # each file system has errors of its own
             raise RecordingError(f"it cannot be listed: {type(error).__name__}: {error!s:.300}") from error
         if not listed:
             raise RecordingError("expected recordings or memories; nothing is there")
         return listed
-    if memories and is_memory(path):
+    if is_memory(path):
         return [path]
     if not (inside := find(path)):
         what = "there is none in this folder" if Path(path).is_dir() else "a file of this kind is none"
@@ -285,17 +264,11 @@ def _sources_in(path: str, memories: bool, patience: float | None) -> list[str]:
     return list(map(str, inside))
 
 
-def is_memory(address: str, patience: float | None = None) -> bool:
-    """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none.
-
-    patience: seconds in which a remote one must answer; raises TimeoutError where it does not.
-    """
-    remote = is_remote(address)
+def is_memory(address: str) -> bool:
+    """Whether an address is that of a memory, in a folder or packed; what cannot be looked at is none."""
     try:
-        return _answered(partial(_is_remote_memory, address), patience) if remote else _is_local_memory(Path(address))
-    except Exception as error:  # each file system has errors of its own; reading it raises what is wrong
-        if remote and isinstance(error, TimeoutError):
-            raise
+        return _is_remote_memory(address) if is_remote(address) else _is_local_memory(Path(address))
+    except Exception:  # each file system has errors of its own; reading it raises what is wrong
         return False
 
 
@@ -318,47 +291,10 @@ def _is_remote_memory(address: str) -> bool:
         return is_archive(file.read(ARCHIVE_BYTES))
 
 
-@contextmanager
-def fetched(address: str, patience: float | None = None) -> Iterator[Path]:
-    """The path of a memory, as `local` gives it; patience: seconds in which a remote one must be there.
-
-    Raises what `local` raises, and RecordingError where it takes longer.
-    """
-    fetch = local(address)
-    try:
-        place = _answered(fetch.__enter__, patience) if is_remote(address) else fetch.__enter__()
-    except TimeoutError as error:
-        raise RecordingError(
-            f"{address} cannot be fetched: {error}. Give it more time, or look at its server"
-        ) from error
-    try:
-        yield place
-    finally:
-        fetch.__exit__(None, None, None)
-
-
-def _answered(ask: Callable[[], T], patience: float | None) -> T:
-    """The answer of a call. Raises what it raises, and TimeoutError where it takes longer; it is left alone then."""
-    answers: Queue[T | Exception] = Queue()
-
-    def call() -> None:
-        try:
-            answers.put(ask())
-        except Exception as error:  # raised below
-            answers.put(error)
-
-    threading.Thread(target=call, daemon=True).start()
-    try:
-        answer = answers.get(timeout=patience)
-    except Empty:
-        raise TimeoutError(f"no answer in {patience:g} s") from None
-    if isinstance(answer, Exception):
-        raise answer
-    return answer
-
-
 def _listed(address: str) -> list[str]:
     """What a remote folder holds; the address itself where it is a file, or a folder that is one recording."""
+    if address.lower().endswith(RECORDINGS):
+        return [address]
     files, path = file_system(address)
     files.invalidate_cache()
     if not files.isdir(path):

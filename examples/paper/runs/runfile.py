@@ -4,24 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scroll_tactile_store import LockedError
 from scroll_tactile_store.files import new_file
 
 from scroll_tactile.errors import InputError
 
-try:
-    import fcntl
-except ImportError:  # Windows has none
-    flock = None
-else:
-    flock = fcntl.flock
-
-__all__ = ["RunFile", "alone_in"]
+__all__ = ["RunFile"]
 
 _FORMAT = 1
 
@@ -95,29 +86,6 @@ class RunFile:
                 f"{path} cannot be written: {error.strerror}. What was noted before is kept: make room, or take "
                 "another folder, and start again"
             ) from error
-
-
-@contextmanager
-def alone_in(folder: Path, destination: Path) -> Iterator[None]:
-    """Keep other runs out of the folder of one, which is made; where the system has no locks nothing does.
-
-    Raises LockedError where another run is in it, for this destination.
-    """
-    with ExitStack() as stack:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(folder, os.O_RDONLY)
-            stack.callback(os.close, descriptor)
-            if flock is not None:
-                flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise LockedError(
-                f"another run is at work for {destination}, in {folder}: wait until it has ended, or take another "
-                "destination"
-            ) from error
-        except OSError:  # what is wrong with the folder is raised where notes are written
-            pass
-        yield
 
 
 def _draft(path: Path) -> Path:

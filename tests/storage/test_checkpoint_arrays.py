@@ -1,0 +1,143 @@
+"""The arrays of a checkpoint: zarr reads what is written, and nothing gets to zarr that was not written so."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from forging import describe_again, get_current, group_of, refiled
+from numcodecs import zstd
+from scroll_tactile_store import DamageError, Store, check_store, checkpoint_files
+from scroll_tactile_store.checkpoint_files import CheckpointReader
+from store_builds import flip, newest, taking_at_most
+
+ARRAYS = {
+    "rows": np.arange(4000.0).reshape(1000, 4),
+    "long": np.arange(1_200_000, dtype=np.int32).reshape(1_200, 1_000) % 1000,
+    "bytes": np.arange(300).astype(np.uint8),
+    "none": np.zeros((0, 3), np.float32),
+    "one": np.array(1.5),
+}
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A store with one row and a checkpoint, not to be changed."""
+    path = tmp_path_factory.mktemp("kept") / "s"
+    with Store.open(path, identity={}) as opened:
+        opened.append("a", "b", b"")
+        opened.commit(ARRAYS, last_sequence=1)
+    return path
+
+
+@pytest.fixture
+def path(kept, tmp_path):
+    return shutil.copytree(kept, tmp_path / "s")
+
+
+def require_damage(path):
+    """The checkpoint is passed over, and `check_store` names it."""
+    with Store.open(path, mode="read") as opened:
+        assert opened.latest() is None
+        assert len(list(opened.records())) == 1
+    problems = check_store(path)
+    assert any("checkpoint" in problem.what for problem in problems)
+
+
+CLAIMS = {  # of an array, with the right sha256
+    "objects": {"data_type": "variable_length_bytes"},
+    "text": {"data_type": {"name": "fixed_length_utf32", "configuration": {"length_bytes": 400}}},
+    "no dtype": {"data_type": None},
+    "a shape in words": {"shape": "4"},
+    "a length of 4.0": {"shape": [4.0, 4]},
+    "lengths whose product overflows": {"shape": [2**40, 2**40]},
+    "a hundred axes": {"shape": [1] * 100},
+    "an axis less": {"shape": [1000]},
+    "more chunks than files": {"shape": [10**6, 4]},
+    "a pickle": {"codecs": [{"name": "bytes"}, {"name": "numcodecs.pickle"}]},
+    "a codec of another list": {"codecs": [{"name": "bytes"}, {"name": "gzip", "configuration": {"level": 1}}]},
+    "no codecs": {"codecs": []},
+    "not compressed": {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
+    "chunks of nothing": {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [0, 4]}}},
+    "a larger chunk": {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40, 4]}}},
+    "chunks in words": {"chunk_grid": {"name": "x"}},
+}
+
+
+def claiming(*sha256, **about):
+    """The array "rows" of the newest checkpoint has another description; sha256: in place of the right one."""
+
+    def attack(path):
+        number = get_current(path)["newest"]["number"]
+        header = group_of(path, number) / "rows" / "zarr.json"
+        header.write_text(json.dumps(json.loads(header.read_text()) | about))
+        files = refiled(path, number)["files"]
+        describe_again(path, files=files | dict(zip(["rows/zarr.json"], sha256, strict=False)))
+
+    return attack
+
+
+FORGED = {name: claiming(**about) for name, about in CLAIMS.items()}
+FORGED |= {f"{sha256} for a sha256": claiming(sha256) for sha256 in ("0" * 64, None)}
+FILES = {
+    "a list": ["rows/zarr.json"],
+    "a name that leads out": {"../rows/zarr.json": "0" * 64},
+    "a file of no array": {"rows/x": "0" * 64},
+}
+
+
+def test_zarr_alone_reads_what_is_written_without_a_warning(path):
+    import zarr
+
+    group = zarr.open_group(newest(path), mode="r")
+    for name, array in ARRAYS.items():
+        found = np.asarray(group[name][...])
+        assert (found.dtype, found.shape, found.tobytes()) == (array.dtype, array.shape, array.tobytes())
+
+
+def test_what_is_stored_is_verified_before_zarr_gets_it(path, monkeypatch):
+    flip(newest(path) / "rows" / "c" / "0" / "0")
+
+    def reached(*_):
+        pytest.fail("damaged bytes were decompressed")
+
+    monkeypatch.setattr(checkpoint_files, "_read_zarr", reached)
+    with pytest.raises(DamageError, match=r"array 'rows' of checkpoint 1 .*sha256 differs") as refused:
+        CheckpointReader(newest(path)).arrays(["rows"])
+    assert refused.value.path == newest(path) / "rows" / "c" / "0" / "0"
+
+
+def test_so_little_that_stands_for_so_much_is_written_as_it_is_and_read_back(path, monkeypatch):
+    monkeypatch.setattr(checkpoint_files, "SPARE", 2**20)
+    zeros = np.zeros(5 * 2**20, np.uint8)
+    with Store.open(path) as opened:
+        opened.commit({"zeros": zeros}, last_sequence=1)
+        assert opened.latest().arrays["zeros"].tobytes() == zeros.tobytes()
+    assert check_store(path) == []
+
+
+@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
+def test_an_array_that_claims_what_is_never_written_is_damage_and_takes_no_memory(path, forge):
+    forge(path)
+    with taking_at_most(40 * 2**20):
+        require_damage(path)
+    assert list(CheckpointReader(newest(path)).arrays(["one"])) == ["one"]
+
+
+def test_a_frame_that_claims_another_size_is_damage_and_takes_no_memory(path):
+    (newest(path) / "rows" / "c" / "0" / "0").write_bytes(zstd.compress(bytes(2**28), 1))
+    describe_again(path, files=refiled(path, 1)["files"])
+    with taking_at_most(40 * 2**20):
+        require_damage(path)
+
+
+def test_many_arrays_claim_no_more_than_all_files_can_stand_for(path, monkeypatch):
+    monkeypatch.setattr(checkpoint_files, "SPARE", 0)
+    monkeypatch.setattr(checkpoint_files, "RATIO", 1)
+    require_damage(path)
+
+
+@pytest.mark.parametrize("files", FILES.values(), ids=FILES)
+def test_files_that_no_checkpoint_has_are_damage(path, files):
+    describe_again(path, files=files)
+    require_damage(path)

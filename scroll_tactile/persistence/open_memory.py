@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
-from scroll_tactile_store import CompactedError, ReadOnlyError, Store, StoreClosedError, StoreError
+from scroll_tactile_store import ReadOnlyError, Store, StoreClosedError, StoreError
 
 from scroll_tactile.errors import InputError
 from scroll_tactile.health.watch import WatchedRows, WatchRules
@@ -26,7 +26,6 @@ logger = logging.getLogger(__name__)
 Answer = TypeVar("Answer")
 
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
-REFRESH_ATTEMPTS = 5  # of a reader, while a writer changes the memory, before all of it is read anew
 # A checkpoint writes all materials, so many of them in the time that one touch takes to learn: it waits until as long
 # was spent on touches. With 100 000 materials and a row for each 16, writing took twice as long as learning.
 MATERIALS_PER_ROW = 8
@@ -189,20 +188,14 @@ class OpenMemory:
             memory, store = self.memory, self.store
             if store is None or store.mode == "write":
                 return False
-            if (store.newest, store.last, store.compacted) == (memory.checkpoint, memory.sequence, memory.compacted):
+            state = store.state()
+            if state == (memory.sequence, memory.checkpoint, memory.compacted):
                 return False
-            try:
-                # A checkpoint that was written between the reads may contain later rows than were read here.
-                for _ in range(REFRESH_ATTEMPTS):
-                    if store.compacted != memory.compacted or store.last - memory.sequence > CHECKPOINT_EVERY:
-                        break
-                    records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
-                    with self._mutation():
-                        self._changed(apply_appended(memory, store, records))
-                    if store.newest == memory.checkpoint and store.compacted == memory.compacted:
-                        return True
-            except CompactedError:  # just now, and a retraction needs what is gone
-                pass
+            if state.compacted == memory.compacted and state.last - memory.sequence <= CHECKPOINT_EVERY:
+                records = list(store.records(after=memory.sequence))  # one may be damaged: before any change
+                with self._mutation():
+                    self._changed(apply_appended(memory, store, records))
+                return True
             self._memory, self._whole = self._load(), True
             self._changed()
             return True

@@ -63,13 +63,13 @@ LOAD_ATTEMPTS = 20  # of a reader, while a writer changes the store
 def load(empty: Memory, store: Store) -> Memory:
     """The memory that a store holds: its newest checkpoint, then the journal's rows after it; made as the empty one."""
     for _ in range(LOAD_ATTEMPTS - 1):
-        newest = store.newest
+        state = store.state()
         try:
             memory = _loaded(empty.empty_like(), store)
-        except CompactedError:  # a writer compacted it between two reads
+        except CompactedError:  # a writer compacted it meanwhile
             continue
-        # A checkpoint that came between the reads may hold a tuned model from before the rows that were read.
-        if store.newest == newest:
+        # Where a writer has replaced the checkpoint meanwhile, a later one was read, or none.
+        if store.state(look=False)[1:] == state[1:]:
             return memory
     return _loaded(empty.empty_like(), store)
 
@@ -231,24 +231,16 @@ def _chosen(memory: Memory, store: Store, last_sequence: int) -> Memory:
 
 
 def _behind_compaction(memory: Memory, store: Store, last_sequence: int) -> list[Head]:
-    """The rows up to one from which samples are chosen.
-
-    A damaged row may be of any kind. Without it other touches would be chosen, and a writer would save them: it gets
-    DamageError. A reader, which saves nothing, gets the remaining rows and a warning.
-    """
+    """The rows up to one from which samples are chosen. Raises DamageError: a damaged row may be of any kind."""
     try:
         return list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
     except DamageError as damage:
-        if store.mode == "write":
-            raise DamageError(
-                f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair the "
-                "memory (scroll-tactile memory repair)",
-                path=damage.path,
-                sequence=damage.sequence,
-            ) from damage
-        logger.warning("%s; samples of touches are chosen without it, others than there were", damage)
-    left = (head for kind in (MERGE, OBSERVE) for head in store.heads(memory.compacted, kind=kind))
-    return [head for head in left if head.sequence <= last_sequence]
+        raise DamageError(
+            f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair the "
+            "memory (scroll-tactile memory repair)",
+            path=damage.path,
+            sequence=damage.sequence,
+        ) from damage
 
 
 def _compaction_samples(memory: Memory, store: Store) -> Memory:

@@ -141,7 +141,7 @@ class Attempt:
                 return None
             result = perform(self.learner, self.operation, self.home)
             if self.operation[0] != "close":
-                self.learner._ledger.store._checkpoints.wait()
+                self.learner._ledger.store._wait()
             return result
         finally:
             checkpoints_every(NEVER)

@@ -6,7 +6,7 @@ import pickle
 import pytest
 from forging import spoil_row
 from scroll_tactile_store import StoreClosedError, StoreError, StoreFullError
-from scroll_tactile_store.log_writer import LogWriter
+from scroll_tactile_store.log import Log
 from touches import SETTINGS, fed, filled, held, stream
 
 from scroll_tactile import TactileLearner
@@ -89,7 +89,7 @@ class TestChanges:
             with pytest.raises(StoreError, match="nothing of this batch"), learner.batch():
                 first = learner.observe(*given(OBSERVED[5]))
                 assert learner.observe(*given(OBSERVED[5])).repeated and not first.durable
-                monkeypatch.setattr(LogWriter, "stage", full)
+                monkeypatch.setattr(Log, "stage", full)
                 with pytest.raises(StoreFullError):
                     learner.observe(*given(OBSERVED[6]))
             monkeypatch.undo()

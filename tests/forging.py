@@ -157,7 +157,7 @@ def raw(name: str, array: np.ndarray) -> Packed:
 def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
     """A payload of arrays of which anything may be said; text: in place of what is said of them."""
     told = {name: [dtype, list(shape), stored] for name, dtype, shape, _, stored in arrays}
-    said = as_text(told if text is None else text).encode("utf-8", "surrogatepass")
+    said = (json.dumps(told) if text is None else text).encode("utf-8", "surrogatepass")  # in the order of the buffers
     return b"".join([struct.pack("<I", len(said)), said, *(buffer for _, _, _, buffer, _ in arrays)])
 
 

@@ -19,8 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store import DamageError, Head, NotAStoreError, Record, Store
 from scroll_tactile_store.exceptions import reported
-from scroll_tactile_store.files import file_size, is_there, sync_folder
-from scroll_tactile_store.layout import log_numbers, log_path
+from scroll_tactile_store.files import is_there, sync_folder
 
 from scroll_tactile.embeddings.registry import require_configuration
 from scroll_tactile.errors import EmbeddingError, InputError, MismatchError
@@ -124,8 +123,7 @@ class MemoryStore(Store):
         for first, last in pairs or ():
             expect(before < first <= last < sequence, "sequences", f"spans of rows before {sequence}, ascending", pairs)
             before, rows = last, rows + last - first + 1
-        logs = [self.path] if self.path.is_file() else [log_path(self.path, each) for each in log_numbers(self.path)]
-        most = sum(map(file_size, logs)) // SMALLEST_ROW
+        most = self.size()["journal"] // SMALLEST_ROW
         expect(0 < rows <= most, "sequences", f"1 to {most} rows, which the journal can hold", rows)
 
     def sound_record(self, record: Record) -> Record:

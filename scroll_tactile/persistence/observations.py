@@ -1,10 +1,16 @@
-"""The observations in a journal: their state, and which of them can be retracted."""
+"""The observations in a journal: their state, which of them can be retracted, and which have some readings.
+
+Equal readings are one touch. One that the memory has under the same name is never learned twice. One that it has under
+another name is refused in learning from files, by one process or a fleet; `observe` and `merge` accept it.
+"""
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import cast
 
-from scroll_tactile_store import Head, Record, Store
+from scroll_tactile_store import Head, Record
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
@@ -20,9 +26,13 @@ from scroll_tactile.memory.touch_rows import (
     declared_by,
     retracted_by,
 )
+from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
+from scroll_tactile.signals.ranges import CURE
+from scroll_tactile.statistics.annotations import Annotation
 
 __all__ = [
+    "TouchRows",
     "adaptation_of",
     "compaction_point",
     "is_from",
@@ -30,10 +40,39 @@ __all__ = [
     "observations",
     "observations_from",
     "observations_of",
+    "refusal",
+    "rows_with",
 ]
 
+TouchRows = dict[str, tuple[int, Annotation]]
+"""Material → the row that has some readings under this name, and its annotation; the oldest first."""
 
-def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
+
+def rows_with(store: AnyStore, memory: Memory, key: bytes) -> TouchRows:
+    """The rows of observations that count and have readings with this hash; of each name the first."""
+    found: TouchRows = {}
+    for head in takewhile(lambda head: head.sequence <= memory.sequence, store.with_key(key)):
+        if head.kind in (OBSERVE, MEMBER) and not memory.is_gone(head.sequence):
+            found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
+    return found
+
+
+def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
+    """Why a touch that is there under these names cannot be learned as a material; None where it can.
+
+    clipped: whether all its values lay outside the sensor's range, so that clipping may have made it equal another.
+    """
+    if not names or material in names:
+        return None
+    if clipped:
+        return (
+            f"all its values lie outside the sensor's range, and the memory has what clipping leaves of them already, "
+            f"as {names[0]!r} and not as {material!r}: {CURE}"
+        )
+    return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
+
+
+def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> Record:
     """The journal's row of an observation that can be retracted.
 
     Raises ObservationError where there is none, it was retracted before, or compacted.
@@ -59,7 +98,7 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
     return record
 
 
-def adaptation_of(store: Store, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
+def adaptation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
     """The row of an adaptation that counts; None where the receipt is of anything else.
 
     Raises ObservationError for an adaptation that was not kept, counts no more, or is one of another memory.
@@ -82,7 +121,7 @@ def adaptation_of(store: Store, memory: Memory, receipt: Receipt | Adaptation | 
     return sequence
 
 
-def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
+def observations_of(store: AnyStore, memory: Memory, material: str) -> list[int]:
     """The sequences of all observations of a material, ascending.
 
     Raises UnknownMaterialError for one never observed, ObservationError where some were compacted, and DamageError
@@ -104,13 +143,13 @@ def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
     return found
 
 
-def _retractable(store: Store, memory: Memory, material: str | None = None) -> list[Head]:
+def _retractable(store: AnyStore, memory: Memory, material: str | None = None) -> list[Head]:
     """The observations whose arrays the journal still holds, of one material or all, in order; no damaged ones."""
     rows = store.heads(memory.compacted, kind=OBSERVE, label=material)
     return [head for head in rows if head.sequence not in memory.retracted]
 
 
-def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
+def observations_from(store: AnyStore, memory: Memory, source: str) -> list[int]:
     """The sequences of all observations from a source, ascending: a file, or all that lies in a folder or address.
 
     Raises ObservationError where there are none, and where some were compacted.
@@ -139,27 +178,22 @@ def is_from(recorded: str | None, source: str) -> bool:
     return recorded is not None and (recorded == source or recorded.startswith(tuple(place + end for end in ends)))
 
 
-def observations(store: Store) -> list[Observation]:
+def observations(store: AnyStore) -> list[Observation]:
     """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
-
-    def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
-        if head.sequence in retracted:
-            return "retracted"
-        return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
-
     quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
+        gone = head.sequence <= compacted or head.kind == MEMBER
         return Observation(
             sequence=head.sequence,
             material=head.label,
             key=head.key,
             time=head.time,
-            state=state(head),
-            source=_source(head),
+            state="retracted" if head.sequence in retracted else "compacted" if gone else "kept",
+            source=cast("str | None", head.attributes.get(SOURCE)),
             values=annotation.measured(quantities),
             labels=dict(annotation.labels),
         )
@@ -167,11 +201,7 @@ def observations(store: Store) -> list[Observation]:
     return [observation(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
 
 
-def _source(head: Head) -> str | None:
-    return cast("str | None", head.attributes.get(SOURCE))
-
-
-def compaction_point(store: Store, memory: Memory, keep: int) -> int:
+def compaction_point(store: AnyStore, memory: Memory, keep: int) -> int:
     """The last row to be compacted, so that the newest `keep` observations can still be retracted."""
     if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")

@@ -22,6 +22,7 @@ from scroll_tactile_store.files import is_there, sync_folder
 from scroll_tactile_store.lock import WriterLock
 
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.gate import MemoryStore, beside, finish_interrupted
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -37,9 +38,8 @@ from scroll_tactile.memory.touch_rows import (
     pack_readings,
     unpack_readings,
 )
-from scroll_tactile.persistence.replaying import append_row, load, refill
+from scroll_tactile.persistence.replaying import apply, load, refill
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted
 
 __all__ = ["Reembedding"]
 
@@ -103,7 +103,8 @@ class Reembedding:
             attributes |= {"columns": steps, "nbytes": readings.nbytes}
             arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
         of = record.kind, record.label, record.key
-        append_row(self._memory, self._draft, *of, attributes=attributes, arrays=arrays, time=record.time, codes=codes)
+        head = self._draft.append(*of, attributes=attributes, arrays=arrays, time=record.time)
+        apply(self._memory, Record(**vars(head), arrays=arrays), self._draft, codes)
 
     def _write_checkpoint(self) -> None:
         arrays, attributes = self._memory.to_arrays()

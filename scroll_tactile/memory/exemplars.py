@@ -38,7 +38,6 @@ __all__ = [
 # touch (BioTac and RoboSkin, five folds, 5 to 20 exemplars a material); with 2 it reaches 1.24, with 4 it is 1.06.
 CANDIDATES = 3
 LARGEST_HERDED = 2 ** (53 - 2 * BITS)  # of codes: a product of two rows is then exact in float64
-LIMB_BITS = 32  # bits
 
 
 def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: Ints, count: int) -> list[int]:
@@ -50,63 +49,44 @@ def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: Ints,
     and fewer are a beginning of more.
 
     candidates: codes of shape (N, d), of magnitude at most 2²⁰, d at most 8192. keys: N different content hashes.
-    mean: μ, codes of shape (d,). Raises InputError for anything else.
+    mean: μ, codes of shape (d,). Raises InputError for more features, or larger codes.
     """
-    _require_codes(candidates, keys, mean, count)
+    features, ends = (
+        candidates.shape[1],
+        [(int(each.min(initial=0)), int(each.max(initial=0))) for each in (candidates, mean)],
+    )
+    largest = max(max(-low, high) for low, high in ends)
+    if features > LARGEST_HERDED or largest > 2**BITS:
+        raise InputError(
+            f"expected codes of at most {LARGEST_HERDED} features, of magnitude at most {2**BITS}; came {features} "
+            f"features, and {largest}. Round features by to_codes"
+        )
     order = sorted(range(len(keys)), key=keys.__getitem__)
     rows, target = candidates[order].astype(np.float64), mean.astype(np.float64)
+    left, chosen = list(range(len(rows))), list[int]()
     with one_thread():
-        # Each product of rows is below 2⁵³, exact in any order. The score is kept in two limbs: at step k it may
-        # reach (4k − 1)·d·2⁴⁰, which from d·k = 2²¹ on would not fit 64 bits.
-        norms, towards = _exact(np.einsum("nd,nd->n", rows, rows)), _exact(rows @ target)
-        high, low = _carried(np.zeros_like(norms), norms - 2 * towards)
-        free = np.ones(len(rows), dtype=bool)
-        chosen: list[int] = []
-        while len(chosen) < min(count, len(rows)):
-            places = np.flatnonzero(free)
-            places = places[high[places] == high[places].min()]
-            pick = int(places[low[places].argmin()])  # the first of equal ones: by key
-            free[pick] = False
+        # Each product of rows is below 2⁵³, exact in any order. Scores are Python's integers: at step k they may reach
+        # (4k − 1)·d·2⁴⁰, which from d·k = 2²¹ on would not fit 64 bits.
+        towards = _whole(rows @ target)
+        scores = _whole(np.einsum("nd,nd->n", rows, rows)) - 2 * towards
+        while left and len(chosen) < count:
+            pick = min(left, key=scores.__getitem__)  # the first of equal ones: by key
+            left.remove(pick)
             chosen.append(order[pick])
-            change = 2 * (_exact(rows @ rows[pick]) - towards)
-            more, low = _carried(high, low + (change & (2**LIMB_BITS - 1)))
-            high = more + (change >> LIMB_BITS)
+            scores = scores + 2 * (_whole(rows @ rows[pick]) - towards)
     return chosen
 
 
-def _exact(values: npt.NDArray[np.float64]) -> Ints:
-    return values.astype(np.int64)
-
-
-def _carried(high: Ints, low: Ints) -> tuple[Ints, Ints]:
-    return high + (low >> LIMB_BITS), low & (2**LIMB_BITS - 1)
-
-
-def _require_codes(
-    candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: npt.NDArray[np.integer], count: int
-) -> None:
-    integers = candidates.dtype.kind in "iu" and mean.dtype.kind in "iu"
-    fits = candidates.ndim == 2 and mean.shape == candidates.shape[1:] and candidates.shape[1] <= LARGEST_HERDED
-    if not integers or not fits or len(set(keys)) != len(candidates) or len(keys) != len(candidates) or count < 0:
-        raise InputError(
-            f"expected integer codes of shape (N, d), d at most {LARGEST_HERDED}, a mean of shape (d,), N different "
-            f"keys and a count of 0 or more; came codes of {candidates.dtype} {candidates.shape}, a mean of "
-            f"{mean.dtype} {mean.shape}, {len(keys)} keys of which {len(set(keys))} differ, and {count}"
-        )
-    largest = max(max(int(array.max(initial=0)), -int(array.min(initial=0))) for array in (candidates, mean))
-    if largest > 2**BITS:
-        raise InputError(f"expected codes of magnitude at most {2**BITS}; came {largest}. Round features by to_codes")
+def _whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.object_]:
+    return values.astype(np.int64).astype(object)
 
 
 def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
     """Places of each material in a buffer: as even as can be, spare ones to the materials that have more.
 
     available: streams that there are of each. The sum is min(capacity, Σ available); a larger buffer takes a place
-    from nobody. Of materials with as many streams the first by name come first. Raises InputError for negative
-    numbers.
+    from nobody. Of materials with as many streams the first by name come first.
     """
-    if capacity < 0 or min(available.values(), default=0) < 0:
-        raise InputError(f"expected numbers of streams, 0 or more; came capacity {capacity} and {dict(available)}")
     places, left = {}, capacity
     ascending = sorted(available, key=lambda name: (available[name], name))
     for i, name in enumerate(ascending):

@@ -197,7 +197,7 @@ class Identity(_Kept):
         return Recipe(self.sensor, embedding, request.settings.model_copy(update=kept))
 
     def _require(self, path: Path, request: RecipeRequest) -> None:
-        sensor, exemplars, kept_touches = request.sensor, request.settings.exemplars, request.settings.kept_touches
+        sensor = request.sensor
         if sensor is not None and sensor != self.sensor:
             differing = [
                 f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
@@ -208,16 +208,15 @@ class Identity(_Kept):
                 f"{path} holds the memory of sensor {self.sensor.name!r}; it was opened for {sensor.name!r} "
                 f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
             )
-        if exemplars not in (None, self.exemplars):
-            raise MismatchError(
-                f"{path} was made with exemplars={self.exemplars}; it was opened with {exemplars}. Readings that were "
-                "not kept are gone: leave exemplars out"
-            )
-        if kept_touches not in (None, self.kept_touches):
-            raise MismatchError(
-                f"{path} was made with kept_touches={self.kept_touches}; it was opened with {kept_touches}. Which "
-                "touches are kept is a function of all that were observed: leave kept_touches out"
-            )
+        for name, why in (
+            ("exemplars", "Readings that were not kept are gone"),
+            ("kept_touches", "Which touches are kept is a function of all that were observed"),
+        ):
+            made, asked = getattr(self, name), getattr(request.settings, name)
+            if asked not in (None, made):
+                raise MismatchError(
+                    f"{path} was made with {name}={made}; it was opened with {asked}. {why}: leave {name} out"
+                )
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
         """Raise EmbeddingMismatchError for another embedding than the memory's; computing its fingerprint may embed."""

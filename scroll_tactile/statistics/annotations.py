@@ -12,7 +12,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,7 @@ from scroll_tactile.quantities import Quantity
 from scroll_tactile.settings import require_name
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.fields import Ints, Must, Name
-from scroll_tactile.statistics.statistics import Statistics, StatisticsFields
+from scroll_tactile.statistics.statistics import Algebra, Statistics, StatisticsFields
 
 __all__ = ["MOST_AXES", "NO_ANNOTATION", "Annotation", "TargetFields", "TargetSums"]
 
@@ -114,12 +114,10 @@ class TargetFields:
     axes: list[AxisFields]
 
 
-class TargetSums:
+class TargetSums(Algebra):
     """The exact sums of values and labels; empty where no touch has any.
 
     axes: by the name of each, the statistics of the touches with a label on it; see `Statistics`.
-
-    `+` joins two, `-` takes one out of another, `==` compares digests.
     """
 
     def __init__(self, dimension: int, scales: Sequence[Scale]) -> None:
@@ -143,25 +141,22 @@ class TargetSums:
 
     def add(self, material: str, key: bytes, annotation: Annotation, codes: Codes, columns: int) -> None:
         """Add the annotation of an observation, of so many columns and these rows of codes by scale."""
-        if annotation:
-            self._count(material, key, annotation, 1)
-            for axis, label in annotation.labels:
-                if axis not in self.axes:
-                    self.axes[axis] = Statistics(self._dimension, self._scales)
-                self.axes[axis].add(label, codes, columns)
+        self._count(material, key, annotation, 1)
+        for axis, label in annotation.labels:
+            self.axes.setdefault(axis, Statistics(self._dimension, self._scales)).add(label, codes, columns)
 
     def remove(self, material: str, key: bytes, annotation: Annotation, codes: Codes, columns: int) -> None:
         """Take out one that was added. Raises UnknownMaterialError for a label without such an observation."""
-        if annotation:
-            self._count(material, key, annotation, -1)
-            for axis, label in annotation.labels:
-                self.axes.setdefault(axis, Statistics(self._dimension, self._scales)).remove(label, codes, columns)
-                if not self.axes[axis].touches:
-                    del self.axes[axis]
+        self._count(material, key, annotation, -1)
+        for axis, label in annotation.labels:
+            self.axes.setdefault(axis, Statistics(self._dimension, self._scales)).remove(label, codes, columns)
+            if not self.axes[axis].touches:
+                del self.axes[axis]
 
     def _count(self, material: str, key: bytes, annotation: Annotation, sign: int) -> None:
-        self._touches += sign
-        self._total = (self._total + sign * annotation.number(material, key)) % MODULUS
+        if annotation:
+            self._touches += sign
+            self._total = (self._total + sign * annotation.number(material, key)) % MODULUS
         for name, steps in annotation.values:
             self._change((name, material), (1, steps, steps * steps), sign)
 
@@ -179,21 +174,8 @@ class TargetSums:
             digest.update(repr((axis, self.axes[axis].digest())).encode())
         return digest.hexdigest()
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, TargetSums):
-            return NotImplemented
-        return self.digest() == other.digest()
-
-    __hash__ = None  # type: ignore[assignment]  # it changes
-
-    def __add__(self, other: TargetSums) -> TargetSums:
-        return self._combined(other, 1)
-
-    def __sub__(self, other: TargetSums) -> TargetSums:
-        return self._combined(other, -1)
-
-    def _combined(self, other: TargetSums, sign: int) -> TargetSums:
-        joint = TargetSums(self._dimension, self._scales)
+    def _combined(self, other: Self, sign: int) -> Self:
+        joint = type(self)(self._dimension, self._scales)
         joint._touches = self._touches + sign * other._touches
         joint._total = (self._total + sign * other._total) % MODULUS
         joint._quantities = dict(self._quantities)

@@ -84,7 +84,7 @@ class Must:
         fits = len(shape) == len(axes) and all(
             known[axis] in (None, own) for axis, own in zip(axes, shape, strict=True)
         )
-        came = f"{getattr(array, 'dtype', type(array).__name__)} {shape}"
+        came = "none" if array is None else f"{getattr(array, 'dtype', type(array).__name__)} {shape}"
         shown = f"{self.dtype or 'a list'} of shape ({', '.join(str(known[axis] or 'any') for axis in axes)})"
         expect(fits and str(getattr(array, "dtype", "")) == self.dtype, field, shown, came)
         sizes |= {axis: own for axis, own in zip(axes, shape, strict=True) if axis.isalpha()}

@@ -7,10 +7,11 @@ that A is of. Sums and sets do not depend on order, batching or grouping, so nei
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, cast
+from typing import Annotated, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +22,7 @@ from scroll_tactile.statistics.fields import Ints, Must, Name, expect
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment, Sums, require_room
 
-__all__ = ["LONGEST_TOUCH", "Statistics", "StatisticsFields"]
+__all__ = ["LONGEST_TOUCH", "Algebra", "Statistics", "StatisticsFields"]
 
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
 
@@ -64,12 +65,32 @@ class _Own:
         self.sums[scale] = both.astype(np.int32) if np.abs(both).max(initial=0) <= LARGEST else both
 
 
-class Statistics:
+class Algebra(ABC):
+    """What is added, taken out and compared exactly: `+` joins two, `-` takes one out of another, `==` compares."""
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
+
+    @abstractmethod
+    def digest(self) -> str:
+        """Hex of a SHA-256 over all of it."""
+
+    @abstractmethod
+    def _combined(self, other: Self, sign: int) -> Self: ...
+
+    def __eq__(self, other: object) -> bool:
+        return self.digest() == other.digest() if isinstance(other, type(self)) else NotImplemented
+
+    def __add__(self, other: Self) -> Self:
+        return self._combined(other, 1)
+
+    def __sub__(self, other: Self) -> Self:
+        return self._combined(other, -1)
+
+
+class Statistics(Algebra):
     """Counts and sums by material and scale, and the second moment of each scale.
 
     dimension: d. scales: the widths of windows, in readings, ascending.
-
-    `+` joins two, `-` takes one out of another, `==` compares bytes whatever the order of the materials.
     """
 
     def __init__(self, dimension: int, scales: Sequence[Scale]) -> None:
@@ -179,26 +200,13 @@ class Statistics:
                 digest.update(self._seconds[scale].packed().astype("<i8", copy=False).data)
         return digest.hexdigest()
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Statistics):
-            return NotImplemented
-        return self.digest() == other.digest()
-
-    __hash__ = None  # type: ignore[assignment]  # it changes
-
-    def __add__(self, other: Statistics) -> Statistics:
-        return self._combined(other, 1)
-
-    def __sub__(self, other: Statistics) -> Statistics:
-        return self._combined(other, -1)
-
-    def _combined(self, other: Statistics, sign: int) -> Statistics:
+    def _combined(self, other: Self, sign: int) -> Self:
         if (self.dimension, self.scales) != (other.dimension, other.scales):
             raise MismatchError(
                 f"expected statistics of {self.dimension} features at scales {self.scales}; came "
                 f"{other.dimension} at {other.scales}"
             )
-        joint = Statistics(self.dimension, self.scales)
+        joint = type(self)(self.dimension, self.scales)
         for scale in self.scales:
             if sign > 0:
                 require_room(self._seconds[scale].rows, other._seconds[scale].rows)

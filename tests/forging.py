@@ -111,7 +111,7 @@ def put_row(
 
     payload: bytes, or arrays by name. size: where the row is to say another than the right one.
     """
-    body = payload if isinstance(payload, bytes) else pack([raw(*one) for one in (payload or {}).items()])
+    body = payload if isinstance(payload, bytes) else pack([raw(*one) for one in sorted((payload or {}).items())])
     rows = {int.from_bytes(row[:8], "little"): row for row in read_log(path)[1]}
     if sequence is None:
         sequence = 1 + max([*rows, *(named["last_sequence"] for named in named_in(path))], default=0)

@@ -79,8 +79,8 @@ class TactileLearner:
     A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Both keep a journal and do
     the same; the journal of this one grows in RAM. Of each touch it has what takes it out of the sums again: its
     readings (8 to 15 kB for 400 of a BioTac) where the embedding is exact, such as `Kernels`; else its codes, 4 bytes
-    for each feature of each window, beside readings where exemplars or kept touches are kept. `compact` gives both up.
-    Only `backup` and `reembed` take a path.
+    for each feature of each window, beside readings where exemplars or kept touches are kept. `compact` gives both up
+    for a copy of the sums. Only `backup` and `reembed` take a path.
 
     Methods may be called from any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that
     knows what this one knows at that moment, as if it were compacted; its repr names the memory that it was taken of.

@@ -42,7 +42,6 @@ __all__ = ["MOST_CORRECTIONS", "KeptTouches", "Memory", "MemoryFields"]
 
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
 MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
-Chosen = tuple[TouchSample, "KeptTouches | None", ExemplarSample | None]
 
 
 class KeptTouches(Sample[KeptTouch]):
@@ -296,18 +295,12 @@ class Memory:
     def _touch(self, columns: int, codes: Codes, annotation: Annotation) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation)
 
-    @property
-    def chosen(self) -> Chosen:
-        """What was chosen among the observations: sample, kept touches and exemplars."""
-        return self.sample, self.kept, self.exemplars
-
-    @chosen.setter
-    def chosen(self, chosen: Chosen) -> None:
-        self.sample, self.kept, self.exemplars = chosen
-        self.stale = False
+    def take_chosen(self, other: Memory) -> None:
+        """Take sample, kept touches and exemplars of a memory in place of its own."""
+        self.sample, self.kept, self.exemplars, self.stale = other.sample, other.kept, other.exemplars, False
 
     def take_sums(self, memory: Memory, later: Memory, last_sequence: int) -> None:
-        """Take the sums of a memory without those of the rows behind one; `chosen` is of the rows up to it already."""
+        """Take the sums of a memory without those of the rows behind one; its own samples have none of these."""
         self.statistics, self.targets = memory.statistics - later.statistics, memory.targets - later.targets
         self.compacted, self.sequence, self.tuned = memory.compacted, last_sequence, None
         self.retracted = set(memory.retracted)

@@ -56,8 +56,7 @@ from scroll_tactile.persistence.observations import (
     adaptation_of,
     compaction_point,
     observation_of,
-    observations_from,
-    observations_of,
+    observations_to_forget,
     rows_with,
 )
 from scroll_tactile.persistence.ram_store import AnyStore, RamStore
@@ -215,7 +214,7 @@ class Ledger:
         if self._batching:
             raise InputError(f"{what} is a batch of its own: end the batch before it")
 
-    def _append(
+    def append(
         self,
         kind: str,
         label: str,
@@ -243,7 +242,7 @@ class Ledger:
         row = Record(**vars(head) | {"arrays": arrays or {}})
         changed = apply(memory, row, self.store, codes, gone=gone, summed=summed)
         if chosen is not None:
-            memory.chosen = chosen.chosen
+            memory.take_chosen(chosen)
         if changed != []:
             self._changed(changed)
         self._whole = True
@@ -276,7 +275,7 @@ class Ledger:
                     yield
                 except BaseException as error:  # the store must not see it: it would undo the batch
                     raised = error
-            self._checkpoint_if_due()
+            self.checkpoint_if_due()
             if raised is not None:
                 raise raised
 
@@ -313,8 +312,8 @@ class Ledger:
                 if (numbers := channel_numbers(stream)) is not None:
                     attributes[CHANNELS] = to_text(numbers)
                 arrays = (pack_readings(stream.readings) if kept else {}) | ({} if self._bare else pack_codes(codes))
-                row = self._append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays, codes=codes)
-                self._checkpoint_if_due()
+                row = self.append(OBSERVE, material, stream.key, attributes=attributes, arrays=arrays, codes=codes)
+                self.checkpoint_if_due()
             return Receipt(
                 sequence=row if known is None else known,
                 material=material,
@@ -341,8 +340,8 @@ class Ledger:
 
     def _note(self, kind: str, label: str, attributes: dict[str, Any]) -> int:
         """Append and apply a row that has no arrays."""
-        sequence = self._append(kind, label, attributes=attributes)
-        self._checkpoint_if_due()
+        sequence = self.append(kind, label, attributes=attributes)
+        self.checkpoint_if_due()
         return sequence
 
     def describe(self, material: str, constituents: Description | None) -> None:
@@ -396,24 +395,21 @@ class Ledger:
                 return
             assert not isinstance(receipt, Adaptation)
             self._retract([observation_of(store, self.memory, receipt)], "")
-            self._checkpoint_if_due()
+            self.checkpoint_if_due()
 
     def forget(self, material: str | None, source: str | None) -> int:
         """As `TactileLearner.forget`."""
         with self.lock:
             store, memory = self.require_open(), self.memory
-            if material is not None:
-                found = observations_of(store, memory, material)
-            else:
-                found = observations_from(store, memory, source or "")
+            found = observations_to_forget(store, memory, material, source)
             self._retract([store.record(sequence) for sequence in found], material or "")
-            self._checkpoint_if_due()
+            self.checkpoint_if_due()
         return len(found)
 
     def _retract(self, records: Sequence[Record], material: str) -> None:
         gone = {record.sequence: record for record in records}
         chosen = chosen_without(self.memory, self.store, gone)
-        self._append(RETRACT, material, attributes={"sequences": spans(gone)}, gone=gone, chosen=chosen)
+        self.append(RETRACT, material, attributes={"sequences": spans(gone)}, gone=gone, chosen=chosen)
 
     def relabel(self, receipt: Receipt | int, material: str) -> int:
         """As `TactileLearner.relabel`."""
@@ -427,8 +423,8 @@ class Ledger:
             with self._together():
                 self._retract([record], "")
                 kept: Any = {"attributes": record.attributes, "arrays": record.arrays, "time": record.time}
-                sequence = self._append(OBSERVE, material, record.key, **kept) if known is None else known
-            self._checkpoint_if_due()
+                sequence = self.append(OBSERVE, material, record.key, **kept) if known is None else known
+            self.checkpoint_if_due()
             return sequence
 
     def merge(
@@ -449,12 +445,12 @@ class Ledger:
                 sums = merge.sums()
                 with self._together():
                     for done, row in enumerate(merge.rows(), start=1):
-                        self._append(**row, summed=sums is not None)
+                        self.append(**row, summed=sums is not None)
                         progress("merging", done, merge.total)
                     if sums is not None:
                         memory.join(sums, exemplars=False)
             self._changed(None)
-            self._checkpoint_if_due()
+            self.checkpoint_if_due()
         return Merged(merge.added, merge.shared, len(merge.descriptions)), merge.refused
 
     def compact(self, keep: int) -> Compacted:
@@ -518,14 +514,10 @@ class Ledger:
             self._changed(None)
             return True
 
-    def _checkpoint_if_due(self) -> None:
-        if self.saves:
-            materials = self._memory.statistics.material_count
-            self.checkpoint_in_background(max(CHECKPOINT_EVERY, materials // MATERIALS_PER_ROW))
-
-    def checkpoint_in_background(self, rows: int) -> None:
-        """Write a checkpoint in a thread, if so many rows or more came since the last; also where `saves` is False."""
-        if self._batching or self._memory.sequence - self._saved < rows:
+    def checkpoint_if_due(self) -> None:
+        """Write a checkpoint in a thread, where many rows came since the last."""
+        rows = max(CHECKPOINT_EVERY, self._memory.statistics.material_count // MATERIALS_PER_ROW)
+        if not self.saves or self._batching or self._memory.sequence - self._saved < rows:
             return
         arrays, attributes = self._memory.to_arrays()
         try:
@@ -536,6 +528,12 @@ class Ledger:
         self._note_saved()
         del arrays
         give_back_scratch()
+
+    def save(self) -> None:
+        """Write a checkpoint, if rows came since the last."""
+        if self._memory.sequence > self._saved or self._memory.weighings != self._saved_weighings:
+            self._pass_over_failures()
+            self._write_checkpoint()
 
     def _write_checkpoint(self) -> None:
         arrays, attributes = self._memory.to_arrays()
@@ -557,9 +555,7 @@ class Ledger:
                 # A change that was cut short is never saved: the journal holds all of it, or nothing.
                 if store.mode == "write" and self.saves and self._whole:
                     self._memory.weighings |= weighings
-                    if self._memory.sequence > self._saved or self._memory.weighings != self._saved_weighings:
-                        self._pass_over_failures()
-                        self._write_checkpoint()
+                    self.save()
             finally:
                 store.close()
                 give_back_scratch()

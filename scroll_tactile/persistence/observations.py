@@ -18,6 +18,7 @@ from scroll_tactile.memory.touch_rows import (
     ADAPT,
     DECLARE,
     MEMBER,
+    MERGE,
     OBSERVE,
     RETRACTS,
     SOURCE,
@@ -38,8 +39,7 @@ __all__ = [
     "is_from",
     "observation_of",
     "observations",
-    "observations_from",
-    "observations_of",
+    "observations_to_forget",
     "refusal",
     "rows_with",
 ]
@@ -121,58 +121,42 @@ def adaptation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation
     return sequence
 
 
-def observations_of(store: AnyStore, memory: Memory, material: str) -> list[int]:
-    """The sequences of all observations of a material, ascending.
+def observations_to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:
+    """The sequences of all observations of a material, or from a source: a file, or all in a folder or address.
 
-    Raises UnknownMaterialError for one never observed, ObservationError where some were compacted, and DamageError
-    where a damaged row may be one of them.
+    Raises UnknownMaterialError for a material never observed, ObservationError where a source has none, and where some
+    were compacted, and DamageError where a damaged row may be one of them.
     """
-    count = memory.statistics.materials.get(material, 0)
-    if not count:
+    if material is not None and material not in memory.statistics.materials:
         raise UnknownMaterialError(
             f"{material!r} was never observed; observed were {list(memory.statistics.materials)[:30]}"
         )
-    found = [head.sequence for head in _retractable(store, memory, material)]
-    if len(found) != count:
-        for _ in store.heads(memory.compacted):  # raises DamageError for a damaged row, which `_retractable` skips
-            pass
-        raise ObservationError(
-            f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
-            "compacted, and their features given up. Retract the others one by one, by their receipts"
-        )
-    return found
-
-
-def _retractable(store: AnyStore, memory: Memory, material: str | None = None) -> list[Head]:
-    """The observations whose arrays the journal still holds, of one material or all, in order; no damaged ones."""
-    rows = store.heads(memory.compacted, kind=OBSERVE, label=material)
-    return [head for head in rows if head.sequence not in memory.retracted]
-
-
-def observations_from(store: AnyStore, memory: Memory, source: str) -> list[int]:
-    """The sequences of all observations from a source, ascending: a file, or all that lies in a folder or address.
-
-    Raises ObservationError where there are none, and where some were compacted.
-    """
     mine = [
-        head for head in active_rows(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
+        head
+        for head in active_rows(store.heads())
+        if head.kind != MERGE and (is_from(_source(head), source) if material is None else head.label == material)
     ]
-    held = {head.sequence for head in _retractable(store, memory)}
     if not mine:
         raise ObservationError(
             f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
         )
-    if gone := [head for head in mine if head.sequence not in held]:
+    if gone := [head for head in mine if head.kind == MEMBER or head.sequence <= memory.compacted]:
+        what = f"what comes from {source!r}" if material is None else f"{material!r}"
         raise ObservationError(
-            f"what comes from {source!r} cannot be forgotten: {len(gone)} of its {len(mine)} observations in "
-            f"{store.path} were compacted, there or before they were merged, and their features given up"
+            f"{what} cannot be forgotten: {len(gone)} of its {len(mine)} observations in {store.path} were compacted, "
+            "there or before they were merged, and their features given up. Retract the others one by one, by their "
+            "receipts"
         )
     return [head.sequence for head in mine]
 
 
-def is_from(recorded: str | None, source: str) -> bool:
+def _source(head: Head) -> str | None:
+    return cast("str | None", head.attributes.get(SOURCE))
+
+
+def is_from(recorded: str | None, source: str | None) -> bool:
     """Whether an observation's recorded source is this one: the same file, or a file in this folder or address."""
-    place = source.rstrip("/")
+    place = (source or "").rstrip("/")
     # A file's name is followed by an interval in brackets or a topic, a folder's by a file.
     ends = "/[ " if "." in place.rpartition("/")[2] else "/"
     return recorded is not None and (recorded == source or recorded.startswith(tuple(place + end for end in ends)))
@@ -193,7 +177,7 @@ def observations(store: AnyStore) -> list[Observation]:
             key=head.key,
             time=head.time,
             state="retracted" if head.sequence in retracted else "compacted" if gone else "kept",
-            source=cast("str | None", head.attributes.get(SOURCE)),
+            source=_source(head),
             values=annotation.measured(quantities),
             labels=dict(annotation.labels),
         )
@@ -207,5 +191,6 @@ def compaction_point(store: AnyStore, memory: Memory, keep: int) -> int:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
     if keep == 0:
         return store.last
-    sequences = [head.sequence for head in _retractable(store, memory)]
+    kept = store.heads(memory.compacted, kind=OBSERVE)
+    sequences = [head.sequence for head in kept if head.sequence not in memory.retracted]
     return memory.compacted if len(sequences) <= keep else sequences[-keep] - 1

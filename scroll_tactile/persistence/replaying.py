@@ -187,7 +187,7 @@ def refill(memory: Memory, store: AnyStore) -> None:
     """Choose sample and exemplars again after a retraction; does nothing if no retracted touch was among them."""
     if memory.stale:
         # Rows that a writer appended since this memory was read are left for the next `load`.
-        memory.chosen = _chosen(memory, store, memory.sequence).chosen
+        memory.take_chosen(_chosen(memory, store, memory.sequence))
 
 
 def chosen_without(memory: Memory, store: AnyStore, gone: Mapping[int, Record]) -> Memory | None:

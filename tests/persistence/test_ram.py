@@ -27,7 +27,7 @@ def test_what_changes_it_leaves_what_observing_gives(made, tmp_path):
     assert learner.forget("c") == 3
     expected = [(name if touch != OBSERVED[1][1] else "a", touch) for name, touch in without(2) if name != "c"]
     assert held(learner) == held(fed(expected, **made))
-    assert learner.compact(keep=2).bytes_after < learner.compact(keep=2).bytes_before * 2
+    learner.compact(keep=2)
     with pytest.raises(ObservationError, match="were compacted"):
         learner.retract(1)
     last = [row for row in learner.observations() if row.state == "kept"][-1]

@@ -175,7 +175,7 @@ class SampleFields(TouchFields):
     """What a store keeps of a `TouchSample`, whose touches have p rows in all.
 
     sizes: how many of the rows are each touch's own, (n,). pairs: see `SampledTouch`, (p, 3). rows: feature by feature,
-    which takes less on the disk, (d, p); they are ordered by stage and scale, and among these by touch.
+    which takes less on the disk, (d, p).
     """
 
     sizes: Annotated[Ints, Must("int64", "n", 1, MOST_PAIRS)]
@@ -192,20 +192,13 @@ class TouchSample(Sample[SampledTouch]):
         pairs = np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)])
         rows = np.concatenate([np.zeros((0, dimension), np.int32), *(touch.rows for touch in touches)])
         sizes = np.array([len(touch.pairs) for touch in touches], dtype=np.int64)
-        return SampleFields(*self.named(), sizes, pairs, np.ascontiguousarray(rows[_by_scale(pairs)].T))
+        return SampleFields(*self.named(), sizes, pairs, np.ascontiguousarray(rows.T))
 
     @classmethod
     def of(cls, kept: SampleFields) -> TouchSample:
         """The sample that these fields were made of."""
         sample, edges = cls(), np.cumsum(kept.sizes)[:-1]
-        joined = np.empty(kept.rows.shape[::-1], np.int32)
-        joined[_by_scale(kept.pairs)] = kept.rows.T
-        rows, pairs = np.split(joined, edges), np.split(kept.pairs, edges)
+        rows, pairs = np.split(np.ascontiguousarray(kept.rows.T), edges), np.split(kept.pairs, edges)
         for i, (material, key, annotation) in enumerate(kept.named()):
             sample.add(material, key, SampledTouch(rows[i], pairs[i], annotation))
         return sample
-
-
-def _by_scale(pairs: Ints) -> npt.NDArray[np.intp]:
-    """The order in which the rows of a stage and a scale lie together."""
-    return np.lexsort((pairs[:, 1], pairs[:, 0]))

@@ -57,9 +57,7 @@ def test_the_sample_is_the_learners(made):
     assert keys(group, "sample-keys") == [key for _, key, _ in own]
     pairs = group["sample-pairs"][...]
     assert pairs.tolist() == np.concatenate([touch.pairs for *_, touch in own]).tolist()
-    columns = np.lexsort((pairs[:, 1], pairs[:, 0]))  # those of a stage and a scale lie together
-    rows = np.empty(group["sample-rows"].shape[::-1], np.int32)
-    rows[columns] = group["sample-rows"][...].T
+    rows = group["sample-rows"][...].T
     assert rows.tolist() == np.concatenate([touch.rows for *_, touch in own]).tolist()
 
 

@@ -160,7 +160,7 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
 
-    def _check_open(self, after: int = 0, *, write: bool = False) -> None:
+    def _check_open(self, *, write: bool = False) -> None:
         if os.getpid() != self._process:
             who = f"process {self._process}, of which this is a fork"
             raise StoreClosedError(f"{self.path} was opened by {who}: open it here again")
@@ -168,8 +168,6 @@ class Store:
             raise StoreClosedError(f"the store in {self.path} is closed")
         if write and self.mode != "write":
             raise ReadOnlyError(f'{self.path} was opened with mode="read"')
-        if after < 0:
-            raise RecordError(f"after must not be negative, not {after}")
 
     # What `CURRENT` names.
 
@@ -384,10 +382,7 @@ class Store:
         `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those that a
         repair named as lost. Raises DamageError at the first that is damaged or missing.
         """
-        self._check_open(after)
-        for what, text in (("the kind", kind), ("the label", label)):
-            if text is not None:
-                check_text(what, text)
+        self._check_open()
         found = self._rows_behind(after, arrays=False)
         return (head for head in found if kind in (None, head.kind) and label in (None, head.label))
 
@@ -410,7 +405,7 @@ class Store:
         `after` with which to continue behind it. Raises CompactedError where the first are compacted: `compaction` has
         their place, and its `last_sequence` is the `after` to continue with.
         """
-        self._check_open(after)
+        self._check_open()
         if after < self._settled().compacted:
             raise self._given_up(after + 1)
         return cast(Iterator[Record], self._rows_behind(after, arrays=True))

@@ -110,6 +110,16 @@ class TestBatch:
         with TactileLearner.open(path, **SETTINGS) as again:
             require_same(again, without(5), {"a": {"silk": 1.0}}, answers=True)
 
+    def test_retractions_follow_one_of_more_rows_than_are_on_the_disk(self, path):
+        with TactileLearner.open(path, **SETTINGS) as learner, learner.batch():
+            for name, touch in [*OBSERVED, *(("d", (seed, 60)) for seed in range(20, 40))]:
+                learner.observe(name, stream(touch))
+            learner.forget("d")
+            learner.retract(1)
+            learner.retract(2)
+        with TactileLearner.open(path, **SETTINGS) as again:
+            require_same(again, without(0, 1))
+
     def test_within_it_nothing_that_needs_a_checkpoint(self, path):
         learner, _ = filled(path)
         with learner:

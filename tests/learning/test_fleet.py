@@ -253,10 +253,12 @@ class TestGoingOn:
         left = tmp_path / "m.fleet" / "share-0.x.partial"  # of a worker that died
         (left / "whole").mkdir(parents=True)
         (tmp_path / "m.fleet" / "mine.txt").write_text("any")
+        (tmp_path / "m.fleet" / "share-known.json").unlink()
+        (tmp_path / "m.fleet" / "share-known.json").symlink_to("mine.txt")  # a link is not followed
         done = run(tmp_path / "m", [tmp_path / "in"], workers=3)
         assert len(learned) == len(set(learned)) == 12 == done.sources and done.repeated == 0
         require_learned(tmp_path / "m")
-        assert [path.name for path in (tmp_path / "m.fleet").iterdir()] == ["mine.txt"]
+        assert [path.read_text() for path in (tmp_path / "m.fleet").iterdir()] == ["any"]
 
     @pytest.mark.parametrize("merged", range(4))
     def test_a_full_disk_at_any_merge_costs_nothing(self, tmp_path, full, learned, merged):

@@ -63,7 +63,7 @@ def shared_tables() -> Iterator[None]:
         yield
 
 
-BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_checkpoint_bounds")
+BY_ZARR = ("test_store_commit", "test_store_roundtrip", "test_checkpoint_arrays")
 """What is about the writing and the reading themselves."""
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from forging import get_current, get_identity, log_of, put_row, set_current, set_identity
-from scroll_tactile_store.log import LogReader
+from scroll_tactile_store.log import Log, refuse
 from touches import PAD, stream
 
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -37,8 +37,8 @@ def placed(path: Path, **changes: Any) -> dict[str, Any]:
 
 def behind_all(path: Path) -> dict[str, Any]:
     """The newest checkpoint at the end of the log."""
-    with LogReader(log_of(path)) as log:
-        for _ in log.refresh():
+    with Log(log_of(path)) as log:
+        for _ in log.scan(refuse):
             pass
         return placed(path, offset=log.place.offset, number=log.place.number, previous=log.place.previous.hex())
 

@@ -19,8 +19,8 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from scroll_tactile_store.log_writer import LogWriter, create_log
-from scroll_tactile_store.row_encoding import ROW, encode_row
+from scroll_tactile_store.log import Log, create_log
+from scroll_tactile_store.rows import ROW, encode_row
 
 from examples.benchmarks.timing import Timing, timed
 from examples.paper.runs.options import Json, Seed
@@ -66,13 +66,18 @@ def _ways(folder: Path, opened: ExitStack) -> dict[str, Append]:
         database.execute(statement)
     database.execute("CREATE TABLE row (sequence INTEGER PRIMARY KEY, bytes BLOB) STRICT")
     create_log(folder / "log", b"{}")
-    journal = opened.enter_context(LogWriter(folder / "log"))
+    journal = opened.enter_context(Log(folder / "log", write=True))
+    journal.prepare()
     bare = os.open(folder / "bare", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     opened.callback(os.close, bare)
     about = ("add", "material", bytes(32), time.time(), "{}")
 
     def as_row(sequence: int, payload: bytes) -> bytes:
         return encode_row(sequence, *about, payload=payload, size=len(payload))
+
+    def to_log(*row: Any) -> None:
+        journal.stage(ROW, as_row(*row))
+        journal.commit()
 
     def to_bare(_: int, payload: bytes) -> None:
         os.write(bare, payload)
@@ -82,7 +87,7 @@ def _ways(folder: Path, opened: ExitStack) -> dict[str, Append]:
         "SQLite, WAL, synchronous=FULL": lambda *row: database.execute(
             "INSERT INTO row VALUES (?, ?)", (row[0], as_row(*row))
         ),
-        "the log": lambda *row: journal.append(ROW, as_row(*row)),
+        "the log": to_log,
         "a bare file that grows, fdatasync": to_bare,
     }
 

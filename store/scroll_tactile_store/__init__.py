@@ -26,7 +26,7 @@ from scroll_tactile_store.exceptions import (
 )
 from scroll_tactile_store.records import JSON, Checkpoint, Head, Record
 from scroll_tactile_store.repair import Repair, repair_store
-from scroll_tactile_store.store import Store
+from scroll_tactile_store.store import Store, StoreState
 from scroll_tactile_store.survey import Problem, check_store
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
     "StoreClosedError",
     "StoreError",
     "StoreFullError",
+    "StoreState",
     "VersionError",
     "check_store",
     "repair_store",

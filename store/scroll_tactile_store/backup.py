@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
 from scroll_tactile_store.files import copy_regular, is_real_folder, remove_tree, replacing, same_folder
-from scroll_tactile_store.found_log import Progress
 from scroll_tactile_store.layout import (
     CURRENT_FILE,
     PARTIAL,
@@ -21,11 +19,9 @@ from scroll_tactile_store.layout import (
     read_current,
     write_current,
 )
-from scroll_tactile_store.log import LogReader
-from scroll_tactile_store.row_encoding import HEAD_BYTES, ROW, row_sequence
-from scroll_tactile_store.survey import check_store
-
-__all__ = ["back_up"]
+from scroll_tactile_store.log import Log
+from scroll_tactile_store.rows import Rows
+from scroll_tactile_store.survey import Progress, check_store
 
 LARGEST_FILE = 2**30  # of a checkpoint
 PART = 2**20  # bytes that are copied at once
@@ -50,10 +46,9 @@ def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
 def _copy(source: Path, draft: Path) -> None:
     """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
     for _ in range(ATTEMPTS):
-        current, last = read_current(source / CURRENT_FILE), 0
+        current, last, failure = read_current(source / CURRENT_FILE), 0, None
         try:
             last = _copy_named(source, draft, current)
-            failure: Exception | None = None
         except (OSError, StoreError) as error:
             if not isinstance(error, DamageError) and not is_missing(error):
                 raise
@@ -70,20 +65,19 @@ def _copy(source: Path, draft: Path) -> None:
 
 
 def _copy_named(source: Path, draft: Path, current: Current) -> int:
-    """Copy what `current` names; return the last row of the log, or 0."""
-    last = 0
+    """Copy what `current` names; return the last row of the log, or 0. Verifying the copy names what is damaged."""
     for named in current.checkpoints:
         _copy_tree(checkpoint_path(source, named.number), checkpoint_path(draft, named.number))
     # The log last: it has every row that the checkpoints contain.
-    with LogReader(log_path(source, current.log), payloads=False) as log:
-        for batch in log.refresh():
-            rows = [frame for frame in batch if frame.kind == ROW]
-            with suppress(ValueError):  # damage, which verifying the copy names
-                last = row_sequence(log.peek(rows[-1].offset, HEAD_BYTES)) if rows else last
+    with Log(log_path(source, current.log)) as log:
+        if current.newest is not None and log.has_place(current.newest.place):
+            log.place = current.newest.place
+        rows = Rows(log.place, 0 if current.newest is None else current.newest.last_sequence)
+        rows.catch_up(log)
         with log_path(draft, current.log).open("xb") as copy:
             for offset in range(0, log.place.offset, PART):
                 copy.write(log.bytes_at(offset, min(PART, log.place.offset - offset)))
-    return last
+        return rows.last
 
 
 def _copy_tree(source: Path, target: Path) -> None:

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scroll_tactile_store.archive import Files
 from scroll_tactile_store.encoding import KEPT_TYPES, NAME, declared_size, require_shape
 from scroll_tactile_store.exceptions import DamageError, RecordError, StoreError, VersionError, reported
-from scroll_tactile_store.files import remove_tree, replacing, sync_folder
+from scroll_tactile_store.files import read_regular, remove_tree, replacing, sync_folder, tree_size
 from scroll_tactile_store.layout import FORMAT_VERSION, PARTIAL, checkpoint_path, other_format
 from scroll_tactile_store.records import JSON, LARGEST_JSON, LARGEST_NUMBER, from_json, json_digest
 
@@ -65,9 +64,9 @@ def index_name(log: bytes) -> str:
     return INDEX + log.hex()
 
 
-def most_bytes(files: Files, group: Path) -> int:
+def most_bytes(group: Path) -> int:
     """Return how many bytes of arrays the files of a checkpoint may stand for."""
-    return SPARE + RATIO * sum(files.sizes(group))
+    return SPARE + RATIO * tree_size(group)
 
 
 def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity: Mapping[str, JSON]) -> str:
@@ -86,7 +85,7 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
             remove_tree(partial)
             with replacing(final, partial):
                 group = _write_zarr(partial, draft.arrays, LEVEL)
-                if sum(array.nbytes for array in draft.arrays.values()) > most_bytes(Files(folder), partial):
+                if sum(array.nbytes for array in draft.arrays.values()) > most_bytes(partial):
                     # Readers make no room for so much that so little stands for: anybody could claim it.
                     remove_tree(partial)
                     group = _write_zarr(partial, draft.arrays, None)
@@ -101,7 +100,7 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
                 digest = json_digest(known)
                 group.update_attributes(known | {"sha256": digest})
                 try:
-                    CheckpointReader(partial, Files(folder))
+                    CheckpointReader(partial)
                 except DamageError as error:
                     raise RecordError(f"checkpoint {number} has more attributes than can be read: {error}") from error
     except BaseException:
@@ -161,12 +160,12 @@ class CheckpointReader:
     for another format, and StoreError for a file that cannot be read for a reason that says nothing against it.
     """
 
-    def __init__(self, path: Path, files: Files) -> None:
-        self._path, self._read = path, files.read
+    def __init__(self, path: Path) -> None:
+        self._path = path
         header = path / "zarr.json"
         with _reading(f"a checkpoint in {header}", header):
-            known = _described(header, files)
-            self._room = most_bytes(files, path)
+            known = _described(header)
+            self._room = most_bytes(path)
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]
         self.sha256: str = known["sha256"]
@@ -214,7 +213,7 @@ class CheckpointReader:
 
     def _verified_file(self, name: str, inside: str, limit: int) -> bytes:
         path = self._path / name / inside
-        data = self._read(path, limit)
+        data = read_regular(path, limit, within=self._path.parent.parent)
         if hashlib.sha256(data).hexdigest() != self._files[name].get(inside):
             raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
         return data
@@ -252,9 +251,9 @@ def _reading(what: str, path: Path) -> Iterator[None]:
         raise DamageError(f"{what} cannot be read: {type(error).__name__}: {error}", path=path) from error
 
 
-def _described(header: Path, files: Files) -> dict[str, Any]:
+def _described(header: Path) -> dict[str, Any]:
     """Return what a group says of itself, verified. Raises ValueError for another thing, VersionError and OSError."""
-    group: dict[str, Any] = from_json(files.read(header, LARGEST_JSON).decode())
+    group: dict[str, Any] = from_json(read_regular(header, LARGEST_JSON, within=header.parents[2]).decode())
     known: dict[str, Any] = dict(group["attributes"])
     # Before the format, which a flipped bit can make another one.
     if json_digest({name: value for name, value in known.items() if name != "sha256"}) != known.get("sha256"):

@@ -19,32 +19,12 @@ except ImportError:  # Windows has none
 else:
     FULL_SYNC = getattr(fcntl, "F_FULLFSYNC", None)
 
-__all__ = [
-    "CAREFULLY",
-    "copy_regular",
-    "file_size",
-    "is_file",
-    "is_real_folder",
-    "is_there",
-    "new_file",
-    "open_regular",
-    "read_regular",
-    "regular_file",
-    "remove_tree",
-    "replacing",
-    "same_folder",
-    "store_folder",
-    "sync_file",
-    "sync_folder",
-    "sync_open",
-    "sync_tree",
-    "tree_size",
-]
-
 # Not through a link, nor waiting for whoever might write into a pipe. Windows has neither.
 CAREFULLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 PART = 2**20  # bytes that are copied at once
+BLOCK = 512  # bytes, of st_blocks
+SPARE, RATIO = 64 * 2**20, 16  # what a file may claim beyond its bytes on the disk
 
 
 def sync_file(path: Path) -> None:
@@ -195,6 +175,19 @@ def open_regular(path: Path, flags: int) -> int:
         os.close(descriptor)
         raise DamageError(f"{path} is no regular file", path=path)
     return descriptor
+
+
+def dense_size(descriptor: int, path: Path) -> int:
+    """Return the bytes of an open file. Raises DamageError where next to nothing of them is on the disk."""
+    found = os.fstat(descriptor)
+    stored = getattr(found, "st_blocks", 0) * BLOCK  # 0 also where the file system does not tell
+    if stored and found.st_size > SPARE + RATIO * stored:
+        raise DamageError(
+            f"{path} says that it has {found.st_size} bytes, and {stored} are on the disk: nothing of it was read. In "
+            "a folder that comes from elsewhere trust nothing",
+            path=path,
+        )
+    return found.st_size
 
 
 def store_folder(path: str | os.PathLike[str]) -> Path:

@@ -1,4 +1,4 @@
-"""The frames of a log: their bytes, and whether they are as they were written (FORMAT.md describes them)."""
+"""The frames of a log: their bytes, where the next one belongs, whether they are as written (see FORMAT.md)."""
 
 from __future__ import annotations
 
@@ -6,20 +6,6 @@ import struct
 from typing import NamedTuple
 
 from scroll_tactile_store.records import payload_digest
-
-__all__ = [
-    "COMMIT",
-    "FRAME_BYTES",
-    "HEADER",
-    "IDENTITY_BYTES",
-    "LARGEST_PAYLOAD",
-    "MARK",
-    "NO_CHECKSUM",
-    "VERSION",
-    "Frame",
-    "pack_frame",
-    "read_frame",
-]
 
 # As PNG's: not text, and changed by whatever changes the ends of lines.
 MAGIC, VERSION = b"\x89ARLOG", 1
@@ -67,10 +53,41 @@ class Frame(NamedTuple):
         return self.offset + FRAME_BYTES + self.size
 
 
-def pack_frame(
-    identity: bytes, offset: int, number: int, batch: int, kind: int, payload: bytes, previous: bytes
-) -> tuple[bytes, Frame]:
-    """Return the bytes of a frame for this offset, and the frame; `previous` is the checksum of the one before it."""
+class LogPlace(NamedTuple):
+    """Where a log's next frame belongs: its offset and number, its batch's first number, the checksum before it."""
+
+    offset: int
+    number: int
+    batch: int
+    previous: bytes
+
+    @classmethod
+    def behind(cls, frame: Frame) -> LogPlace:
+        """Return the place of the frame behind this one, in a batch of its own where this one ends a batch."""
+        number = frame.number + 1
+        batch = number if frame.kind in (HEADER, COMMIT) else frame.batch
+        return cls(frame.offset + FRAME_BYTES + frame.size, number, batch, frame.checksum)
+
+    def holds(self, frame: Frame) -> bool:
+        """Return whether the frame is the one that belongs here."""
+        belongs = (frame.offset, frame.number, frame.batch, frame.previous) == self
+        largest = 0 if frame.kind == COMMIT else LARGEST_PAYLOAD
+        return belongs and frame.kind != HEADER and frame.size <= largest
+
+    def is_before(self, frame: Frame) -> bool:
+        """Return whether reading can go on with the frame, where none belongs here."""
+        return frame.number > self.number or (frame.number == self.number and frame.offset > self.offset)
+
+    def can_be_torn_before(self, frame: Frame) -> bool:
+        """Return whether a power cut while the batch of this place was written can have left the frame."""
+        if frame.number <= self.number:
+            return (frame.offset, frame.number, frame.batch, frame.previous) == self
+        return frame.batch == self.batch and frame.offset - self.offset >= FRAME_BYTES * (frame.number - self.number)
+
+
+def pack_frame(identity: bytes, place: LogPlace, kind: int, payload: bytes) -> tuple[bytes, Frame]:
+    """Return the bytes of the frame that belongs at a place of the log of this identity, and the frame."""
+    offset, number, batch, previous = place
     digest = payload_digest(payload)
     fields = FIELDS.pack(MARK, identity, number, batch, kind, len(payload), previous, digest)
     checksum = payload_digest(fields)

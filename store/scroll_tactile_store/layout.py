@@ -6,40 +6,16 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from scroll_tactile_store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
-from scroll_tactile_store.framing import IDENTITY_BYTES
-from scroll_tactile_store.log import LogPlace, LogReader
+from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
+from scroll_tactile_store.log import Log, refuse
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
-
-__all__ = [
-    "CHECKPOINTS",
-    "CURRENT_FILE",
-    "DAMAGED",
-    "HOLDER_FILE",
-    "LOCK_FILE",
-    "LOG",
-    "PARTIAL",
-    "Current",
-    "NamedCheckpoint",
-    "checkpoint_path",
-    "holds_store",
-    "is_number",
-    "log_numbers",
-    "log_path",
-    "numbers",
-    "other_format",
-    "read_current",
-    "remove_unnamed",
-    "require_unshared",
-    "unsafe_entries",
-    "write_current",
-]
 
 FORMAT_VERSION = 3
 OLDER = {
@@ -49,7 +25,6 @@ OLDER = {
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
-DERIVED = "derived"  # of release 0.16: it may tell of what was retracted since
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
 LOCK_FILE, HOLDER_FILE = "lock", "holder.json"
 LEGACY_FILE = "journal.sqlite"  # of releases 0.x
@@ -105,8 +80,7 @@ class Current:
     @property
     def checkpoints(self) -> list[NamedCheckpoint]:
         """The newest and the compaction checkpoint, each once."""
-        named = [named for named in (self.newest, self.compaction) if named is not None]
-        return named[:1] if len(named) > 1 and named[0].number == named[1].number else named
+        return list({each.number: each for each in (self.compaction, self.newest) if each is not None}.values())[::-1]
 
     @property
     def compacted(self) -> int:
@@ -140,8 +114,7 @@ class Current:
             )
             if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
                 raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
-            last = _count(known.get("last", 0))
-            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, last)
+            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, _count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
 
@@ -181,10 +154,10 @@ def _hex(text: Any, size: int) -> bytes:
     return bytes.fromhex(text)
 
 
-def read_current(path: Path, read: Callable[[Path, int], bytes] = read_regular) -> Current:
+def read_current(path: Path) -> Current:
     """Return what the `CURRENT` at `path` says. Raises DamageError, VersionError, and OSError where it is not there."""
     try:
-        data = read(path, LARGEST_CURRENT)
+        data = read_regular(path, LARGEST_CURRENT)
     except DamageError as error:
         raise _not_as_written(path, error) from error
     return Current.from_bytes(data, path)
@@ -216,13 +189,13 @@ def is_number(stem: str) -> bool:
 
 
 def log_numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
-    """Return the numbers of the logs in a store's folder, ascending; finished ones unless told otherwise."""
-    stems = (entry.name.removeprefix(LOG) for entry in folder.iterdir() if entry.name.startswith(LOG))
-    return _numbers(stems, NEW if unfinished else "")
+    """Return the numbers of the logs in a store's folder, ascending; unfinished: of half written ones, too."""
+    names = (entry.name for entry in folder.iterdir() if entry.name.startswith(LOG))
+    return _numbers((name.removeprefix(LOG) for name in names), NEW if unfinished else "")
 
 
 def numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
-    """Return the numbers of the checkpoints in a store's folder, ascending; finished ones unless told otherwise."""
+    """Return the numbers of the checkpoints in a store's folder, as `log_numbers` those of logs."""
     parent = folder / CHECKPOINTS
     entries = parent.iterdir() if is_real_folder(parent) else ()
     return _numbers((entry.name for entry in entries), PARTIAL if unfinished else "")
@@ -244,97 +217,83 @@ def holds_store(folder: Path) -> bool:
             return False
         if not folder.is_dir():
             raise NotAStoreError(f"{folder} is a file; a store is a folder")
-        for error in unsafe_entries(folder):
-            raise error
+        require_safe(folder)
         try:
             read_current(folder / CURRENT_FILE)
             return True
         except FileNotFoundError:
-            return _was_made_since(folder)
+            names = sorted(entry.name for entry in folder.iterdir())
+        if LEGACY_FILE in names:
+            raise VersionError(
+                f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
+                "recordings, or keep that release to read it"
+            )
+        # The first log is made before `CURRENT`: a writer may have died in between.
+        logs = [log_path(folder, number).name for number in log_numbers(folder)]
+        traces = [name for name in logs if name != log_path(folder, 1).name or _has_batches(folder / name)]
+        traces += [CHECKPOINTS] if numbers(folder) else []
+        traces += [name for name in names if DAMAGED in name]
+        foreign = [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]
+        if os.path.lexists(folder / CURRENT_FILE):
+            return True  # another process made it meanwhile
+        if traces:
+            raise DamageError(
+                f"{folder} has {' and '.join(sorted(traces))} but no {CURRENT_FILE}: put it back from a copy, or "
+                "repair the store (repair_store), which finds what it named",
+                path=folder / CURRENT_FILE,
+            )
+        if foreign:
+            raise NotAStoreError(
+                f"{folder} holds no store but other things ({', '.join(foreign[:3])}"
+                f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
+            )
+        return False
 
 
-def _was_made_since(folder: Path) -> bool:
-    """Return whether another process made the store meanwhile; raise where something else is in the folder."""
-    if (folder / LEGACY_FILE).exists():
-        raise VersionError(
-            f"{folder} was made by a release 0.x, whose memories this one does not read: learn it again from the "
-            "recordings, or keep that release to read it"
-        )
-    traces = [CHECKPOINTS] if numbers(folder) else []
-    # The first log is made before `CURRENT`: a writer may have died in between.
-    traces += [log_path(folder, number).name for number in log_numbers(folder) if number > 1 or _has_batches(folder)]
-    traces += [entry.name for entry in folder.iterdir() if DAMAGED in entry.name]
-    if os.path.lexists(folder / CURRENT_FILE):
-        return True
-    if traces:
-        raise DamageError(
-            f"{folder} has {' and '.join(sorted(traces))} but no {CURRENT_FILE}: put it back from a copy, or repair "
-            "the store (repair_store), which finds what it named",
-            path=folder / CURRENT_FILE,
-        )
-    ours = (LOCK_FILE, CHECKPOINTS)
-    names = sorted(entry.name for entry in folder.iterdir())
-    if foreign := [name for name in names if not name.startswith(OURS) and name not in ours]:
-        raise NotAStoreError(
-            f"{folder} holds no store but other things ({', '.join(foreign[:3])}"
-            f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
-        )
-    return os.path.lexists(folder / CURRENT_FILE)
-
-
-def _has_batches(folder: Path) -> bool:
-    """Whether more than its first frame was ever written to the first log."""
+def _has_batches(path: Path) -> bool:
+    """Whether more than its first frame was ever written to a log."""
     try:
-        with LogReader(log_path(folder, 1)) as log:
-            return any(True for _ in log.refresh())
+        with Log(path) as log:
+            return any(True for _ in log.scan(refuse))
     except DamageError:
         return True
 
 
-def unsafe_entries(folder: Path) -> Iterator[DamageError]:
+def require_safe(folder: Path, *, written: bool = False) -> None:
+    """Raise DamageError for the first of `unsafe_entries`."""
+    with reported(folder, "looking at what is there"):
+        for error in unsafe_entries(folder, written=written) if folder.is_dir() else ():
+            raise error
+
+
+def unsafe_entries(folder: Path, *, written: bool = False) -> Iterator[DamageError]:
     """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
 
     A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never
-    end. Raises OSError.
+    end. written: also for a file that is written in place and has another name, which that would change, too. Raises
+    OSError.
     """
-    for path, is_ours in _named_as_ours(folder):
-        if not is_ours and os.path.lexists(path):
-            what = "a symbolic link" if path.is_symlink() else "no regular file or folder"
-            yield DamageError(
-                f"{path} is {what}, where a store has a file or folder of its own: nothing was read through it. Put "
-                "what belongs there in its place; in a folder that comes from elsewhere trust nothing",
-                path=path,
-            )
-
-
-def require_unshared(folder: Path) -> None:
-    """Raise DamageError where a file that is written in place has another name: writing would change that too."""
-    with reported(folder, "looking for what may be written"):
-        for path, is_ours in _named_as_ours(folder) if folder.is_dir() else ():
+    for parent in (folder, folder / CHECKPOINTS):
+        for path in parent.iterdir() if is_real_folder(parent.resolve() if parent == folder else parent) else ():
+            is_folder = path.name == CHECKPOINTS if parent == folder else is_number(path.name.removesuffix(PARTIAL))
+            is_file = parent == folder and (path.name.startswith(OURS) or path.name == LOCK_FILE)
             try:
                 status = path.lstat()
             except FileNotFoundError:  # another process may have written it and moved it
                 continue
-            if is_ours and path.parent == folder and stat.S_ISREG(status.st_mode) and status.st_nlink > 1:
-                raise DamageError(
+            if (is_folder and not stat.S_ISDIR(status.st_mode)) or (is_file and not stat.S_ISREG(status.st_mode)):
+                what = "a symbolic link" if stat.S_ISLNK(status.st_mode) else "no regular file or folder"
+                yield DamageError(
+                    f"{path} is {what}, where a store has a file or folder of its own: nothing was read through it. "
+                    "Put what belongs there in its place; in a folder that comes from elsewhere trust nothing",
+                    path=path,
+                )
+            elif written and is_file and status.st_nlink > 1:
+                yield DamageError(
                     f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
                     'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
                     path=path,
                 )
-
-
-def _named_as_ours(folder: Path) -> Iterator[tuple[Path, bool]]:
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name == CHECKPOINTS:
-                yield Path(entry.path), entry.is_dir(follow_symlinks=False)
-            elif entry.name.startswith(OURS) or entry.name == LOCK_FILE:
-                yield Path(entry.path), entry.is_file(follow_symlinks=False)
-    if is_real_folder(folder / CHECKPOINTS):
-        with os.scandir(folder / CHECKPOINTS) as entries:
-            for entry in entries:
-                if is_number(entry.name.removesuffix(PARTIAL)):
-                    yield Path(entry.path), entry.is_dir(follow_symlinks=False)
 
 
 def remove_unnamed(folder: Path, current: Current) -> None:
@@ -345,8 +304,7 @@ def remove_unnamed(folder: Path, current: Current) -> None:
     kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
     found = [(log_path(folder, number), NEW) for number in log_numbers(folder, unfinished=True)]
     found += [(checkpoint_path(folder, number), PARTIAL) for number in numbers(folder, unfinished=True)]
-    for name in (CURRENT_FILE + NEW, DERIVED):
-        remove_tree(folder / name)
+    remove_tree(folder / (CURRENT_FILE + NEW))
     for path, suffix in found:
         if path not in kept:
             remove_tree(path)

@@ -19,15 +19,13 @@ from scroll_tactile_store.layout import (
     Current,
     holds_store,
     log_path,
-    require_unshared,
+    require_safe,
     write_current,
 )
-from scroll_tactile_store.log_writer import create_log
+from scroll_tactile_store.log import create_log
 
 if TYPE_CHECKING:
     from filelock import BaseFileLock
-
-__all__ = ["WriterLock", "lock_to_write"]
 
 LARGEST_NOTE = 4096  # bytes
 
@@ -107,7 +105,7 @@ def lock_to_write(folder: Path, identity: str | None) -> WriterLock:
         if not folder.is_dir():
             folder.mkdir(parents=True, exist_ok=True)
             sync_folder(folder.parent)
-    require_unshared(folder)
+    require_safe(folder, written=True)
     lock = WriterLock(folder)
     try:
         # Asked again, under the lock: another writer may have made the store, and left, since.

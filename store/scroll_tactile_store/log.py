@@ -1,4 +1,4 @@
-"""The log read: whole batches of frames in order, and single frames by where they are; nothing is ever written.
+"""A log: whole batches of frames read in order by one scan, single frames by where they are, and batches appended.
 
 A batch is written once the one before it is durable. So behind a frame that does not verify there may be, after a power
 cut, others of its own batch and nothing else; any other frame of the log there proves that a durable one was damaged.
@@ -6,313 +6,428 @@ cut, others of its own batch and nothing else; any other frame of the log there 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import errno
+import logging
+import os
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple, Self
+from shutil import disk_usage
+from typing import Self
 
-from scroll_tactile_store.exceptions import DamageError, StoreError, VersionError, reported
+from scroll_tactile_store.exceptions import FULL, DamageError, RecordError, StoreClosedError, VersionError, reported
+from scroll_tactile_store.files import dense_size, new_file, open_regular, replacing, sync_open
 from scroll_tactile_store.framing import (
     COMMIT,
     FRAME_BYTES,
     HEADER,
+    IDENTITY_BYTES,
     LARGEST_PAYLOAD,
     MARK,
     NO_CHECKSUM,
     VERSION,
     Frame,
+    LogPlace,
     pack_frame,
     read_frame,
 )
-from scroll_tactile_store.log_file import LogFile, Window, frames_behind
-from scroll_tactile_store.records import LARGEST_NUMBER, payload_digest
+from scroll_tactile_store.records import payload_digest
 
-__all__ = ["LogPlace", "LogReader"]
+logger = logging.getLogger(__name__)
 
-# A window older than the file, what a writer is just writing, and damage look alike the first time, and not the third.
+# Is called with what is damaged and the frames before it in its batch, which verify. It raises, or the scan goes on
+# behind the damage.
+Damaged = Callable[[DamageError, list[Frame]], object]
+
+BEGIN = LogPlace(0, 0, 0, NO_CHECKSUM)
+USUAL = 2**13  # bytes of a frame, which are read at once
+PART = 2**18  # bytes of the file that are looked through at once
+# What a writer is just writing and damage look alike the first time, and not the third.
 ATTEMPTS = 3
 
-
-class LogPlace(NamedTuple):
-    """Where a log's next frame belongs: its offset and number, its batch's first number, the checksum before it."""
-
-    offset: int
-    number: int
-    batch: int
-    previous: bytes
-
-    @classmethod
-    def behind(cls, frame: Frame) -> LogPlace:
-        """Return the place of the frame behind this one, in a batch of its own where this one ends a batch."""
-        number = frame.number + 1
-        batch = number if frame.kind in (HEADER, COMMIT) else frame.batch
-        return cls(frame.end, number, batch, frame.checksum)
-
-    def holds(self, frame: Frame) -> bool:
-        """Return whether the frame is the one that belongs here."""
-        belongs = (frame.offset, frame.number, frame.batch, frame.previous) == self
-        largest = 0 if frame.kind == COMMIT else LARGEST_PAYLOAD
-        return belongs and frame.kind != HEADER and frame.size <= largest
-
-    def is_before(self, frame: Frame) -> bool:
-        """Return whether reading can go on with the frame, where none belongs here."""
-        return frame.number > self.number or (frame.number == self.number and frame.offset > self.offset)
-
-    def can_be_torn_before(self, frame: Frame) -> bool:
-        """Return whether a power cut while the batch of this place was written can have left the frame."""
-        if frame.number <= self.number:
-            return (frame.offset, frame.number, frame.batch, frame.previous) == self
-        return frame.batch == self.batch and frame.offset - self.offset >= FRAME_BYTES * (frame.number - self.number)
+# Zeros are written ahead: to write over them changes nothing but bytes, and fdatasync has no file system's journal to
+# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.) Of a disk that is nearly
+# full the rest is for others.
+AHEAD = 2**20
+SPARE_ROOM = 16 * AHEAD
+LARGEST_STAGED = 2**22  # bytes that wait in memory for their commit
+TOGETHER = 4096  # frames of a batch in a log that replaces another
+NO_ROOM = FULL | {errno.EFBIG}
 
 
-class LogReader:
-    """An open log. It needs no lock and leaves every byte as it is; a writer may be at work.
+def refuse(damage: DamageError, _: list[Frame]) -> None:
+    """Raise what is damaged: whoever uses a store goes on behind no damage."""
+    what = f"{damage}: repair the store (repair_store)"
+    raise DamageError(what, path=damage.path, offset=damage.offset, frame=damage.frame) from damage
 
-    `header` is the payload of the log's first frame, the caller's. `place` is behind the last batch that was read:
-    kept elsewhere, and given again, it saves reading what is before it. A batch can be read an instant before it is
-    durable. One thread at a time may refresh; any may read.
 
-    payloads: whether `refresh` verifies these, too; where it does not, `read` still does. identity: of a log whose
-    first frame may be damaged, which is then named in `header_damage`, and `refresh` begins with the first that is not.
-    file: the log, where it is open already.
+class Log:
+    """An open log. To read it needs no lock and leaves every byte as it is; a writer may be at work.
 
-    durable: a place that its writer noted elsewhere. Where it is in the log, what is before it is no torn batch.
+    `header` is the payload of its first frame, the caller's; `identity` is what all its frames carry. `place` is where
+    reading, or the one writer, goes on: behind the first frame, until something is scanned. One thread at a time may
+    use it.
 
-    Raises VersionError for a newer format, DamageError for what is no log, or not the one of `place`, and StoreError.
+    write: for whoever holds the writer's lock. identity: of a log whose first frame may be damaged, b"" where nobody
+    knows it; then `header_damage` names that damage, and a scan begins with the first frame that can be found.
+
+    Raises VersionError for a newer format, DamageError for what is no log, StoreError, and OSError when it is opened.
     """
 
-    WRITES = False
-    durable: LogPlace | None = None
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        place: LogPlace | None = None,
-        payloads: bool = True,
-        identity: bytes | None = None,
-        file: LogFile | None = None,
-    ) -> None:
-        self.path = path
-        self.payloads = payloads
+    def __init__(self, path: Path, *, write: bool = False, identity: bytes | None = None) -> None:
+        self.path, self.header = path, b""
         self.header_damage: DamageError | None = None
-        with reported(path, "opening the log"):
-            self._file = LogFile(path, write=self.WRITES) if file is None else file
-            try:
-                self._window = Window(self._file)
-                self._torn: LogPlace | None = None
-                self._proved: Frame | None = None
-                self._first: Frame | None = None
-                try:
-                    self._first = self._read_header()
-                    self.place = LogPlace.behind(self._first)
-                except DamageError as damage:
-                    if identity is None:
-                        raise
-                    self._begin_without_header(identity, damage)
-                self._last = self._first
-                if place is not None and place != self.place:
-                    self._last = self._commit_before(place)
-                    self.place = place
-            except BaseException:
-                if file is None:
-                    self._file.close()
-                raise
+        self._proved: Frame | None = None
+        self._descriptor = open_regular(path, os.O_RDWR if write else os.O_RDONLY)
+        try:
+            self._read_header(identity)
+            self._begin_batch()
+        except BaseException:
+            self._release()
+            raise
 
-    def _read_header(self) -> Frame:
-        self._file.size()
-        frame = read_frame(self._window.read(0, FRAME_BYTES), 0)
+    def _read_header(self, identity: bytes | None) -> None:
+        self.place = BEGIN
+        try:
+            frame = self._first_frame()
+            self.identity, self._mark = frame.identity, MARK + frame.identity
+            self.header = self._payload(frame, b"")
+            self.place = LogPlace.behind(frame)
+        except DamageError as damage:
+            if identity is None:
+                raise
+            self.header_damage = damage
+            found = identity or next((frame.identity for frame in self._frames_behind(0, MARK)), None)
+            if found is None:
+                raise
+            self.identity, self._mark = found, MARK + found
+        self.first = self.place
+
+    def _first_frame(self) -> Frame:
+        self.size()
+        frame = read_frame(self._at(0, FRAME_BYTES), 0)
         if frame is None:
-            raise self._damage("does not begin as a log, or its first frame is not as it was written", 0, 0)
+            raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
         if frame.version > VERSION:
             raise VersionError(
                 f"{self.path} is written in format {frame.version}; this release reads format {VERSION}: upgrade it; "
                 "nothing was changed"
             )
-        expected = (VERSION, 0, 0, HEADER, NO_CHECKSUM)
-        if (frame.version, frame.number, frame.batch, frame.kind, frame.previous) != expected:
-            raise self._damage("does not begin with the first frame of a log", 0, 0)
-        self.identity = frame.identity
-        self._mark = MARK + frame.identity
-        self.header = self._payload(frame)
+        if frame.version != VERSION or frame[3:6] != (0, 0, HEADER) or frame.previous != NO_CHECKSUM:
+            raise self._damage("does not begin with the first frame of a log", BEGIN)
         return frame
 
-    def _begin_without_header(self, identity: bytes, damage: DamageError) -> None:
-        self.header, self.identity, self._mark, self.header_damage = b"", identity, MARK + identity, damage
-        self._torn = self.place = LogPlace(0, 0, 0, NO_CHECKSUM)
-        with suppress(DamageError):
-            self.resume()
+    def _damage(self, what: str, at: LogPlace | Frame) -> DamageError:
+        return DamageError(f"{self.path} {what} (byte {at.offset})", path=self.path, offset=at.offset, frame=at.number)
 
-    def has_place(self, place: LogPlace) -> bool:
-        """Return whether a place is behind the first frame or a batch of this log."""
-        if self._first is not None and place == LogPlace.behind(self._first):
-            return True
-        try:
-            with reported(self.path, "looking for a place"):
-                self._commit_before(place)
-        except DamageError:
-            return False
-        return True
+    # Reading.
 
-    def _commit_before(self, place: LogPlace) -> Frame:
-        offset = place.offset - FRAME_BYTES
-        is_inside = 0 < offset < self._file.size()
-        frame = read_frame(self._file.read(offset, FRAME_BYTES), offset) if is_inside else None
-        ours = frame is not None and self._is_ours(frame) and frame.kind == COMMIT and frame.number < LARGEST_NUMBER
-        if frame is None or not ours or LogPlace.behind(frame) != place:
-            raise self._damage(f"holds no batch that ends with frame {place.number - 1} there", offset, place.number)
-        return frame
+    def _at(self, offset: int, size: int) -> bytes:
+        """Return so many bytes of the file at an offset, fewer where it ends."""
+        os.lseek(self._open(), offset, os.SEEK_SET)
+        data = part = os.read(self._descriptor, size)
+        while part and len(data) < size:
+            part = os.read(self._descriptor, size - len(data))
+            data += part
+        return data
+
+    def _open(self) -> int:
+        if self._descriptor < 0:
+            raise StoreClosedError(f"the log {self.path} is closed")
+        return self._descriptor
+
+    def size(self) -> int:
+        """Return the bytes of the file. Raises DamageError where they are holes, which no log has."""
+        return dense_size(self._open(), self.path)
 
     def _is_ours(self, frame: Frame) -> bool:
         return frame.version == VERSION and frame.identity == self.identity
 
-    def _damage(self, what: str, offset: int, number: int) -> DamageError:
-        return DamageError(f"{self.path} {what} (byte {offset})", path=self.path, offset=offset, frame=number)
+    def scan(self, damaged: Damaged, durable: LogPlace | None = None) -> Iterator[list[Frame]]:
+        """Yield the frames of each batch that was committed behind `place`, verified and in order; move that behind it.
 
-    def refresh(self) -> Iterator[list[Frame]]:
-        """Yield what was committed since the last call: the frames of each batch, verified and in order.
-
-        A batch without its commit frame is not there yet. Raises DamageError at the first damaged frame: those before
-        it were yielded, its batch's too, and `resume` continues behind it. Raises StoreError where the writer took back
-        what was read here, because it could not be made durable: open the log anew.
+        A batch without its commit frame is not there yet. durable: a place that was noted elsewhere; where it is in the
+        log what is before it is no torn batch.
         """
-        with reported(self.path, "reading the log"):
-            last = self._last
-            if last is not None and read_frame(self._file.read(last.offset, FRAME_BYTES), last.offset) != last:
-                raise StoreError(f"{self.path} no longer ends as it did, its writer took a batch back: open it anew")
-            damage = None
-            while damage is None:
-                batch, damage = self._next_batch()
-                if damage is not None and self._torn is not None:
-                    self._last, self.place = self._first, self._torn
-                elif batch:
-                    self._last = batch.pop()
-                    self.place = LogPlace.behind(self._last)
-                else:
-                    return
-                if batch:
-                    yield batch
-            raise damage
-
-    def _next_batch(self) -> tuple[list[Frame], DamageError | None]:
-        """Return the next batch with its commit frame, nothing where the log ends; or what is before damage, and it."""
-        damage: DamageError | None = None
-        for attempt in range(ATTEMPTS):
-            batch, torn = self._scan()
-            if torn is None:
-                return batch, None
-            self._window.drop()
-            if attempt:
-                if (proof := self._proof(torn)) is None:
-                    return [], None
-                self._torn = torn
-                damage = self._damage(
-                    f"is damaged: frame {torn.number} is not as it was written, and frame {proof.number} at byte "
-                    f"{proof.offset} proves that it was durable. What is before it verifies and can be kept",
-                    torn.offset,
-                    torn.number,
-                )
-        return batch, damage
-
-    def _scan(self) -> tuple[list[Frame], LogPlace | None]:
-        """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
-        place, size = self.place, self._file.size()
-        batch: list[Frame] = []
+        if self.place == BEGIN:
+            self._resume(BEGIN)
         while True:
-            frame = read_frame(self._window.read(place.offset, FRAME_BYTES), place.offset)
+            frames, torn, proof = self._next_batch(durable)
+            if torn is None:
+                self.place = LogPlace.behind(frames.pop())
+                if frames:
+                    yield frames
+            elif proof is None:
+                return
+            else:
+                what = (
+                    f"is damaged: frame {torn.number} is not as it was written, and {proof} proves that it was durable"
+                )
+                damaged(self._damage(f"{what}. What is before it verifies and can be kept", torn), frames)
+                if not self._resume(torn):
+                    return
+
+    def _next_batch(self, durable: LogPlace | None) -> tuple[list[Frame], LogPlace | None, str | None]:
+        """Return the next batch; or what verifies of it, the place where it ends, and what proves that it was whole."""
+        with reported(self.path, "reading the log"):
+            for attempt in range(ATTEMPTS):
+                frames, torn = self._batch()
+                if torn is None:
+                    return frames, None, None
+                proof = self._proof(torn, durable) if attempt else None
+                if attempt and proof is None:
+                    break
+        return frames, torn, proof
+
+    def _batch(self) -> tuple[list[Frame], LogPlace | None]:
+        """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
+        place, size, frames = self.place, self.size(), list[Frame]()
+        while True:
+            data = self._at(place.offset, USUAL)
+            frame = read_frame(data, place.offset)
             if frame is None or not self._is_ours(frame) or not place.holds(frame) or frame.end > size:
-                return batch, place
-            if self.payloads and self._window.digest(frame.payload_offset, frame.size) != frame.digest:
-                return batch, place
-            batch.append(frame)
+                return frames, place
+            try:
+                self._payload(frame, data[FRAME_BYTES:])
+            except DamageError:
+                return frames, place
+            frames.append(frame)
             if frame.kind == COMMIT:
-                return batch, None
+                return frames, None
             place = LogPlace.behind(frame)
 
-    def _proof(self, torn: LogPlace) -> Frame | None:
-        """Return a frame of this log that no power cut can have left behind a torn one; None where there is none."""
-        known = self._proved
-        if known is not None and known.offset > torn.offset and not torn.can_be_torn_before(known):
-            # Or each of many damaged frames would be a search of all that is behind it.
-            found = read_frame(self._file.read(known.offset, FRAME_BYTES), known.offset)
-            if found == known:
-                return known
-        if self.durable is not None and torn.offset < self.durable.offset:
-            commit = pack_frame(self.identity, torn.offset, torn.number, torn.batch, COMMIT, b"", torn.previous)[1]
-            if LogPlace.behind(commit) == self.durable:
-                return commit  # as it was: all of its batch is there but for this frame
-            with suppress(DamageError):
-                return self._commit_before(self.durable)
-        behind = frames_behind(self._file, torn.offset, self._mark)
-        self._proved = next((frame for frame in behind if not torn.can_be_torn_before(frame)), None)
-        return self._proved
+    def _payload(self, frame: Frame, begin: bytes) -> bytes:
+        """Return the payload of a frame, verified; begin: what was read of it, and maybe of what is behind it."""
+        payload = begin[: frame.size]
+        if len(payload) < frame.size <= min(LARGEST_PAYLOAD, self.size()):
+            payload += self._at(frame.payload_offset + len(payload), frame.size - len(payload))
+        if len(payload) != frame.size or payload_digest(payload) != frame.digest:
+            raise self._damage(f"is damaged: the payload of frame {frame.number} is not as it was written", frame)
+        return payload
 
-    def resume(self) -> None:
-        """Go on behind the damaged frame that `refresh` named, at the next that can be found; the rest is lost."""
-        if (torn := self._torn) is None:
-            return
+    def _proof(self, torn: LogPlace, durable: LogPlace | None) -> str | None:
+        """Return what no power cut can have left behind a torn frame, in words; None where there is nothing."""
+        if durable is not None and torn.offset < durable.offset:
+            commit = pack_frame(self.identity, torn, COMMIT, b"")[1]  # as it was, where only that is damaged
+            if LogPlace.behind(commit) == durable or self.has_place(durable):
+                return "the place of the newest checkpoint"
+        known = self._proved  # or each of many damaged frames would be a search of all that is behind it
+        if known is None or known.offset <= torn.offset or torn.can_be_torn_before(known):
+            behind = self._frames_behind(torn.offset, self._mark)
+            self._proved = known = next((frame for frame in behind if not torn.can_be_torn_before(frame)), None)
+        return None if known is None else f"frame {known.number} at byte {known.offset}"
+
+    def _resume(self, torn: LogPlace) -> bool:
+        """Go on behind a damaged frame, at the next that can be found, if any."""
         with reported(self.path, "looking for a frame behind damage"):
-            behind = frames_behind(self._file, torn.offset, self._mark)
-            if (frame := next(filter(torn.is_before, behind), None)) is None:
-                raise self._damage("holds no frame behind the damage", torn.offset, torn.number)
-            self.place = LogPlace(frame.offset, frame.number, frame.batch, frame.previous)
-            self._last, self._torn = self._first, None
+            found = next(filter(torn.is_before, self._frames_behind(torn.offset, self._mark)), None)
+        if found is not None:
+            self.place = LogPlace(found.offset, found.number, found.batch, found.previous)
+        return found is not None
 
-    def read(self, offset: int, size: int) -> tuple[Frame, bytes]:
-        """Return the frame at an offset, whose payload has `size` bytes, and that payload, both verified.
+    def _frames_behind(self, offset: int, mark: bytes) -> Iterator[Frame]:
+        """Yield the frames whose first bytes verify, found by what they begin with, wherever they are."""
+        for start in range(offset, self.size(), PART):
+            data = self._at(start, PART + FRAME_BYTES - 1)
+            found = data.find(mark)
+            while 0 <= found < PART:
+                if (frame := read_frame(data[found : found + FRAME_BYTES], start + found)) is not None:
+                    yield frame
+                found = data.find(mark, found + 1)
 
-        Raises DamageError where there is none.
+    def has_place(self, place: LogPlace) -> bool:
+        """Return whether a place is behind the first frame or a batch of this log."""
+        if place == self.first:
+            return True
+        offset = place.offset - FRAME_BYTES
+        frame = self.frame_at(offset) if 0 < offset < 2**63 else None
+        return frame is not None and frame.kind == COMMIT and LogPlace.behind(frame) == place
+
+    def read(self, offset: int, size: int, *, first: int | None = None) -> bytes:
+        """Return the payload, of `size` bytes, of the frame at an offset, verified. Raises DamageError.
+
+        first: so many of its first bytes, or all; only that the frame is there is verified.
         """
-        frame = self.frame(offset, size)
+        wanted = size if first is None else min(first, size)
         with reported(self.path, "reading a frame"):
-            return frame, self._payload(frame)
+            data = self._raw(offset, FRAME_BYTES + wanted)
+            frame = read_frame(data, offset)
+            if frame is None or not self._is_ours(frame) or frame.size != size or len(data) < FRAME_BYTES + wanted:
+                raise self._damage(
+                    f"holds no frame with a payload of {size} bytes there", BEGIN._replace(offset=offset)
+                )
+            return self._payload(frame, data[FRAME_BYTES:]) if first is None else data[FRAME_BYTES:]
 
-    def frame(self, offset: int, size: int) -> Frame:
-        """Return the frame at an offset, verified but for its payload of `size` bytes. Raises DamageError."""
+    def _raw(self, offset: int, size: int) -> bytes:
+        """Return bytes of the log, staged ones, too, fewer where it ends."""
+        begin = offset - self._written
+        if 0 <= begin < len(self._staged):
+            return bytes(self._staged[begin : begin + size])
+        room = self.size() - offset
+        return self._at(offset, min(size, room)) if offset >= 0 and room > 0 else b""
+
+    def frame_at(self, offset: int) -> Frame | None:
+        """Return the frame at an offset, whose payload is not looked at; None where there is none of this log."""
         with reported(self.path, "reading a frame"):
-            if not 0 <= offset <= offset + FRAME_BYTES + size <= self._file.size():
-                raise self._damage(f"ends before a frame of {size} bytes could", offset, 0)
-            frame = read_frame(self._file.read(offset, FRAME_BYTES), offset)
-            if frame is None or not self._is_ours(frame) or frame.size != size:
-                raise self._damage(f"holds no frame with a payload of {size} bytes there", offset, 0)
-            return frame
-
-    def peek(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes of the payload of the frame at an offset, not verified, fewer where the file ends."""
-        with reported(self.path, "reading the beginning of a frame"):
-            return self._file.read(offset + FRAME_BYTES, size)
+            frame = read_frame(self._at(offset, FRAME_BYTES), offset)
+            return frame if frame is not None and self._is_ours(frame) else None
 
     def bytes_at(self, offset: int, size: int) -> bytes:
         """Return bytes of the file as they are, fewer where it ends."""
         with reported(self.path, "copying the log"):
-            return self._file.read(offset, size)
+            return self._at(offset, size)
 
-    def _payload(self, frame: Frame) -> bytes:
-        payload = b""
-        if frame.size <= LARGEST_PAYLOAD and frame.end <= self._file.size():
-            payload = self._file.read(frame.payload_offset, frame.size)
-        if payload_digest(payload) != frame.digest or len(payload) != frame.size:
-            raise self._damage(
-                f"is damaged: the payload of frame {frame.number} is not as it was written", frame.offset, frame.number
-            )
-        return payload
+    # Writing, by whoever holds the writer's lock.
 
-    @property
-    def size(self) -> int:
-        """The bytes of the file."""
-        with reported(self.path, "measuring the log"):
-            return self._file.size()
+    def prepare(self) -> None:
+        """Make ready to append at `place`, behind all that was committed; cut off what a kill or a power cut left."""
+        with reported(self.path, "preparing the log"):
+            self._begin_batch()
+            self._allocated = self.size()
+            parts = (self._at(at, PART) for at in range(self.place.offset, self._allocated, PART))
+            self._settled = not any(part.count(0) < len(part) for part in parts)
+            self._settle()
+            # The last commit may be in the system's memory alone, if its writer was killed before its sync.
+            sync_open(self._descriptor)
 
-    def reader_of_heads(self) -> LogReader:
-        """Return another reader of the same open file, of heads alone, from its beginning; it is not to be closed."""
-        return LogReader(self.path, payloads=False, file=self._file)
+    def _begin_batch(self) -> None:
+        """Nothing is staged, and what is written next belongs behind the last commit."""
+        self._staged = bytearray()
+        self._written = self.place.offset
+        self._next = self.place
 
-    def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        self._file.close()
+    def _settle(self) -> None:
+        """Cut off what is behind the last commit, where something may be; raises OSError."""
+        if not self._settled:
+            os.ftruncate(self._open(), self.place.offset)
+            self._allocated = self.place.offset
+            sync_open(self._descriptor)
+            self._settled = True
+
+    def stage(self, kind: int, payload: bytes) -> Frame:
+        """Add a frame to the batch that the next `commit` makes durable; `kind` is 2 or more, the caller's.
+
+        After an error the whole batch is not there.
+        """
+        if not COMMIT < kind < 2**32 or len(payload) > LARGEST_PAYLOAD:
+            raise RecordError(f"a frame of kind {kind} and {len(payload)} bytes cannot be kept")
+        with reported(self.path, "appending to the log"):
+            if self._next == self.place:
+                self._settle()  # a batch that could not be taken back
+            try:
+                frame = self._pack(kind, payload)
+                if len(self._staged) > LARGEST_STAGED:
+                    self._write()
+            except BaseException:
+                self.rollback()
+                raise
+            return frame
+
+    def _pack(self, kind: int, payload: bytes) -> Frame:
+        data, frame = pack_frame(self.identity, self._next, kind, payload)
+        self._staged += data
+        self._next = LogPlace.behind(frame)
+        return frame
+
+    def _write(self) -> None:
+        """Write what is staged, with one call, and zeros behind it where the file ends."""
+        begin, end = self._written, self._written + len(self._staged)
+        self._settled = False  # until it is committed
+        ahead = end
+        # Asked of the open file, whose folder may have been moved; Windows takes a path alone.
+        where = self.path.parent if os.name == "nt" else self._open()
+        if end > self._allocated and disk_usage(where).free > SPARE_ROOM:
+            ahead = -(-end // AHEAD) * AHEAD
+        try:
+            self._put(begin, self._staged + bytes(ahead - end) if ahead > end else self._staged)
+        except OSError as error:
+            if ahead == end or error.errno not in NO_ROOM:
+                raise
+            self._put(begin, self._staged)
+            ahead = end
+        self._allocated = max(self._allocated, ahead)
+        self._written, self._staged = end, bytearray()
+
+    def _put(self, offset: int, data: bytearray) -> None:
+        """Write all bytes at an offset, in one call unless the system takes fewer."""
+        os.lseek(self._open(), offset, os.SEEK_SET)
+        done = os.write(self._descriptor, data)
+        while done < len(data):
+            done += os.write(self._descriptor, data[done:])
+
+    def commit(self, *, seal: bool = False) -> None:
+        """Make the staged frames durable, all of them or none; without any it does nothing.
+
+        seal: also where there are none. Such a batch proves damage of the one before it; what befalls the last batch
+        cannot be told from what a power cut leaves. Raises StoreFullError or another StoreError, and then the log is
+        as it was at the last commit.
+        """
+        if self._next == self.place and not seal:
+            return
+        with reported(self.path, "making a batch durable"):
+            try:
+                self._pack(COMMIT, b"")
+                self._write()
+                sync_open(self._descriptor, data_only=True)
+            except BaseException:
+                self.rollback()
+                raise
+            self.place, self._settled = self._next, True
+
+    def rollback(self) -> None:
+        """Forget the staged frames.
+
+        Where some may be on the disk they are cut off. If that fails, a warning says so, and nothing can be staged
+        before it succeeds.
+        """
+        self._begin_batch()
+        try:
+            self._settle()
+        except OSError as error:
+            # The caller has to learn what ended the batch; the next one settles it, or is refused.
+            logger.warning("%s: a batch could not be taken back yet: %s", self.path, error)
+
+    def close(self, *, trim: bool = False) -> None:
+        """Close the file; a second call does nothing. trim: give back the room ahead, of a log that was written."""
+        if trim and self._descriptor >= 0:
+            with suppress(OSError):
+                os.ftruncate(self._descriptor, self.place.offset)
+        self._release()
+
+    def _release(self) -> None:
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = ()) -> bytes:
+    """Put a new log, with these kinds and payloads, at `path`, whole and durable or not at all; return its identity.
+
+    header: of the caller, for good. A log that is there is replaced; readers keep it open as it was. Raises
+    StoreFullError, ReadOnlyError or another StoreError.
+    """
+    if len(header) > LARGEST_PAYLOAD:
+        raise RecordError(f"a log's first frame of {len(header)} bytes cannot be kept")
+    draft = path.with_name(f"{path.name}.new")
+    identity = os.urandom(IDENTITY_BYTES)
+    with reported(path, "making a log"), replacing(path, draft):
+        with new_file(draft) as file:
+            file.write(pack_frame(identity, BEGIN, HEADER, header)[0])
+        with Log(draft, write=True) as log:
+            log.prepare()
+            count = 0
+            for count, (kind, payload) in enumerate(frames, 1):
+                log.stage(kind, payload)
+                if count % TOGETHER == 0:
+                    log.commit()
+            log.commit()
+            if count:
+                log.commit(seal=True)  # all of them were durable, and may be all that the log ever holds
+            log.close(trim=True)
+    return identity

@@ -13,24 +13,6 @@ import numpy as np
 
 from scroll_tactile_store.exceptions import RecordError
 
-__all__ = [
-    "JSON",
-    "LARGEST_JSON",
-    "LARGEST_NUMBER",
-    "Arrays",
-    "Attributes",
-    "Checkpoint",
-    "Head",
-    "Record",
-    "check_key",
-    "check_text",
-    "check_time",
-    "from_json",
-    "json_digest",
-    "payload_digest",
-    "to_json",
-]
-
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 Attributes: TypeAlias = Mapping[str, JSON] | None
@@ -38,6 +20,8 @@ Attributes: TypeAlias = Mapping[str, JSON] | None
 # Texts that are read as JSON. A value of three characters takes up to 90 bytes of memory: these at most 200 MB.
 LARGEST_JSON, MOST_VALUES = 64 * 2**20, 2**21
 LARGEST_NUMBER = 2**63 - 1
+
+SIMPLE = frozenset({int, bool, type(None)})  # what comes back from JSON as it is
 
 LONGEST_KEY = 64  # bytes: the longest digest in common use (sha512, blake2b)
 
@@ -88,6 +72,8 @@ def check_text(what: str, text: str) -> str:
 
 def _check_pairs(what: str, text: str) -> str:
     # UTF-8 has no form for half of a surrogate pair, and two halves in JSON would come back as one character.
+    if text.isascii():
+        return str(text)
     try:
         text.encode("utf-8")
     except UnicodeEncodeError as error:
@@ -112,23 +98,27 @@ def check_time(time: float) -> float:
 
 
 def to_json(what: str, value: Attributes) -> str:
-    """Return `value` as compact JSON with sorted keys, in ASCII; None counts as empty.
+    """Return `value` as compact JSON with sorted keys, in ASCII; None counts as empty. Raises as `plain_json`."""
+    return plain_json(what, value)[1]
+
+
+def plain_json(what: str, value: Attributes) -> tuple[dict[str, JSON], str]:
+    """Return `value` as it comes back from JSON, and that: compact, in ASCII, with sorted keys. None counts as empty.
 
     Raises RecordError, naming the place, for what would not come back equal: NaN and infinities, keys
     that are not strings, NumPy scalars and other objects. A tuple comes back as a list.
     """
-    if value is None:
-        return "{}"
-    if not isinstance(value, Mapping):
+    if not isinstance(value, Mapping | None):
         raise RecordError(f"{what} must be a mapping, not {type(value).__name__}")
     try:
-        text = json.dumps(_plain(what, value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        plain = cast("dict[str, JSON]", _plain(what, value or {}))
+        text = json.dumps(plain, sort_keys=True, separators=(",", ":"), allow_nan=False)
         _require_bounded(text)
     except (RecursionError, ValueError) as error:
         if isinstance(error, RecordError):
             raise
         raise RecordError(f"{what} cannot be written as JSON: {error}") from error
-    return text
+    return plain, text
 
 
 def from_json(text: str) -> dict[str, JSON]:
@@ -161,20 +151,24 @@ JSON_READER = json.JSONDecoder(parse_float=_finite, parse_constant=_finite)
 
 
 def _plain(where: str, value: JSON) -> JSON:
-    if isinstance(value, Mapping):
-        if strange := [name for name in value if not isinstance(name, str)]:
-            raise RecordError(f"{where} has the key {strange[0]!r}; JSON keys are strings")
-        return {_check_pairs(where, name): _plain(f"{where}[{name!r}]", part) for name, part in value.items()}
+    if type(value) in SIMPLE:
+        return value
     if isinstance(value, str):
         return _check_pairs(where, value)
-    if isinstance(value, list | tuple):
-        return [_plain(f"{where}[{index}]", part) for index, part in enumerate(value)]
-    if value is None or isinstance(value, bool | int):
-        return value
     if isinstance(value, float):
         if not math.isfinite(value):
             raise RecordError(f"{where} is {value!r}, which JSON cannot hold; use None or a string")
         return float(value)
+    if isinstance(value, list | tuple):
+        # Most of what is appended is lists of numbers.
+        parts = enumerate(value)
+        return [part if type(part) in SIMPLE else _plain(f"{where}[{index}]", part) for index, part in parts]
+    if isinstance(value, Mapping):
+        if strange := [name for name in value if not isinstance(name, str)]:
+            raise RecordError(f"{where} has the key {strange[0]!r}; JSON keys are strings")
+        return {_check_pairs(where, name): _plain(f"{where}[{name!r}]", part) for name, part in value.items()}
+    if isinstance(value, int):
+        return int(value)
     raise RecordError(f"{where} is a {type(value).__name__}, not JSON: convert it, or keep it as an array")
 
 

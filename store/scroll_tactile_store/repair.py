@@ -1,4 +1,4 @@
-"""Making a damaged store whole again, at the price of what is lost: the one entry to repair."""
+"""Making a damaged store whole again, at the price of what is lost."""
 
 from __future__ import annotations
 
@@ -10,32 +10,24 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
-from scroll_tactile_store.archive import Files
-from scroll_tactile_store.checkpoints import read_back
 from scroll_tactile_store.exceptions import DamageError, reported
 from scroll_tactile_store.files import store_folder, sync_folder
-from scroll_tactile_store.found_log import Fault, Progress
 from scroll_tactile_store.layout import (
     DAMAGED,
     LOG,
     Current,
-    NamedCheckpoint,
+    is_number,
     log_numbers,
     log_path,
     remove_unnamed,
-    require_unshared,
-    unsafe_entries,
+    require_safe,
     write_current,
 )
 from scroll_tactile_store.lock import WriterLock
-from scroll_tactile_store.log_writer import create_log
+from scroll_tactile_store.log import Log, create_log
 from scroll_tactile_store.records import to_json
-from scroll_tactile_store.row_encoding import ROW, head_without_arrays
-from scroll_tactile_store.survey import FoundCheckpoint, Survey, require_store
-
-__all__ = ["Repair", "repair_store"]
-
-DISTRUST = "its disk cannot be trusted; copy the folder to another one and repair it there"
+from scroll_tactile_store.rows import ROW, head_without_arrays, read_back
+from scroll_tactile_store.survey import HEADLESS, FoundCheckpoint, Progress, Survey, require_store
 
 
 @dataclass(frozen=True)
@@ -62,7 +54,7 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
 
     Where nothing is damaged nothing is written. Otherwise the damaged log and damaged checkpoints stay
     beside the new ones, under names with "damaged" in them. Killed at any instant it can be started again.
-    Readers that have the store open continue with the damaged one until they open it anew.
+    Readers that have the store open continue with the damaged one until they look again.
     `progress` is called with what is being done, how many of it are done, and how many there will be.
 
     Raises NotAStoreError, LockedError while a writer has it, VersionError for another format, DamageError
@@ -71,18 +63,13 @@ def repair_store(path: str | PathLike[str], *, progress: Progress | None = None)
     """
     folder = store_folder(path)
     require_store(folder)
-    with reported(folder, "looking at the store"):
-        for error in unsafe_entries(folder):
-            raise error
-    require_unshared(folder)
+    require_safe(folder, written=True)
     lock = WriterLock(folder)
     try:
         with reported(folder, "repairing the store"):
-            survey = Survey(Files(folder), progress or (lambda *_: None))
+            survey = Survey(folder, progress or (lambda *_: None))
             try:
-                if not survey.problems():
-                    return Repair(survey.last, [], None)
-                return _repair(survey)
+                return _repair(survey) if survey.problems() else Repair(survey.last, [], None)
             finally:
                 survey.log.close()
     finally:
@@ -118,37 +105,30 @@ class _Plan:
         return cls(kept, newest if fresh else standing, fresh, start, start if fresh else survey.compaction)
 
 
-def _lost(survey: Survey, plan: _Plan) -> list[str]:
+def _lost(survey: Survey, plan: _Plan) -> Iterator[str]:
+    """Say what a repair gives up."""
     newest = 0 if plan.start is None else plan.start.last_sequence
-    which = "" if plan.start is None else f"checkpoint {plan.start.number}"
-    lost = [
-        f"{fault.describe(first, last)}; what they did is in {which}, but can no longer be retracted"
-        for first, last, fault in survey.faulty(1, newest)
-    ]
+    which = "" if plan.start is None else f"checkpoint {int(plan.start.folder.name)}"
+    for _, what in survey.faulty(1, newest):
+        yield f"{what}; what they did is in {which}, but can no longer be retracted"
     if plan.fresh:
-        lost.append(
-            f"rows 1 to {plan.compacted} give up their arrays, {which} stands for them: none of them can be retracted "
-            f"any more{_counts_again(survey, plan)}"
-        )
+        what = f"rows 1 to {plan.compacted} give up their arrays, {which} stands for them"
+        yield f"{what}: none of them can be retracted any more{_counts_again(survey, plan)}"
     if plan.kept < survey.last:
         behind = survey.faulty(newest + 1, survey.last)
-        first, last, fault = behind[0] if behind else (0, 0, None)
-        why = fault.describe(first, last) if fault else "the compaction checkpoint that they continue is lost"
-        lost.append(
-            f"rows {plan.kept + 1} to {survey.last} are dropped, also those that verify: {why}, and nobody knows what "
-            "that did to the others"
-        )
+        why = behind[0][1] if behind else "the compaction checkpoint that they continue is lost"
+        what = f"rows {plan.kept + 1} to {survey.last} are dropped, also those that verify: {why}"
+        yield f"{what}, and nobody knows what that did to the others"
     if survey.log.damage and not survey.log.rows:
-        lost.append(f"{'; '.join(survey.log.damage)}: the rows behind {newest}, if there were any, are lost")
+        yield f"{'; '.join(survey.log.damage)}: the rows behind {newest}, if there were any, are lost"
     for found in survey.checkpoints:
         if found.damage and (survey.current is not None or found.named is not None):
-            lost.append(f"checkpoint {found.number}: {'; '.join(map(str, found.damage))}")
-    return lost
+            yield f"checkpoint {int(found.folder.name)}: {'; '.join(map(str, found.damage))}"
 
 
 def _counts_again(survey: Survey, plan: _Plan) -> str:
     """Return in words which rows behind a new compaction checkpoint can have taken back one that it contains."""
-    behind = [sequence for sequence, _ in survey.log.rows if plan.compacted < sequence <= plan.kept]
+    behind = [sequence for sequence in survey.log.rows if plan.compacted < sequence <= plan.kept]
     if not behind:
         return ""
     kinds = Counter(survey.log.head(sequence).kind for sequence in behind)
@@ -165,55 +145,44 @@ def _repair(survey: Survey) -> Repair:
             path=survey.log.path,
         )
     folder, plan = survey.folder, _Plan.of(survey)
-    lost = _lost(survey, plan)
-    number = 1 + max([*log_numbers(folder, unfinished=True), *_numbers_aside(folder), 0])
-    if log_path(folder, number) == survey.log.path:
-        number += 1  # that of one which is gone
+    lost = list(_lost(survey, plan))
+    number = 1 + max(_taken(survey), default=0)
     path = log_path(folder, number)
     identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, plan))
-    current = Current(number, identity, *_checkpoints(path, plan), plan.kept)
+    with Log(path) as log:
+        rows = read_back(log)
+        newest, compaction = (
+            None
+            if each is None or each.named is None
+            else replace(each.named, place=rows.place(log, each.last_sequence))
+            for each in (plan.start, plan.stand_in)
+        )
+    current = Current(number, identity, newest, compaction, plan.kept)
     aside = _move_aside(survey, path)
     write_current(folder, current)
     remove_unnamed(folder, current)
     return Repair(plan.kept, lost, aside)
 
 
-def _numbers_aside(folder: Path) -> Iterator[int]:
-    """Yield the numbers of logs that earlier repairs put aside."""
-    for entry in folder.iterdir():
-        stem, dot, _ = entry.name.removeprefix(LOG).partition(DAMAGED)
-        if dot and stem.isascii() and stem.isdigit():
+def _taken(survey: Survey) -> Iterator[int]:
+    """Yield the numbers of logs, of those that were put aside, too, and of one that is gone."""
+    yield from log_numbers(survey.folder, unfinished=True)
+    for name in (survey.log.path.name, *(entry.name for entry in survey.folder.iterdir())):
+        stem = name.removeprefix(LOG).partition(DAMAGED)[0]
+        if is_number(stem):
             yield int(stem)
 
 
 def _rows(survey: Survey, plan: _Plan) -> Iterator[tuple[int, bytes]]:
-    for sequence, fault in survey.log.rows:
+    for sequence, row in survey.log.rows.items():
         if sequence > plan.kept:
             return
         survey.progress("rows written", sequence, plan.kept)
         if sequence > plan.compacted:
-            try:
-                yield ROW, survey.log.data(sequence)
-            except DamageError as error:
-                raise DamageError(
-                    f"row {sequence} of {survey.log.path} verified, and a moment later did not: {DISTRUST}",
-                    path=survey.log.path,
-                    sequence=sequence,
-                ) from error
-        elif fault is not Fault.DAMAGED:
-            with suppress(DamageError):
+            yield ROW, survey.log.data(sequence)
+        elif row.fault is not HEADLESS:
+            with suppress(DamageError, ValueError):
                 yield ROW, head_without_arrays(survey.log.head(sequence))
-
-
-def _checkpoints(path: Path, plan: _Plan) -> tuple[NamedCheckpoint | None, NamedCheckpoint | None]:
-    """Return the newest and the compaction checkpoint, with places in the new log, which is read back."""
-    found = [plan.start, plan.stand_in]
-    places, _ = read_back(path, [0 if each is None else each.last_sequence for each in found])
-    newest, compaction = (
-        None if each is None or each.named is None else replace(each.named, place=place)
-        for each, place in zip(found, places, strict=True)
-    )
-    return newest, compaction
 
 
 def _move_aside(survey: Survey, new: Path) -> Path | None:
@@ -226,7 +195,7 @@ def _move_aside(survey: Survey, new: Path) -> Path | None:
         if other not in (new, survey.log.path):
             _put_aside(other)
     for found in survey.checkpoints:
-        if not found.sound and found.folder.exists():
+        if found.damage and found.folder.exists():
             _put_aside(found.folder)
     path = survey.log.path
     if not path.exists() or DAMAGED in path.name:

@@ -1,125 +1,221 @@
-"""Which rows a log holds and where, by sequence and by key; a checkpoint keeps it as an array."""
+"""A record as the payload of a frame, and back (FORMAT.md describes it); and which rows a log holds, and where."""
 
 from __future__ import annotations
 
+import math
+import struct
 from array import array
-from bisect import bisect_right
-from collections.abc import Iterator
-from contextlib import suppress
-from typing import Self
+from bisect import bisect_left, bisect_right
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from scroll_tactile_store.exceptions import DamageError
-from scroll_tactile_store.framing import Frame
-from scroll_tactile_store.log import LogPlace, LogReader
-from scroll_tactile_store.row_encoding import (
-    HEAD_BYTES,
-    ROW,
-    head_size,
-    key_prefix,
-    prefix_in,
-    row_sequence,
-    verified_size,
-)
+from scroll_tactile_store.framing import Frame, LogPlace
+from scroll_tactile_store.log import Log, refuse
+from scroll_tactile_store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json, payload_digest, to_json
 
-__all__ = ["Rows", "head_bytes"]
+ROW = 2  # the kind of a frame that holds a record
 
+# sequence, time, bytes of the arrays' payload, whether that follows; lengths of key, kind, label and attributes.
+FIELDS = struct.Struct("<QdQBBIII")
+DIGEST_BYTES = 16
+HEAD_BYTES = FIELDS.size + DIGEST_BYTES
 USUAL_HEAD = 512  # bytes that are read at once of a row's head
-COLUMNS = ("sequences", "offsets", "sizes", "keys")
+
+
+class JournalRow(NamedTuple):
+    """A record's head, and the payload of its arrays; None where compaction gave that up."""
+
+    head: Head
+    payload: bytes | None
+
+
+def encode_row(
+    sequence: int, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes | None, size: int
+) -> bytes:
+    """Return the bytes of checked values: `attributes` as JSON, and of arrays that were given up their `size` alone."""
+    texts = (key, kind.encode(), label.encode(), attributes.encode())
+    kept = payload is not None
+    fields = FIELDS.pack(sequence, time, size, kept, *map(len, texts))
+    return b"".join((fields, payload_digest(fields, *texts), *texts, payload or b""))
+
+
+def head_without_arrays(head: Head) -> bytes:
+    """Return the bytes of a row that has given up its arrays."""
+    text = to_json("attributes", head.attributes)
+    return encode_row(head.sequence, head.kind, head.label, head.key, head.time, text, None, head.size)
+
+
+def _fields(data: bytes) -> tuple[Any, ...]:
+    if len(data) < HEAD_BYTES:
+        raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
+    return FIELDS.unpack_from(data)
+
+
+def row_sequence(data: bytes) -> int:
+    """Return the sequence of a row, of which these are the first HEAD_BYTES or more; raise ValueError for none."""
+    sequence: int = _fields(data)[0]
+    if not 1 <= sequence <= LARGEST_NUMBER:
+        raise ValueError(f"a row has the sequence {sequence}")
+    return sequence
+
+
+def key_prefix(key: bytes) -> int:
+    """Return the first eight bytes of a key as a number, by which a row is looked for; equal keys have equal ones."""
+    return int.from_bytes(key[:8], "little")
+
+
+def _head_size(data: bytes, whole: int) -> int:
+    """Return the bytes of a row of `whole` bytes without its arrays; raise ValueError for no row."""
+    _, _, size, kept, *lengths = _fields(data)
+    end: int = HEAD_BYTES + sum(lengths)
+    if end + (size if kept else 0) != whole or kept > 1:
+        raise ValueError(f"a row of {whole} bytes says that it has {end} and {size}")
+    return end
+
+
+def decode_head(data: bytes, whole: int) -> Head:
+    """Return the head of a row of `whole` bytes, of which `data` has the head, verified by its own digest.
+
+    Raises ValueError for what `encode_row` never made.
+    """
+    end = _head_size(data, whole)
+    if payload_digest(data[: FIELDS.size], data[HEAD_BYTES:end]) != data[FIELDS.size : HEAD_BYTES]:
+        raise ValueError("a row's head is not as it was written")
+    _, time, size, _, *lengths = FIELDS.unpack_from(data)
+    if size > LARGEST_NUMBER or not math.isfinite(time):
+        raise ValueError(f"a row has {size} bytes and the time {time}")
+    parts, start = [], HEAD_BYTES
+    for length in lengths:
+        parts.append(data[start : start + length])
+        start += length
+    key, kind, label, attributes = parts
+    return Head(
+        row_sequence(data),
+        check_text("the kind", kind.decode()),
+        check_text("the label", label.decode()),
+        check_key(key),
+        time,
+        from_json(attributes.decode()),
+        size,
+    )
+
+
+def decode_row(data: bytes) -> JournalRow:
+    """Return the record; raise ValueError for what `encode_row` never made."""
+    head = decode_head(data, len(data))
+    return JournalRow(head, data[_head_size(data, len(data)) :] if FIELDS.unpack_from(data)[3] else None)
+
+
+def read_head(log: Log, offset: int, size: int) -> Head:
+    """Return the head of the row in the frame at an offset. Raises DamageError, and ValueError for no row."""
+    data = log.read(offset, size, first=USUAL_HEAD)
+    needed = _head_size(data, size)
+    return decode_head(data if needed <= len(data) else log.read(offset, size, first=needed), size)
 
 
 class Rows:
     """Which rows a log holds, in order: of each its sequence, offset, size and the first bytes of its key.
 
-    damage: what lies between them, by the count of the rows before it.
+    first: the row before those that follow a place of the log, `begin`. whole: whether those before it are known, too.
     """
 
-    def __init__(self) -> None:
-        self.sequences, self.offsets, self.sizes, self.keys = (array("Q") for _ in COLUMNS)
-        self.damage: dict[int, list[DamageError]] = {}
+    def __init__(self, place: LogPlace, first: int = 0) -> None:
+        self.sequences, self.offsets, self.sizes, self.keys = array("Q"), array("Q"), array("Q"), array("Q")
+        self.columns = (self.sequences, self.offsets, self.sizes, self.keys)
+        self.first, self.begin, self.whole = first, place, first == 0
 
     def __len__(self) -> int:
         return len(self.keys)
 
-    def append(self, sequence: int, offset: int, size: int, key: int) -> None:
-        """Add a row; key: as of `key_prefix`."""
-        for name, value in zip(COLUMNS, (sequence, offset, size, key), strict=True):
-            getattr(self, name).append(value)
+    @property
+    def last(self) -> int:
+        """The sequence of the last row that is known."""
+        return max(self.first, self.sequences[-1]) if self.sequences else self.first
 
-    def cut(self, count: int) -> None:
-        """Keep the first rows alone."""
-        for name in COLUMNS:
-            del getattr(self, name)[count:]
+    def append(self, sequence: int, offset: int, size: int, key: bytes) -> None:
+        """Add a row."""
+        self.sequences.append(sequence)
+        self.offsets.append(offset)
+        self.sizes.append(size)
+        self.keys.append(key_prefix(key))
 
-    def extend(self, rows: Rows) -> None:
-        """Add rows behind these."""
-        for index, damage in rows.damage.items():
-            self.damage.setdefault(len(self) + index, []).extend(damage)
-        for name in COLUMNS:
-            getattr(self, name).extend(getattr(rows, name))
+    def catch_up(self, log: Log, last: int = 0) -> None:
+        """Take in what was committed since; `last`: a row that the log has had. Raises DamageError."""
+        for frames in log.scan(refuse):
+            for frame in frames:
+                if frame.kind == ROW:
+                    self._take(log, frame)
+        if self.last < last:
+            what = f"{log.path} ends with row {self.last}, and had row {last}: its end is damaged or was cut off"
+            refuse(DamageError(what, path=log.path), [])
 
-    def table(self, last_sequence: int) -> np.ndarray:
-        """Return those up to a sequence as an array: the columns, shape (4, rows)."""
-        count = bisect_right(self.sequences, last_sequence)
-        return np.stack([np.frombuffer(getattr(self, name), np.uint64)[:count] for name in COLUMNS])
-
-    @classmethod
-    def of_table(cls, table: np.ndarray, until: int) -> Self:
-        """Return the rows of a `table` that lie before an offset. Raises ValueError where that is none."""
-        if table.dtype != np.uint64 or table.ndim != 2 or len(table) != len(COLUMNS):
-            raise ValueError(f"an index of rows is no array of {table.dtype.str} and shape {table.shape}")
-        rows, table = cls(), table[:, table[1] < until]
-        for name, column in zip(COLUMNS, table, strict=True):
-            getattr(rows, name).frombytes(column.tobytes())
-        return rows
-
-    def with_key(self, key: bytes) -> list[int]:
-        """Return the indices of the rows whose keys begin as this one does."""
-        found: list[int] = np.flatnonzero(np.frombuffer(self.keys, np.uint64) == key_prefix(key)).tolist()
-        return found
-
-    def take(self, log: LogReader, until: int | None = None) -> Iterator[LogPlace]:
-        """Add the rows that follow in a log, up to an offset; yield the place behind each batch. Damage is noted."""
-        while True:
-            try:
-                for batch in log.refresh():
-                    for frame in batch:
-                        if until is not None and frame.offset >= until:
-                            return
-                        if frame.kind == ROW:
-                            self._take(log, frame)
-                    yield log.place
-                return
-            except DamageError as damage:
-                if damage.offset is None:
-                    raise  # of the whole file
-                noted = self.damage.setdefault(len(self), [])
-                if damage.offset in [earlier.offset for earlier in noted]:
-                    return  # nothing can be read behind it
-                noted.append(damage)
-                with suppress(DamageError):
-                    log.resume()
-
-    def _take(self, log: LogReader, frame: Frame) -> None:
+    def _take(self, log: Log, frame: Frame) -> None:
+        data = log.read(frame.offset, frame.size, first=HEAD_BYTES + 8)
         try:
-            if log.payloads:
-                data = log.peek(frame.offset, min(HEAD_BYTES + 8, frame.size))
-            else:
-                data = head_bytes(log, frame.offset, frame.size)
-                verified_size(data, frame.size)
             sequence = row_sequence(data)
             if self.sequences and sequence <= self.sequences[-1]:
                 raise ValueError(f"row {sequence} follows row {self.sequences[-1]}")
         except ValueError as error:
             what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
-            self.damage.setdefault(len(self), []).append(DamageError(what, path=log.path, offset=frame.offset))
-        else:
-            self.append(sequence, frame.offset, frame.size, prefix_in(data))
+            refuse(DamageError(what, path=log.path, offset=frame.offset), [])
+        self.append(sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, _fields(data)[4])])
+
+    def cut(self, place: LogPlace) -> None:
+        """Forget the rows behind a place, behind which nothing is left."""
+        count = bisect_left(self.offsets, place.offset)
+        for column in self.columns:
+            del column[count:]
+
+    def prepend(self, earlier: Rows) -> None:
+        """Add the rows before the first place."""
+        for column, before in zip(self.columns, earlier.columns, strict=True):
+            column[:0] = before
+        self.whole = True
+
+    def find(self, after: int) -> int:
+        """Return the index of the first row behind `after`."""
+        return bisect_right(self.sequences, after)
+
+    def with_key(self, key: bytes) -> list[int]:
+        """Return the sequences of the rows whose keys begin as this one does."""
+        found = np.flatnonzero(np.frombuffer(self.keys, np.uint64) == key_prefix(key)).tolist()
+        return [self.sequences[index] for index in found]
+
+    def place(self, log: Log, last_sequence: int) -> LogPlace:
+        """Return a place in the log that all rows behind `last_sequence` are behind: that of a batch."""
+        index = self.find(last_sequence)
+        if index == len(self):
+            return log.place
+        for offset in reversed(self.offsets[: index + 1]):
+            frame = log.frame_at(offset)
+            if frame is not None and frame.number == frame.batch:
+                return LogPlace(frame.offset, frame.number, frame.batch, frame.previous)
+        return log.first
+
+    def table(self, last_sequence: int) -> np.ndarray:
+        """Return those up to a sequence as an array: the columns, shape (4, rows)."""
+        count = self.find(last_sequence)
+        return np.stack([np.frombuffer(column, np.uint64)[:count] for column in self.columns])
+
+    @classmethod
+    def of_table(cls, table: np.ndarray, until: LogPlace) -> Rows:
+        """Return the rows of a `table` that lie before a place. Raises ValueError where that is none."""
+        rows = cls(until)
+        if table.dtype != np.uint64 or table.ndim != 2 or len(table) != len(rows.columns):
+            raise ValueError(f"an index of rows is no array of {table.dtype.str} and shape {table.shape}")
+        for column, values in zip(rows.columns, table[:, table[1] < until.offset], strict=True):
+            column.frombytes(values.tobytes())
+        return rows
 
 
-def head_bytes(log: LogReader, offset: int, size: int) -> bytes:
-    """Return the bytes of a row without its arrays, not verified; raise ValueError for no row."""
-    data = log.peek(offset, min(size, USUAL_HEAD))
-    needed = head_size(data, size)
-    return data[:needed] if needed <= len(data) else log.peek(offset, needed)
+def read_back(log: Log) -> Rows:
+    """Return the rows of a log that was just written. Raises DamageError where it does not read back whole."""
+    rows = Rows(log.place)
+    rows.catch_up(log)
+    if log.place.offset != log.size():
+        raise DamageError(
+            f"{log.path} does not read back as it was just written: its disk cannot be trusted", path=log.path
+        )
+    return rows

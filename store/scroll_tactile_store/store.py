@@ -1,32 +1,61 @@
-"""The store: a journal of durable rows beside snapshots of arrays, with one writer and any readers."""
+"""The store: a log of durable rows beside snapshots of arrays, with one writer and any readers."""
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 import time as clock
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, Self, cast
+from typing import Literal, NamedTuple, Self, cast
 
-from scroll_tactile_store.archive import files_of
+import numpy as np
+
+from scroll_tactile_store.archive import unpacked
 from scroll_tactile_store.backup import back_up
-from scroll_tactile_store.checkpoint_files import CheckpointDraft
-from scroll_tactile_store.checkpoints import Checkpoints
+from scroll_tactile_store.checkpoint_files import (
+    INDEX,
+    CheckpointDraft,
+    CheckpointReader,
+    index_name,
+    write_checkpoint,
+)
+from scroll_tactile_store.encoding import check_arrays, decode_payload, encode_payload
 from scroll_tactile_store.exceptions import (
+    CompactedError,
+    DamageError,
     NotAStoreError,
     ReadOnlyError,
     RecordError,
     StoreClosedError,
     StoreError,
+    is_missing,
     reported,
 )
-from scroll_tactile_store.files import is_file, store_folder
-from scroll_tactile_store.found_log import Progress
-from scroll_tactile_store.journal import Journal
-from scroll_tactile_store.layout import CHECKPOINTS, holds_store
+from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
+from scroll_tactile_store.framing import LogPlace
+from scroll_tactile_store.layout import (
+    CHECKPOINTS,
+    CURRENT_FILE,
+    MOST_DIGITS,
+    Current,
+    NamedCheckpoint,
+    checkpoint_path,
+    holds_store,
+    log_numbers,
+    log_path,
+    numbers,
+    read_current,
+    remove_unnamed,
+    write_current,
+)
 from scroll_tactile_store.lock import WriterLock, lock_to_write
+from scroll_tactile_store.log import Log, create_log
 from scroll_tactile_store.records import (
     JSON,
     Arrays,
@@ -36,17 +65,39 @@ from scroll_tactile_store.records import (
     Record,
     check_key,
     check_text,
+    check_time,
+    from_json,
+    plain_json,
     to_json,
 )
+from scroll_tactile_store.rows import ROW, Rows, decode_row, encode_row, head_without_arrays, read_back, read_head
+from scroll_tactile_store.survey import Progress
 
-__all__ = ["Store"]
+logger = logging.getLogger(__name__)
+
+LAST_SEQUENCE = 2**62  # far beyond what anybody appends
+ATTEMPTS = 8  # of a reader, while a writer puts another log in the place of the one
+
+
+class StoreState(NamedTuple):
+    """What a store holds at one moment.
+
+    last: the sequence of the last durable record, 0 without any. newest: the number of the newest committed checkpoint,
+    None without one; `latest` may pass it over. compacted: the last record that has given up its arrays for a
+    compaction checkpoint, 0 where none has.
+    """
+
+    last: int
+    newest: int | None
+    compacted: int
 
 
 class Store:
     """A folder of records that survive a power cut, and of arrays that are replaced as a whole.
 
     Open it with `Store.open`. One Store may write a folder at a time, any number may read it. The methods may be called
-    from any thread, but not in a forked child.
+    from any thread, but not in a forked child. A reader sees the store as it was when it was opened, or last asked for
+    its `state`.
     """
 
     @classmethod
@@ -60,8 +111,8 @@ class Store:
         """Open the store at `path`, a folder, or to read also a packed one, see `write_archive`.
 
         To write, it makes the folder and its parents where there is nothing, and keeps `identity` in it for good; an
-        existing store keeps its own, and the caller compares. To read, it makes and changes nothing, and each call sees
-        what is committed at that moment.
+        existing store keeps its own, and the caller compares. To read, it makes and changes nothing; a packed store is
+        unpacked into a temporary folder, which is removed when it is closed.
 
         Raises NotAStoreError when there is no store and none may be made (no identity, mode "read", a file, a folder of
         other things), LockedError for a second writer, VersionError for another format, DamageError, ReadOnlyError,
@@ -71,33 +122,39 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        if is_file(folder) and mode == "write":
-            raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
-        if not is_file(folder) and not holds_store(folder) and (mode == "read" or kept is None):
+        if is_file(folder):
+            if mode == "write":
+                raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
+        elif not holds_store(folder) and (mode == "read" or kept is None):
             hint = "" if mode == "read" else "; give an identity to make one"
             raise NotAStoreError(f"{folder} holds no store{hint}")
         return cls(folder, kept, mode)
 
-    def __init__(self, folder: Path, identity: str | None, mode: Literal["write", "read"]) -> None:
-        self.path = folder
+    def __init__(self, path: Path, identity: str | None, mode: Literal["write", "read"]) -> None:
+        self.path = self._folder = path
         self.mode = mode
         self._process = os.getpid()
-        self._closing = threading.Lock()
-        self._closed = False
+        # Of the log and what is known of it; of `CURRENT` while it is written; of checkpoints, of which one is written
+        # at a time; and of the one that waits to be.
+        self._guard, self._naming = threading.RLock(), threading.Lock()
+        self._committing, self._queue = threading.Lock(), threading.Lock()
+        self._closed = self._batching = self._failed = self._unsettled = False
         self._lock: WriterLock | None = None
+        self._worker = ThreadPoolExecutor(1, f"store commit {path.name}")
+        self._waiting: CheckpointDraft | None = None
+        self._submitted: Future[None] | None = None
+        self._failure: Exception | None = None
         with ExitStack() as undo:
             if mode == "write":
-                self._lock = lock_to_write(folder, identity)
+                self._lock = lock_to_write(path, identity)
                 undo.callback(self._lock.release)
-            files = files_of(folder)
-            undo.callback(files.close)
-            self._journal = Journal(files, write=mode == "write")
-            undo.callback(self._journal.close)
-            self.identity: Mapping[str, JSON] = self._journal.identity
-            self._checkpoints = Checkpoints(files, self._journal)
-            self._files = files
+            elif is_file(path):
+                self._folder = undo.enter_context(unpacked(path))
+            with reported(path, "opening the store"):
+                self._take_current()
+            undo.callback(lambda: self._log.close(trim=mode == "write"))
             if mode == "write":
-                self._checkpoints.remove_unnamed()
+                self._remove_unnamed()
             self._held = undo.pop_all()
 
     def __repr__(self) -> str:
@@ -115,16 +172,122 @@ class Store:
         if after < 0:
             raise RecordError(f"after must not be negative, not {after}")
 
-    @property
-    def is_packed(self) -> bool:
-        """Whether it is a packed store, which is only read."""
-        return self._files.is_packed
+    # What `CURRENT` names.
+
+    def _take_current(self) -> None:
+        """Use the log that `CURRENT` names now, read from the newest checkpoint's place on."""
+        for _ in range(ATTEMPTS):
+            current = read_current(self._folder / CURRENT_FILE)
+            path = log_path(self._folder, current.log)
+            try:
+                log = Log(path, write=self.mode == "write")
+                break
+            except FileNotFoundError as error:
+                # A writer removes a log after another has taken its place.
+                if read_current(self._folder / CURRENT_FILE) == current:
+                    what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the"
+                    raise DamageError(
+                        f"{what} store (repair_store), which resumes from what verifies", path=path
+                    ) from error
+        else:
+            raise StoreError(f"{self.path} is compacted again and again: open it later")
+        try:
+            rows, identity = self._read(current, log), from_json(log.header.decode())
+        except BaseException as error:
+            log.close()
+            if isinstance(error, ValueError):
+                what = f"the identity in {log.path} was never written so: {error}"
+                raise DamageError(what, path=log.path) from error
+            raise
+        self._current, self._log, self._rows = current, log, rows
+        self.identity: Mapping[str, JSON] = identity
+
+    def _read(self, current: Current, log: Log) -> Rows:
+        if log.identity != current.log_identity:
+            raise DamageError(f"{log.path} is the log of another store, or of another time", path=log.path)
+        rows = Rows(log.place)
+        if (named := current.newest) is not None:
+            if not log.has_place(named.place):
+                what = f"{log.path} holds no batch that ends where checkpoint {named.number} says"
+                raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
+            log.place = named.place
+            rows = Rows(named.place, named.last_sequence)
+        rows.whole |= log.place == log.first
+        rows.catch_up(log, current.last)
+        if self.mode == "write":
+            log.prepare()
+            # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
+            sync_folder(self._folder)
+        return rows
+
+    @contextmanager
+    def _using(self, doing: str) -> Iterator[None]:
+        """In the block nobody else uses the log, which is the one that counts."""
+        with self._guard, reported(self.path, doing):
+            if self._closed:
+                raise StoreClosedError(f"the store in {self.path} is closed")
+            if self._unsettled:
+                self._settle()
+            yield
+
+    def _settle(self) -> None:
+        """Find out what `CURRENT` names, and make it durable: what wrote it failed, or has put another log in place."""
+        current = read_current(self._folder / CURRENT_FILE)
+        if current.log == self._current.log:
+            self._current = current
+            sync_folder(self._folder)
+        else:
+            self._renew()
+        self._unsettled = False
+
+    def _settled(self) -> Current:
+        with self._using("looking for what counts"):
+            return self._current
+
+    def _renew(self) -> None:
+        before = self._log
+        self._take_current()
+        before.close()
+
+    def _look(self) -> None:
+        """Take in what was committed since, for a reader."""
+        current = read_current(self._folder / CURRENT_FILE)
+        if (current.log, current.log_identity) == (self._current.log, self._current.log_identity):
+            if self._log.has_place(self._log.place):
+                self._rows.catch_up(self._log, current.last)
+                self._current = current
+                return
+            logger.info("%s: its writer took a batch back", self._log.path)
+        self._renew()
+
+    def state(self, *, look: bool = True) -> StoreState:
+        """Return what the store holds at this moment, which from now on is what a reader reads.
+
+        look: whether a reader looks for what was committed since. Raises DamageError, and another StoreError.
+        """
+        self._check_open()
+        with self._using("looking for what was committed"):
+            if look and self.mode == "read":
+                self._look()
+            newest = self._current.newest
+            return StoreState(self._rows.last, None if newest is None else newest.number, self._current.compacted)
 
     @property
     def last(self) -> int:
-        """The sequence of the last durable record, 0 when there is none."""
-        self._check_open()
-        return self._journal.last()
+        """The sequence of the last durable record, 0 when there is none; of a reader, at its last `state`."""
+        return self.state(look=False).last
+
+    @property
+    def newest(self) -> int | None:
+        """The number of the newest checkpoint, None when there is none; of a reader, at its last `state`."""
+        return self.state(look=False).newest
+
+    @property
+    def compacted(self) -> int:
+        """The last record that has given up its arrays, 0 where none has; of a reader, at its last `state`."""
+        return self.state(look=False).compacted
+
+    # Records.
 
     def append(
         self,
@@ -142,7 +305,28 @@ class Store:
         ReadOnlyError or another StoreError; after any of them the store can be used on.
         """
         self._check_open(write=True)
-        return self._journal.insert(kind, label, key, clock.time() if time is None else time, attributes, arrays)
+        check_text("the kind", kind)
+        check_text("the label", label)
+        check_key(key)
+        seconds = check_time(clock.time() if time is None else time)
+        known, text = plain_json("attributes", attributes)
+        payload = encode_payload(check_arrays(arrays))
+        with self._using("appending a row"):
+            if self._batching and self._failed:
+                raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
+            if (sequence := self._rows.last + 1) > LAST_SEQUENCE:
+                raise DamageError(f"{self._log.path} has a row of number {sequence - 1}", path=self._log.path)
+            data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
+            try:
+                frame = self._log.stage(ROW, data)
+                self._rows.append(sequence, frame.offset, frame.size, key)
+                if not self._batching:
+                    self._make_durable()
+            except BaseException:
+                self._failed = True
+                self._undo()
+                raise
+        return Head(sequence, kind, label, key, seconds, known, len(payload))
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -154,23 +338,62 @@ class Store:
         StoreFullError, ReadOnlyError or another StoreError.
         """
         self._check_open(write=True)
-        self._journal.refuse_in_batch("beginning a batch")
-        self._checkpoints.wait()
-        with self._journal.batch():
-            yield
+        self._refuse_in_batch("beginning a batch")
+        self._wait()
+        with self._guard:
+            with self._using("beginning a batch"):
+                self._batching, self._failed = True, False
+            try:
+                yield
+                if self._failed:
+                    raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
+                self._make_durable()
+            except BaseException:
+                self._undo()
+                raise
+            finally:
+                self._batching = False
+
+    def _make_durable(self) -> None:
+        self._log.commit()
+        if not self._current.last and self._rows.last:
+            self._note_last()  # without any row the log would look like a new one
+
+    def _undo(self) -> None:
+        """Take back what is not durable; what was committed before an interruption stays, and is known."""
+        self._log.rollback()
+        self._rows.cut(self._log.place)
+
+    def _refuse_in_batch(self, doing: str) -> None:
+        """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
+        with self._guard:
+            if self._batching:
+                raise StoreError(f"{doing} is not possible in a batch of {self.path}: end it first")
+
+    def _note_last(self) -> None:
+        """Have `CURRENT` say which row is the last, so that a log that is cut off later is not taken for whole."""
+        last = self._rows.last
+        try:
+            with self._naming:
+                if replace(read_current(self._folder / CURRENT_FILE), last=0) == replace(self._current, last=0):
+                    current = replace(self._current, last=last)
+                    write_current(self._folder, current)
+                    self._current = current
+        except (OSError, StoreError) as error:  # nothing is lost but this knowledge
+            logger.warning("%s could not say that row %d is the last: %s", self._folder / CURRENT_FILE, last, error)
 
     def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
         """Yield the records behind sequence `after` without their arrays, up to the last at the start.
 
         `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those that a
-        repair named as lost. Raises DamageError at the first that is damaged or, without `kind` and `label`, missing;
-        with them, a record whose kind or label is damaged is passed over.
+        repair named as lost. Raises DamageError at the first that is damaged or missing.
         """
         self._check_open(after)
         for what, text in (("the kind", kind), ("the label", label)):
             if text is not None:
                 check_text(what, text)
-        return self._journal.rows(after, self._journal.last(), arrays=False, kind=kind, label=label)
+        found = self._rows_behind(after, arrays=False)
+        return (head for head in found if kind in (None, head.kind) and label in (None, head.label))
 
     def record(self, sequence: int) -> Record:
         """Return the record of this sequence.
@@ -178,12 +401,11 @@ class Store:
         Raises RecordError where there is none, CompactedError where compaction gave up its arrays, DamageError.
         """
         self._check_open()
-        last = self._journal.last()
-        if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= last:
-            raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
-        for record in self._journal.rows(sequence - 1, sequence, arrays=True):
-            return cast(Record, record)
-        raise self._journal.given_up(sequence)  # a repair left it out
+        with self._using("reading a row"):
+            last = self._rows.last
+            if type(sequence) is not int or not 1 <= sequence <= last:
+                raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
+            return cast(Record, self._row(sequence, arrays=True))
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -193,17 +415,112 @@ class Store:
         their place, and its `last_sequence` is the `after` to continue with.
         """
         self._check_open(after)
-        if after < self._journal.current().compacted:
-            raise self._journal.given_up(after + 1)
-        return cast(Iterator[Record], self._journal.rows(after, self._journal.last(), arrays=True))
+        if after < self._settled().compacted:
+            raise self._given_up(after + 1)
+        return cast(Iterator[Record], self._rows_behind(after, arrays=True))
 
     def with_key(self, key: bytes) -> Iterator[Head]:
-        """Yield the heads of the records with this key, in order; damaged ones are left out.
-
-        The first call may read where the records are; each after it takes about a nanosecond a record.
-        """
+        """Yield the records with this key without their arrays. Raises DamageError."""
         self._check_open()
-        return self._journal.with_key(check_key(key))
+        check_key(key)
+        with self._using("looking for a key"):
+            self._find(0)
+            sequences = self._rows.with_key(key)
+        for sequence in sequences:
+            with self._using("reading a row"):
+                head = self._row(sequence, arrays=False)
+            if head.key == key:
+                yield head
+
+    def _rows_behind(self, after: int, *, arrays: bool) -> Iterator[Head]:
+        with self._using("looking for rows"):
+            last = self._rows.last
+
+        def rows(after: int) -> Iterator[Head]:
+            while after < last:
+                with self._using(f"reading rows behind {after}"):
+                    if (after := self._next_row(after, last)) > last:
+                        return  # those that are left gave up their arrays, and a repair left them out
+                    head = self._row(after, arrays=arrays)
+                yield head
+
+        return rows(after)
+
+    def _find(self, after: int) -> int:
+        """Return the index of the first row behind `after`, once all rows from there on are known."""
+        if after < self._rows.first and not self._rows.whole:
+            self._rows.prepend(self._rows_before(self._rows.begin))
+        return self._rows.find(after)
+
+    def _rows_before(self, place: LogPlace) -> Rows:
+        """Return the rows before a place, as the newest checkpoint has them, or else the log itself."""
+        named, name = self._current.newest, index_name(self._log.identity)
+        try:
+            if named is not None and named.place.offset >= place.offset and self._log.has_place(named.place):
+                reader = CheckpointReader(checkpoint_path(self._folder, named.number))
+                if reader.sha256 == named.sha256 and (found := reader.arrays([name])):
+                    return Rows.of_table(found[name], place)
+        except (StoreError, ValueError) as error:
+            if not is_missing(error):  # as where a writer has replaced it
+                logger.warning("%s: rows are looked for in the log itself: %s", self._log.path, error)
+        log, end = self._log, self._log.place
+        rows, log.place = Rows(log.first), log.first
+        try:
+            rows.catch_up(log)
+        finally:
+            log.place = end
+        rows.cut(place)
+        return rows
+
+    def _next_row(self, after: int, last: int) -> int:
+        """Return the first row behind `after`, or one behind `last`. Raises DamageError where one is missing."""
+        index = self._find(after)
+        found = self._rows.sequences[index] if index < len(self._rows) else last + 1
+        # Of compacted ones a repair may have left some out.
+        first, through = 1 + max(after, self._current.compacted), min(found - 1, last)
+        if first <= through:
+            missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
+            raise self._damage(f"{missing} from", through)
+        return found
+
+    def _row(self, sequence: int, *, arrays: bool) -> Head:
+        """Return a row, verified; arrays: as a record. Raises DamageError, and CompactedError for compacted arrays."""
+        if self._next_row(sequence - 1, sequence) != sequence:
+            raise self._given_up(sequence)  # a repair left it out
+        index = self._rows.find(sequence - 1)
+        offset, size = self._rows.offsets[index], self._rows.sizes[index]
+        try:
+            if not arrays:
+                head, payload = read_head(self._log, offset, size), None
+            else:
+                head, payload = decode_row(self._log.read(offset, size))
+            if head.sequence != sequence:
+                raise ValueError(f"it has the number {head.sequence}")
+            if not arrays:
+                return head
+            if payload is None:
+                if sequence <= self._current.compacted:
+                    raise self._given_up(sequence)
+                raise ValueError("its arrays are missing")
+            return Record(**vars(head), arrays=decode_payload(payload))
+        except (DamageError, ValueError) as error:
+            raise self._damage(f"row {sequence} is not as it was written ({error}) in", sequence) from error
+
+    def _given_up(self, sequence: int) -> CompactedError:
+        return CompactedError(
+            f"records 1 to {self._current.compacted} of {self.path} gave up their arrays when it was compacted "
+            f"(row {sequence}, too): begin with compaction(), and continue behind its last_sequence"
+        )
+
+    def _damage(self, what: str, sequence: int) -> DamageError:
+        named = next((named for named in self._current.checkpoints if named.last_sequence >= sequence), None)
+        still = "no checkpoint contains it"
+        if named is not None:
+            still = f"checkpoint {named.number} (up to row {named.last_sequence}) still contains it"
+        path = self._log.path
+        return DamageError(f"{what} {path}; {still}: repair the store (repair_store)", path=path, sequence=sequence)
+
+    # Checkpoints.
 
     def latest(self) -> Checkpoint | None:
         """Return the newest checkpoint that verifies, None when there is none.
@@ -212,28 +529,46 @@ class Store:
         checkpoint of another format.
         """
         self._check_open()
-        return self._checkpoints.latest()
-
-    @property
-    def newest(self) -> int | None:
-        """The number of the newest committed checkpoint, None when there is none; `latest` may pass it over."""
-        self._check_open()
-        newest = self._journal.current().newest
-        return None if newest is None else newest.number
-
-    @property
-    def compacted(self) -> int:
-        """The last record that has given up its arrays for a compaction checkpoint, 0 where none has."""
-        self._check_open()
-        return self._journal.current().compacted
+        passed = set[int]()
+        while left := [named for named in self._settled().checkpoints if named.number not in passed]:
+            try:
+                return self._load(left[0])
+            except DamageError as damage:
+                if self._is_named(left[0]):
+                    passed.add(left[0].number)
+                    logger.warning("%s; replaying the journal behind an older checkpoint, or all of it", damage)
+        return None
 
     def compaction(self) -> Checkpoint | None:
         """Return the checkpoint that stands for the compacted records, None when there are none.
 
-        Raises DamageError where it does not verify, and VersionError for another format.
+        Raises DamageError where it does not verify, VersionError for another format, and CompactedError for a reader of
+        a store that was compacted again since its last `state`.
         """
         self._check_open()
-        return self._checkpoints.compaction()
+        if (named := self._settled().compaction) is None:
+            return None
+        try:
+            return self._load(named)
+        except DamageError as error:
+            if self._is_named(named):
+                raise
+            raise CompactedError(f"{self.path} was compacted again since it was read: read it anew") from error
+
+    def _is_named(self, named: NamedCheckpoint) -> bool:
+        """Whether a checkpoint still counts: a writer replaces them and removes them; a reader then looks again."""
+        self.state()
+        return named in self._settled().checkpoints
+
+    def _load(self, named: NamedCheckpoint) -> Checkpoint:
+        path = checkpoint_path(self._folder, named.number)
+        reader = CheckpointReader(path)
+        known = (reader.number, reader.last_sequence, reader.sha256, dict(reader.identity))
+        if known != (named.number, named.last_sequence, named.sha256, self.identity):
+            raise DamageError(
+                f"{path} is another checkpoint, or another store's, than the one that is named", path=path
+            )
+        return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
     def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> int:
         """Write a checkpoint that contains the records up to `last_sequence`, make it current, return its number.
@@ -245,7 +580,125 @@ class Store:
         """
         draft = self._draft(arrays, last_sequence, attributes)
         self._idle()
-        return self._checkpoints.commit(draft)
+        return self._commit(draft)
+
+    def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
+        """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
+
+        While one is being written, only the newest of those handed over waits. A failure is logged and raised, once, by
+        the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`. What cannot be kept is
+        refused at once, with RecordError. While the interpreter ends nothing is written: the log holds the rows.
+        """
+        draft = self._draft(arrays, last_sequence, attributes)
+        self._raise_failure()
+        with self._queue:
+            self._waiting = draft
+        with suppress(RuntimeError):  # it starts no job any more
+            self._submitted = self._worker.submit(self._commit_newest)
+
+    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
+        self._check_open(write=True)
+        self._refuse_in_batch("committing a checkpoint")  # its rows may yet be rolled back
+        first, last = self._settled().compacted, self._rows.last
+        if type(last_sequence) is not int or not first <= last_sequence <= last:
+            # Recovery could not resume among the compacted rows, which have given up their arrays.
+            raise RecordError(
+                f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
+                f"there is, not {last_sequence!r}"
+            )
+        if reserved := [name for name in arrays if name.startswith(INDEX)]:
+            raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
+        return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes))
+
+    def _commit(self, draft: CheckpointDraft) -> int:
+        with self._committing:
+            with self._using("looking where rows are"):
+                self._find(0)
+                current, place = self._current, self._rows.place(self._log, draft.last_sequence)
+                table = self._rows.table(draft.last_sequence)
+            named = self._write(draft, place, current.log_identity, table)
+            if current.newest is None or named.last_sequence >= current.newest.last_sequence:
+                # When this fails all folders stay, for the next commit or open to remove: what could not be synced may
+                # be on the disk all the same, and count after a crash.
+                with self._using("looking for the last row"):
+                    current = replace(self._current, newest=named, last=self._rows.last)
+                self._name(current)
+            self._remove_unnamed()
+            return named.number
+
+    def _name(self, current: Current) -> None:
+        """Write `CURRENT`, with the same log."""
+        with reported(self.path, "committing"):
+            try:
+                with self._naming:
+                    write_current(self._folder, current)
+            except BaseException:
+                # It may be another than before, or only in the system's memory.
+                with self._guard:
+                    self._unsettled = True
+                raise
+        with self._using("committing"):
+            self._current = current
+
+    def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
+        """Write a draft, with which rows are where in a log."""
+        number = self._next(numbers(self._folder, unfinished=True))
+        draft = replace(draft, arrays={**draft.arrays, index_name(log): table})
+        sha256 = write_checkpoint(self._folder, number, draft, self.identity)
+        return NamedCheckpoint(number, draft.last_sequence, sha256, place)
+
+    def _next(self, taken: list[int]) -> int:
+        number = 1 + max(taken, default=0)
+        if number >= 10**MOST_DIGITS:
+            raise DamageError(f"{self.path} has a log or a checkpoint of number {number - 1}", path=self.path)
+        return number
+
+    def _commit_newest(self) -> None:
+        with self._queue:
+            draft, self._waiting = self._waiting, None
+        if draft is None:
+            return
+        try:
+            self._commit(draft)
+        except Exception as error:
+            if isinstance(error, RuntimeError) and "interpreter shutdown" in str(error):
+                return  # no thread starts a job any more, without which zarr writes nothing
+            logger.exception("%s: a background commit failed; the journal still holds its rows", self.path)
+            self._failure = error
+
+    def _wait(self) -> None:
+        """Return when no background commit runs or waits."""
+        if self._submitted is not None:
+            wait_for([self._submitted])
+
+    def _raise_failure(self) -> None:
+        """Raise the failure of an earlier background commit, once, as a StoreError."""
+        with self._queue:
+            failure, self._failure = self._failure, None
+        if isinstance(failure, StoreError):
+            raise failure
+        if failure is not None:
+            raise StoreError(f"a background commit failed: {failure!r}") from failure
+
+    def _idle(self) -> None:
+        self._wait()
+        self._raise_failure()
+
+    def flush(self) -> None:
+        """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
+        self._check_open()
+        self._refuse_in_batch("waiting for the background commit")
+        self._idle()
+
+    def _remove_unnamed(self) -> None:
+        """Remove what `CURRENT` does not name: what was replaced, and what a writer that died left."""
+        try:
+            current = self._settled()
+            with reported(self.path, "removing checkpoints"):
+                remove_unnamed(self._folder, current)
+        except StoreError as error:
+            # The commit itself stands; the next one, or the next open, removes what is left.
+            logger.warning("%s: what was replaced could not be removed: %s", self.path, error)
 
     def compact(
         self,
@@ -264,35 +717,62 @@ class Store:
         Nobody can append meanwhile. Raises DamageError where a record behind `last_sequence` cannot be read, and as
         `commit`.
         """
-        compaction = self._draft(arrays, last_sequence, attributes)
-        last = None if newest is None else self._draft(newest[0], self._journal.last(), newest[1])
+        drafts = [self._draft(arrays, last_sequence, attributes)]
+        if newest is not None:
+            drafts.append(self._draft(newest[0], self._rows.last, newest[1]))
         self._idle()
-        self._checkpoints.compact(compaction, last)
+        with self._committing:
+            with self._using("putting another log in place"):
+                current = self._compacted(drafts)
+                try:
+                    write_current(self._folder, current)
+                finally:
+                    # A sync that failed leaves it open which of the two is named.
+                    self._unsettled = True
+                try:
+                    with self._using("opening the log that took its place"):
+                        pass
+                except StoreError as error:  # it stands; whoever uses it next opens it, or learns why that cannot be
+                    logger.warning(
+                        "%s: the log that took the place of another could not be opened yet: %s", self.path, error
+                    )
+            self._remove_unnamed()
 
-    def commit_later(self, arrays: Arrays, *, last_sequence: int, attributes: Attributes = None) -> None:
-        """Do as `commit` in a background thread; the arrays are handed over and must not change any more.
+    def _compacted(self, drafts: list[CheckpointDraft]) -> Current:
+        """Write a log in which rows have no arrays, and the checkpoints that stand for them; read all of it back."""
+        number = self._next(log_numbers(self._folder, unfinished=True))
+        path = log_path(self._folder, number)
+        try:
+            header, last_sequence = to_json("identity", self.identity).encode(), drafts[0].last_sequence
+            identity = create_log(path, header, ((ROW, data) for data in self._payloads(last_sequence)))
+            with Log(path) as log:
+                rows = read_back(log)
+                places = [rows.place(log, each.last_sequence) for each in drafts]
+            named = [
+                self._write(each, place, identity, rows.table(each.last_sequence))
+                for each, place in zip(drafts, places, strict=True)
+            ]
+            for one in named:
+                self._load(one)
+        except BaseException:
+            remove_tree(path)
+            raise
+        return Current(number, identity, named[-1], named[0], self._rows.last)
 
-        While one is being written, only the newest of those handed over waits. A failure is logged and raised, once, by
-        the next `commit`, `commit_later` (which then queues nothing), `flush` or `close`. What cannot be kept is
-        refused at once, with RecordError.
-        """
-        draft = self._draft(arrays, last_sequence, attributes)
-        self._checkpoints.raise_failure()
-        self._checkpoints.commit_later(draft)
+    def _payloads(self, last_sequence: int) -> Iterator[bytes]:
+        """Yield the bytes of each row in order, of those up to `last_sequence` without their arrays."""
+        self._find(0)
+        rows = self._rows
+        for index, sequence in enumerate(rows.sequences):
+            if sequence <= last_sequence:
+                yield head_without_arrays(self._row(sequence, arrays=False))
+                continue
+            try:
+                yield self._log.read(rows.offsets[index], rows.sizes[index])
+            except DamageError as error:
+                raise self._damage(f"row {sequence} is not as it was written ({error}) in", sequence) from error
 
-    def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
-        self._check_open(write=True)
-        return self._checkpoints.draft(arrays, last_sequence, attributes)
-
-    def flush(self) -> None:
-        """Return when what was handed to `commit_later` is committed; raise the failure if it is not."""
-        self._check_open()
-        self._journal.refuse_in_batch("waiting for the background commit")
-        self._idle()
-
-    def _idle(self) -> None:
-        self._checkpoints.wait()
-        self._checkpoints.raise_failure()
+    # The folder.
 
     def backup(self, destination: str | os.PathLike[str], *, progress: Progress | None = None) -> None:
         """Copy the store to the new folder `destination`, also while it is written, from here or elsewhere.
@@ -305,13 +785,13 @@ class Store:
         copy does not verify, StoreFullError, ReadOnlyError or another StoreError.
         """
         self._check_open()
-        back_up(self.path, store_folder(destination), progress)
+        back_up(self._folder, store_folder(destination), progress)
 
     def size(self) -> dict[str, int]:
         """Return the bytes on the disk: {"journal": …, "checkpoints": …}."""
         self._check_open()
-        with reported(self.path, "measuring the store"):
-            return {"journal": self._journal.size(), "checkpoints": sum(self._files.sizes(self.path / CHECKPOINTS))}
+        with self._using("measuring the store"):
+            return {"journal": self._log.size(), "checkpoints": tree_size(self._folder / CHECKPOINTS)}
 
     def close(self) -> None:
         """Wait for the background commit, release the files and the lock; a second call does nothing.
@@ -321,14 +801,16 @@ class Store:
         # What a fork inherited belongs to the parent.
         if os.getpid() != self._process:
             return
-        self._journal.refuse_in_batch("closing the store")
-        with self._closing:
+        self._refuse_in_batch("closing the store")
+        self._worker.shutdown()
+        with self._guard:
             if self._closed:
                 return
-            self._checkpoints.close()
             self._closed = True
+            if self.mode == "write" and self._current.last < self._rows.last:
+                self._note_last()
             self._held.close()
-        self._checkpoints.raise_failure()
+        self._raise_failure()
 
     def __enter__(self) -> Self:
         self._check_open()

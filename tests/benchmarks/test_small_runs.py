@@ -8,8 +8,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from commands import run
-from scroll_tactile_store.log import LogReader
-from scroll_tactile_store.row_encoding import decode_row
+from scroll_tactile_store.log import Log, refuse
+from scroll_tactile_store.rows import decode_row
 
 from examples.benchmarks import appending, health, health_peers, live_shift
 from examples.benchmarks.interleaved import AsIs
@@ -87,8 +87,8 @@ def test_each_way_of_appending_keeps_the_rows(tmp_path, monkeypatch):
     assert result["rows"] == 15 and result["records"][0]["times_sqlite"] == 1.0
     with closing(sqlite3.connect(tmp_path / "rows.sqlite")) as database:
         kept = [data for (data,) in database.execute("SELECT bytes FROM row ORDER BY sequence")]
-    with LogReader(tmp_path / "log") as log:
-        rows = [log.read(frame.offset, frame.size)[1] for batch in log.refresh() for frame in batch]
+    with Log(tmp_path / "log") as log:
+        rows = [log.read(frame.offset, frame.size) for batch in log.scan(refuse) for frame in batch]
     assert kept == rows and [decode_row(row).head.sequence for row in rows] == list(range(1, 16))
     assert (tmp_path / "bare").stat().st_size == 15 * appending.ROW_BYTES
 

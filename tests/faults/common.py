@@ -1,4 +1,4 @@
-"""What every command of this folder has: its options, a folder to harm, a table and a record of what came of it."""
+"""What every command of this folder has: its options, a folder to harm, and a record of what came of it."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from scroll_tactile import __version__
 # Folders that are harmed by the shim and not by the disk may lie in memory, where nothing is waited for.
 IN_MEMORY = Path("/dev/shm")
 
+ABOUT = ("command", "seed", "date", "versions", "machine")  # in the file alone
 PACKAGES = ("numpy", "torch", "zarr", "numcodecs", "filelock")
 
 
@@ -44,33 +45,6 @@ def parser(about: str | None, *, seed: int | None = 0, **defaults: Any) -> argpa
         else:
             made.add_argument(f"--{name}", type=type(value), default=value)
     return made
-
-
-class Part:
-    """What is known of a run that is not at its end: in FILE.part beside the record, from which a later call goes on.
-
-    about: what such a run is made with; another's part is not taken up.
-    """
-
-    def __init__(self, record: Path | None, **about: Any) -> None:
-        self._path = None if record is None else record.with_name(record.name + ".part")
-        self._about, self.known = about, dict[str, Any]()
-        if self._path is not None and self._path.exists():
-            kept = json.loads(self._path.read_text(encoding="utf-8"))
-            self.known = kept["known"] if kept["about"] == about else {}
-
-    def save(self, **known: Any) -> None:
-        """Add to what is known."""
-        self.known |= known
-        if self._path is not None:
-            draft = self._path.with_suffix(".new")
-            draft.write_text(json.dumps({"about": self._about, "known": self.known}, indent=1), encoding="utf-8")
-            draft.replace(self._path)
-
-    def remove(self) -> None:
-        """The run is at its end."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -168,7 +142,7 @@ def _without_folders(words: Sequence[str]) -> list[str]:
 def run(
     name: str, options: argparse.Namespace, work: Callable[[argparse.Namespace], Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Do a command's work, print a table of its figures and write its record; exits with 1 where a bar was missed.
+    """Do a command's work, print its figures and write its record; exits with 1 where a bar was missed.
 
     work: gives the figures, and a list "failures" of sentences.
     """
@@ -188,35 +162,12 @@ def run(
         **figures,
         "failures": failures,
     }
-    show(record)
+    print(json.dumps({name: told for name, told in record.items() if name not in ABOUT}, indent=1, ensure_ascii=False))
     if options.json is not None:
         options.json.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     if failures:
         sys.exit(1)
     return record
-
-
-def show(record: Mapping[str, Any]) -> None:
-    """Print a record as a table of two columns."""
-    print(f"\n{record['name']}: {record['seconds']} s, {len(record['failures'])} failures")
-    for key, value in record.items():
-        if key in ("name", "command", "seed", "date", "versions", "machine", "seconds", "failures"):
-            continue
-        if isinstance(value, Mapping):
-            print(f"  {key}")
-            for inner, told in value.items():
-                print(f"    {inner:<34} {_told(told)}")
-        else:
-            print(f"  {key:<36} {_told(value)}")
-    for failure in record["failures"][:20]:
-        print(f"  FAILED {failure}")
-    sys.stdout.flush()
-
-
-def _told(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_told(part)}" for key, part in value.items())
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def progress(text: str) -> None:

@@ -11,7 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile_store import backup, checkpoint_files, checkpoints, journal, layout, log, repair
+from scroll_tactile_store import backup, checkpoint_files, layout, log, repair, rows
+from scroll_tactile_store.records import Checkpoint
+from scroll_tactile_store.store import Store
 
 from faults.planting import BUGS, Replacement, bug, nothing
 from scroll_tactile.memory.state import Memory
@@ -19,15 +21,9 @@ from scroll_tactile.memory.touch_rows import MEMBER, MERGE, OBSERVE
 from scroll_tactile.persistence import ledger, merge, packing, replaying
 
 
-@bug("a frame's payload is not verified", log.LogReader, "_payload")
-def _payload_as_it_is(_: Any, self: Any, frame: Any) -> Any:
-    return self._file.read(frame.payload_offset, frame.size)
-
-
-@bug("a frame's payload is not verified", log.LogReader, "__init__")
-def _payloads_not_read(init: Any, self: Any, path: Any, **named: Any) -> None:
-    init(self, path, **named)
-    self.payloads = False
+@bug("a frame's payload is not verified", log.Log, "_payload")
+def _payload_as_it_is(_: Any, self: Any, frame: Any, begin: bytes) -> Any:
+    return self._at(frame.payload_offset, frame.size)
 
 
 @bug("CURRENT is not verified", layout.Current, "from_bytes")
@@ -42,9 +38,10 @@ def _current_resealed(read: Any, cls: Any, data: bytes, path: Path) -> Any:
 
 
 # What a checkpoint says of itself is compared with what CURRENT says of it. That alone lets one bit in 3900 pass.
-@bug("CURRENT is not verified", checkpoints.Checkpoints, "_verified")
+@bug("CURRENT is not verified", Store, "_load")
 def _checkpoint_as_it_is(_: Any, self: Any, named: Any) -> Any:
-    return checkpoint_files.CheckpointReader(layout.checkpoint_path(self._folder, named.number), self._files)
+    reader = checkpoint_files.CheckpointReader(layout.checkpoint_path(self._folder, named.number))
+    return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
 
 class Same(str):
@@ -74,16 +71,15 @@ def _digest_of_anything(digest: Any, known: Any) -> str:
     return Same(digest(known))
 
 
-@bug("a torn batch is taken", log.LogReader, "_scan")
+@bug("a torn batch is taken", log.Log, "_batch")
 def _torn_taken_for_committed(scan: Any, self: Any) -> Any:
     batch, torn = scan(self)
     return ([*batch, batch[-1]], None) if torn is not None and batch else (batch, torn)
 
 
-@bug("a reader does not notice another log", journal.Journal, "_renewed")
-def _other_log_not_noticed(_: Any, self: Any, at: Any) -> Any:
-    at.catch_up()
-    return at
+@bug("a reader does not notice another log", Store, "_look")
+def _other_log_not_noticed(_: Any, self: Any) -> None:
+    self._rows.catch_up(self._log)
 
 
 @bug("an index of another log is believed", checkpoint_files.CheckpointReader, "arrays")
@@ -108,30 +104,32 @@ bug("a backup does not look at CURRENT again", backup, "_verify")(nothing)
 # What is counted.
 
 
-@bug("rows of a failed batch stay known", journal.Journal, "_undo")
-def _undone_in_the_log_alone(_: Any, at: Any, writer: Any) -> None:
-    writer.rollback()
+@bug("rows of a failed batch stay known", rows.Rows, "cut")
+def _undone_in_the_log_alone(_: Any, self: Any, place: Any) -> None:
+    """The rows of what was rolled back stay."""
 
 
-@bug("a place is one batch too late", journal.Journal, "place")
-def _place_too_late(_: Any, self: Any, last_sequence: int) -> Any:
-    with self._using("looking for a place") as at:
-        found = [place for row, place in at.places if row > last_sequence]
-        return found[0] if found else at.places[-1][1]
+@bug("a place is one batch too late", rows.Rows, "place")
+def _place_too_late(place: Any, self: Any, log: Any, last_sequence: int) -> Any:
+    found = place(self, log, last_sequence)
+    later = next((sequence for sequence in self.sequences if sequence > last_sequence), last_sequence)
+    while later <= self.last and place(self, log, later) == found and found != log.place:
+        later += 1
+    return place(self, log, later)
 
 
-@bug("a checkpoint says one row too many", checkpoints.Checkpoints, "commit")
+@bug("a checkpoint says one row too many", Store, "_commit")
 def _one_row_too_many(commit: Any, self: Any, draft: Any) -> Any:
-    more = min(draft.last_sequence + 1, self._journal.last())
+    more = min(draft.last_sequence + 1, self._rows.last)
     return commit(self, dataclasses.replace(draft, last_sequence=more))
 
 
-@bug("numbers of rows are given out again", journal.OpenLog, "last")
+@bug("numbers of rows are given out again", rows.Rows, "last")
 def _last_of_those_that_are_there(_: Any, self: Any) -> Any:
-    return self.last_row
+    return self.sequences[-1] if self.sequences else 0
 
 
-@bug("compaction drops the last row", journal.Journal, "payloads")
+@bug("compaction drops the last row", Store, "_payloads")
 def _all_but_the_last(payloads: Any, self: Any, last_sequence: int) -> Iterator[bytes]:
     return iter(list(payloads(self, last_sequence))[:-1])
 
@@ -167,9 +165,9 @@ def _retracted_rows_too(_: Any, heads: Any) -> Any:
     return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER)]
 
 
-@bug("a shared touch is counted twice", merge, "_already_there")
+@bug("a shared touch is counted twice", merge.Merge, "_there")
 def _nothing_there(*_: Any) -> Any:
-    return {}, []
+    return set(), []
 
 
 @bug("a packed memory is counted twice", merge, "sums_without")
@@ -177,7 +175,7 @@ def _nothing_left_out(sums: Any, source: Any, newest: Any, memory: Any, left_out
     return sums(source, newest, memory, set())
 
 
-@bug("a description is lost in a merge", merge, "_descriptions")
+@bug("a description is lost in a merge", merge.Merge, "_chosen_descriptions")
 def _all_but_the_first(described: Any, *given: Any) -> Any:
     return dict(list(described(*given).items())[1:])
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from scroll_tactile_store import backup, checkpoint_files, checkpoints, layout, log_writer
+from scroll_tactile_store import backup, checkpoint_files, layout, log, store
 from scroll_tactile_store.exceptions import reported
 from scroll_tactile_store.files import sync_file, sync_folder, sync_tree
 from scroll_tactile_store.layout import Current
@@ -38,18 +38,18 @@ def unsynced_name(_: Any, path: Path, draft: Path) -> Iterator[None]:
     draft.replace(path)
 
 
-@bug("the log is not synced", log_writer, "sync_open")
+@bug("the log is not synced", log, "sync_open")
 def _no_sync_of_the_log(sync: Any, descriptor: int, *, data_only: bool = False) -> None:
     if not data_only:
         sync(descriptor)
 
 
-@bug("a new log is not synced", log_writer, "create_log", everywhere=True)
-@bug("what a killed writer left is not synced", log_writer.LogWriter, "__init__")
+@bug("a new log is not synced", log, "create_log", everywhere=True)
+@bug("what a killed writer left is not synced", log.Log, "prepare")
 def _without_syncs(call: Any, *given: Any, **named: Any) -> Any:
     with (
-        mock.patch.object(log_writer, "sync_open", nothing),
-        mock.patch.object(log_writer, "replacing", lambda path, draft: unsynced(None, path, draft)),
+        mock.patch.object(log, "sync_open", nothing),
+        mock.patch.object(log, "replacing", lambda path, draft: unsynced(None, path, draft)),
     ):
         return call(*given, **named)
 
@@ -82,30 +82,30 @@ def _late_synced_behind(write: Any, folder: Path, current: Current) -> None:
             sync_tree(path)
 
 
-@bug("what is replaced is removed before CURRENT", checkpoints, "write_current")
+@bug("what is replaced is removed before CURRENT", store, "write_current")
 def _removed_too_early(write: Any, folder: Path, current: Current) -> None:
     layout.remove_unnamed(folder, current)
     write(folder, current)
 
 
-@bug("the commit frame is written first", log_writer.LogWriter, "commit")
-def _commit_frame_first(_: Any, self: Any) -> None:
-    if self._next == self.place:
+@bug("the commit frame is written first", log.Log, "commit")
+def _commit_frame_first(_: Any, self: Any, *, seal: bool = False) -> None:
+    if self._next == self.place and not seal:
         return
     with reported(self.path, "making a batch durable"):
         try:
-            last = self._pack(1, b"")
-            begin, staged = self._written, bytes(self._staged)
-            self._file.write(begin + len(staged) - 88, staged[-88:])
-            log_writer.sync_open(self._file.descriptor, data_only=True)
+            self._pack(1, b"")
+            begin, staged = self._written, bytearray(self._staged)
+            self._put(begin + len(staged) - 88, staged[-88:])
+            log.sync_open(self._descriptor, data_only=True)
             self._write()
         except BaseException:
             self.rollback()
             raise
-        self._last, self.place, self._settled = last, self._next, True
+        self.place, self._settled = self._next, True
 
 
-@bug("a rollback does not cut the log", log_writer.LogWriter, "_settle")
+@bug("a rollback does not cut the log", log.Log, "_settle")
 def _rollback_without_cut(_: Any, self: Any) -> None:
     self._settled = True
 

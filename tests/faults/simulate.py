@@ -3,7 +3,8 @@
 Two robots and a central memory observe, retract, relabel, compact, back up, pack and merge, while their disks lose what
 was not synced, fill up and rot, their processes die, and a bucket between them loses, doubles and delays what is packed
 (see simulation_world.py, and what goes on from it). What is seen of each memory must be what the model says (see
-model.py). All of a run comes from its seed; one that fails is made shorter, and told. Goes on where FILE.part ends.
+model.py). All of a run comes from its seed; one that fails is made shorter, and told. `--first S` begins with
+another seed.
 
 That it is harsh enough shows `--plant NAME`: the bug of that name (see planted_*.py) is put in, and must be found;
 `--plants` does so with all of them. `--seed S` replays one seed, `--whole` without making it shorter.
@@ -27,7 +28,7 @@ import faults.planted_reads
 import faults.planted_writes  # noqa: F401  # which name their bugs
 from faults import shim as watch
 from faults import simulation_kit
-from faults.common import Part, folder, parser, progress, run, warnings_told
+from faults.common import folder, parser, progress, run, warnings_told
 from faults.planting import BUGS, planted
 from faults.shim import Shim
 from faults.simulation_system import System
@@ -122,30 +123,23 @@ class Simulation:
 
 def sound(simulation: Simulation, options: argparse.Namespace) -> dict[str, Any]:
     """Without any bug put in: no seed fails."""
-    part = Part(options.json, first=options.first)
-    simulation.counts.update(part.known.get("events", {}))
-    seed, failures = part.known.get("next", options.first), part.known.get("failures", [])
+    failures: list[str] = []
     begun = said = time.monotonic()
-    end, first = options.first + options.seeds, seed
-    while seed < end:
+    end = options.first + options.seeds
+    for seed in range(options.first, end):
         if simulation.first_failing(seed, seed + 1) is not None:
             failures.append(simulation.tell(seed, shorten=not options.whole))
             progress(failures[-1])
-        seed += 1
-        if (now := time.monotonic()) - said > 5 or seed == end:
-            said = now
-            progress(f"seed {seed} of {end}, {(seed - first) / (now - begun):.1f} a second, {len(failures)} failed")
-            part.save(next=seed, events=dict(sorted(simulation.counts.items())), failures=failures)
-    part.remove()
+        if (now := time.monotonic()) - said > 5 or seed + 1 == end:
+            said, done = now, seed + 1 - options.first
+            progress(f"seed {seed + 1} of {end}, {done / (now - begun):.1f} a second, {len(failures)} failed")
     return {"seeds": options.seeds, "events": dict(sorted(simulation.counts.items())), "failures": failures}
 
 
 def found(simulation: Simulation, options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
     """With each of these bugs some seed fails."""
-    part = Part(options.json, first=options.first, seeds=options.seeds)
+    plants: dict[str, Any] = {}
     for name in names:
-        if name in part.known:
-            continue
         with planted(name):
             begun, failed = time.monotonic(), simulation.first_failing(options.first, options.first + options.seeds)
             told = "" if failed is None else simulation.tell(failed, shorten=bool(options.plant))
@@ -156,9 +150,8 @@ def found(simulation: Simulation, options: argparse.Namespace, names: Sequence[s
             progress(told)
         taken = None if failed is None else failed + 1 - options.first
         progress(f"{name}: {taken} seeds, {time.monotonic() - begun:.0f} s: {what[:160]}")
-        part.save(**{name: {"seeds": taken, "told": what[:400]}})
-    plants, missed = part.known, [name for name in names if part.known[name]["seeds"] is None]
-    part.remove()
+        plants[name] = {"seeds": taken, "told": what[:400]}
+    missed = [name for name in names if plants[name]["seeds"] is None]
     return {"plants": plants, "failures": [f"not found in {options.seeds} seeds: {name}" for name in missed]}
 
 

@@ -7,14 +7,14 @@ import random
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import scroll_tactile_store.checkpoint_files
-import scroll_tactile_store.checkpoints
-import scroll_tactile_store.log_writer
+import scroll_tactile_store.log
+import scroll_tactile_store.store
 from quick_checkpoints import read_zarr, write_zarr
 
 from faults import shim as watch
@@ -120,22 +120,18 @@ class Held:
 
 def prepare() -> None:
     """Have the store write little at once, quickly, and in the background only what the schedule lets run."""
-    scroll_tactile_store.log_writer.AHEAD = AHEAD
+    scroll_tactile_store.log.AHEAD = AHEAD
     scroll_tactile_store.checkpoint_files._write_zarr = partial(write_zarr, indent=None)  # numbers stand between commas
     scroll_tactile_store.checkpoint_files._read_zarr = read_zarr
-    scroll_tactile_store.checkpoints.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
-    scroll_tactile_store.checkpoints.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
+    scroll_tactile_store.store.ThreadPoolExecutor = Held  # type: ignore[misc,assignment]
+    scroll_tactile_store.store.wait_for = lambda jobs: [job.wait() for job in jobs]  # type: ignore[assignment,misc]
 
 
 def abandon(learner: Any) -> None:
     """Let go of a memory as a process does that is killed: nothing more is written."""
     held = learner._ledger.store
-    held._checkpoints._worker.jobs.clear()
-    with suppress(Exception):
-        at = held._journal._open
-        if at is not None:
-            at.log._file.close()
-        held._files.close()
+    held._worker.jobs.clear()
+    held._log.close()
     if held._lock is not None:
         held._lock._lock.release()
     held._closed = True

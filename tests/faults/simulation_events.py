@@ -22,7 +22,7 @@ SMALL = ("observe",) * 4 + ("retract", "describe", "forget")
 @contextmanager
 def interleaved(place: int, between: Callable[[], None]) -> Iterator[None]:
     """While it lasts, do something just before the so many-th file is copied; 0: before the log is read."""
-    copy, reader = scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.LogReader
+    copy, reader = scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.Log
     left = [place] if place >= 0 else []
 
     def due(now: bool) -> None:
@@ -39,11 +39,11 @@ def interleaved(place: int, between: Callable[[], None]) -> Iterator[None]:
         due(True)
         return reader(*given, **named)
 
-    scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.LogReader = copied, read  # type: ignore[assignment,misc]
+    scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.Log = copied, read  # type: ignore[assignment,misc]
     try:
         yield
     finally:
-        scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.LogReader = copy, reader  # type: ignore[misc]
+        scroll_tactile_store.backup.copy_regular, scroll_tactile_store.backup.Log = copy, reader  # type: ignore[misc]
 
 
 class OneMemory(World):
@@ -77,8 +77,8 @@ class OneMemory(World):
 
     def _tick(self, machine: Machine, rng: random.Random) -> None:
         """What was handed to the background is done now."""
-        if machine.learner is not None and machine.learner._ledger.store._checkpoints._worker.jobs:
-            worker = machine.learner._ledger.store._checkpoints._worker
+        if machine.learner is not None and machine.learner._ledger.store._worker.jobs:
+            worker = machine.learner._ledger.store._worker
             self.operate(machine, rng, "background commit", worker.run, (machine.state, None))
             self.counts["background commits later"] += 1
 

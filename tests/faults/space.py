@@ -96,7 +96,7 @@ def rows_alone(home: Path, count: int) -> dict[str, Any]:
         store = Store.open(path, mode=mode)
         figures[f"ms to open to {mode}"] = 1e3 * (time.perf_counter() - begun)
         for what, look in {
-            "look whether something came": lambda store: (store.newest, store.last, store.compacted),
+            "look whether something came": lambda store: store.state(),
             "read the newest checkpoint": lambda store: store.latest(),
             "read the rows behind it": lambda store: list(store.records(after=store.latest().last_sequence)),
             "find the rows of one material": lambda store: list(store.heads(label="material 7")),

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scroll_tactile_store import StoreError, StoreFullError
-from scroll_tactile_store.log_writer import LogWriter
+from scroll_tactile_store.log import Log
 
 from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
 from scroll_tactile.health.watch import EVERY, Watch, WatchedRow, WatchedRows, WatchRules
@@ -174,7 +174,7 @@ def test_rows_of_a_batch_that_was_lost_count_no_more_nor_after_a_restart(
                 learner.sense(SCENE.touch(NAMES[0], 80 + i), NAMES[0])
             lost = learner.health()
             assert lost.touches == before.touches + 4
-            monkeypatch.setattr(LogWriter, "stage", full)
+            monkeypatch.setattr(Log, "stage", full)
             with pytest.raises(StoreFullError):
                 learner.sense(SCENE.touch(NAMES[0], 84), NAMES[0])
         monkeypatch.undo()

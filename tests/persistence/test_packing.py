@@ -16,15 +16,13 @@ from scroll_tactile_store import (
     Store,
     StoreError,
     VersionError,
-    archive,
     check_store,
 )
-from scroll_tactile_store.framing import FRAME_BYTES
 from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.validation.gate import MemoryStore, check_memory
+from scroll_tactile.memory.gate import MemoryStore, check_memory
 
 
 def packed(folder, observed, name="p", described=(), pack=None, **settings):
@@ -73,7 +71,7 @@ class TestMerging:
 
 class TestReading:
     @pytest.mark.parametrize("pack", [{}, {"readings": False}])
-    def test_it_is_opened_to_read_where_it_lies_and_left_as_it_is(self, tmp_path, pack):
+    def test_it_is_opened_to_read_and_left_as_it_is(self, tmp_path, pack):
         file = packed(tmp_path, OBSERVED, described={"a": {"cotton": 1.0}}, pack=pack)
         before = file.read_bytes()
         with TactileLearner.open(file, mode="read") as learner:
@@ -125,22 +123,12 @@ def require_refused(learner, file, match=None):
 class TestDamage:
     @pytest.mark.parametrize("pack", [{}, {"rows": False}])
     def test_a_flipped_bit_anywhere_is_refused_by_name_or_changes_nothing(self, tmp_path, pack):
-        """Dates and the like are not verified; where there are rows they say all that a checkpoint says."""
+        """Dates and the like are not verified; each file is."""
         file = packed(tmp_path, OBSERVED[:3], pack=pack)
         whole, draw, digest, refused = file.read_bytes(), np.random.default_rng(7), fed(OBSERVED[:3]).digest(), 0
-        listed = archive.Archive(file)
-        listed.close()
-        inside = listed._ranges
-        # Not read whole: without readings, how arrays are described, and frames of heads, which verify by themselves.
-        described = [name for name in inside if name.count("/") == 3 and name.endswith("/zarr.json")]
-        spare = [name for name in inside if name.startswith("log-" if pack else "checkpoints") or "/log-" in name]
-        spare += described if pack else []
-        # The frame that ends a log proves what is before it, and nothing proves that.
-        shorter = {name: FRAME_BYTES for name in inside if name.startswith("log-")}
-        needed = [(begin, size - shorter.get(name, 0)) for name, (begin, size) in inside.items() if name not in spare]
-        within = [begin + int(draw.integers(size)) for begin, size in needed for _ in range(1 if pack else 2)]
-        outside = [*range(0, 30, 9), *range(len(whole) - 60, len(whole), 17)]
-        outside += [begin - 30 for begin, _ in inside.values()]
+        inside = ranges(file)
+        within = [begin + int(draw.integers(size)) for begin, size in inside for _ in range(1 if pack else 2)]
+        outside = [*range(0, 30, 9), *range(len(whole) - 60, len(whole), 17), *(begin - 30 for begin, _ in inside)]
         places = [*within, *outside, *draw.integers(0, len(whole), size=3).tolist()]
         for place in places:
             flipped = bytearray(whole)
@@ -196,6 +184,16 @@ def test_packing_passes_over_what_a_failing_disk_does_not_let_go_of(tmp_path, mo
         assert whole.last == 1
 
 
+def ranges(file):
+    """Where in a zip the bytes of each file begin, and how many there are; of files without any, nothing."""
+    data, found = file.read_bytes(), []
+    with zipfile.ZipFile(file) as listed:
+        for entry in listed.infolist():
+            name, more = struct.unpack_from("<HH", data, entry.header_offset + 26)
+            found.append((entry.header_offset + 30 + name + more, entry.file_size))
+    return [each for each in found if each[1]]
+
+
 def entries(file):
     """The names and contents of a zip."""
     with zipfile.ZipFile(file) as listed:
@@ -248,12 +246,6 @@ def overlapping(file):
     file.write_bytes(data)
 
 
-def of_too_many_files(file):
-    with zipfile.ZipFile(file, "a") as many:
-        for number in range(2, 1000):
-            many.writestr(f"log-{number:08d}", b"")
-
-
 def of_a_full_list(file):
     zipped(file, entries(file))
     patched(file, b"PK\5\6", 12, struct.pack("<I", 2**31))
@@ -269,7 +261,14 @@ def in_its_place(make):
     return replace
 
 
-NAMES = ["../outside", "checkpoints/../../outside", "/tmp/outside", "C:\\outside", "checkpoints\\00000001\\zarr.json"]
+NAMES = [
+    "../outside",
+    "checkpoints/00000001/../zarr.json",
+    "checkpoints/../../outside",
+    "/tmp/outside",
+    "C:\\outside",
+    "checkpoints\\00000001\\zarr.json",
+]
 NAMES += ["current", "Log-00000001", "log-00000001/", "lock", "log-٠٠٠٠٠٠٠١", "x" * 60_000]
 NAMES += ["checkpoints/00000001/a/c/" + "0/" * 70 + "0", "CURRENT", "log-00000001"]
 SHELL = b"#!/bin/sh\n"
@@ -280,18 +279,16 @@ HARMS = {
         for name in NAMES
     },
     "a link": (lambda file: zipped(file, entries(file), links=["log-00000001"]), "as a link"),
-    "deflated": (lambda file: zipped(file, entries(file), zipfile.ZIP_DEFLATED), "as compressed or encrypted"),
+    "deflated": (lambda file: zipped(file, entries(file), zipfile.ZIP_DEFLATED), None),
     "encrypted": (lambda file: patched(file, LISTED, 8, struct.pack("<H", 1)), "as compressed or encrypted"),
     "another name in the list": (lambda file: patched(file, b"CURRENT", 0, b"CURRENS"), None),
-    "a place in a file": (relisted(42, "<I", 7), "where another file begins, or none"),
+    "a place in a file": (relisted(42, "<I", 7), "does not unpack"),
     **{f"{size} bytes each": (relisted(20, "<II", size, size), None) for size in (0, 2**32 - 2)},
-    "files that overlap": (overlapping, "files that overlap"),
-    "a script before it": (lambda file: file.write_bytes(SHELL + file.read_bytes()), "cut off or added to"),
-    "a byte behind it": (lambda file: file.write_bytes(file.read_bytes() + b"x"), "cut off or added to"),
+    "files that overlap": (overlapping, None),
+    "a script before it": (lambda file: file.write_bytes(SHELL + file.read_bytes()), "no packed store"),
     "nothing in it": (holding(lambda _: []), "no packed store"),
     "all in a folder": (holding(lambda own: [("m/" + name, data) for name, data in own]), "no packed store"),
-    "a list that fills the memory": (of_a_full_list, "its list of files takes 2147483648 bytes"),
-    "too many files": (of_too_many_files, "(?i)fetch it again"),
+    "a list that fills the memory": (of_a_full_list, "no packed store"),
     "a pipe": (in_its_place(os.mkfifo), None),
     "a link to one": (in_its_place(lambda file: file.symlink_to("moved")), None),
     "a folder": (in_its_place(os.mkdir), None),
@@ -301,8 +298,7 @@ HARMS = {
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 @pytest.mark.parametrize(("harm", "match"), HARMS.values(), ids=HARMS)
-def test_one_that_was_made_to_harm(three, other, tmp_path, harm, match, monkeypatch):
-    monkeypatch.setattr(archive, "MOST_FILES", 900)  # so many are soon written
+def test_one_that_was_made_to_harm(three, other, tmp_path, harm, match):
     file = Path(shutil.copy(three, tmp_path / "p"))
     harm(file)
     before = sorted(tmp_path.iterdir())
@@ -313,7 +309,7 @@ def test_one_that_was_made_to_harm(three, other, tmp_path, harm, match, monkeypa
 def test_checking_one(three, tmp_path):
     file = Path(shutil.copy(three, tmp_path / "p"))
     assert check_store(file) == [] == check_memory(file)
-    begin, size = archive.Archive(file)._ranges["log-00000001"]
+    begin, size = ranges(file)[1]
     whole = bytearray(file.read_bytes())
     whole[begin + size // 2] ^= 1
     file.write_bytes(bytes(whole))

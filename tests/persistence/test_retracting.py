@@ -3,7 +3,6 @@
 import pytest
 from forging import spoil_row
 from scroll_tactile_store import (
-    CompactedError,
     DamageError,
     ReadOnlyError,
     Store,
@@ -43,12 +42,6 @@ class TestRetract:
             with pytest.raises(ObservationError, match=r"receipt is of another memory: .* of 'c'.* it is of 'a'"):
                 learner.retract(receipts[0])
             require_same(learner, OBSERVED)
-
-    def test_without_a_journal_nothing_can_be_retracted(self):
-        learner = fed(OBSERVED)
-        for call in (lambda: learner.retract(1), lambda: learner.forget("a"), learner.compact):
-            with pytest.raises(InputError, match="a memory without a path keeps no journal"):
-                call()
 
     def test_a_reader_cannot(self, path):
         learner, receipts = filled(path)
@@ -167,15 +160,13 @@ class TestMerge:
                 ours.merge(theirs)
             require_same(ours, OBSERVED, embedding=own)
 
-    def test_itself_nothing_and_one_without_a_path_are_refused(self, path, tmp_path):
+    def test_itself_and_nothing_are_refused(self, path, tmp_path):
         ours, _ = filled(path)
         with ours:
             with pytest.raises(MismatchError, match="into itself"):
                 ours.merge(path)
             with pytest.raises(StoreError, match="holds no store"):
                 ours.merge(tmp_path / "none")
-            with pytest.raises(InputError, match="without a path"):
-                ours.merge(fed(OBSERVED))
             require_same(ours, OBSERVED)
 
     def test_cut_off_in_the_middle_it_never_began(self, path, tmp_path):
@@ -204,9 +195,7 @@ class TestRefresh:
         with learner, reader:
             learner.retract(receipts[0])
             learner.compact()
-            require_same(reader, OBSERVED, exemplars=False)
-            with pytest.raises(CompactedError, match="was compacted since it was read"):  # their readings are gone
-                reader.exemplars  # noqa: B018
+            require_same(reader, OBSERVED)  # it has the log open that the writer replaced
             reader.refresh()
             require_same(reader, without(0))
 
@@ -263,7 +252,7 @@ def test_a_compaction_interrupted_when_it_was_done_already_is_known(path, monkey
             raise KeyboardInterrupt
 
         with monkeypatch.context() as broken:
-            broken.setattr(type(learner._ledger.store._checkpoints), "remove_unnamed", interrupted)
+            broken.setattr(Store, "_remove_unnamed", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 learner.compact(keep=2)
         require_same(learner, OBSERVED)
@@ -320,7 +309,7 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
     def slow(store, **asked):
         found = latest(store, **asked)
         if store.mode == "read" and not looks:
-            looks.append(1)  # between the reader's two looks the writer goes on
+            looks.append(1)  # while the reader reads, the writer goes on
             learner.observe("a", stream((8, 60)))
             learner.fine_tune(epochs=1)
             learner.observe("b", stream((9, 60)))
@@ -328,6 +317,8 @@ def test_a_reader_sees_no_new_rows_beside_an_older_f_star(path, monkeypatch):
 
     monkeypatch.setattr(Store, "latest", slow)
     with learner, TactileLearner.open(path, mode="read", **SETTINGS) as reader:
+        require_same(reader, OBSERVED)
+        reader.refresh()
         require_same(reader, [*OBSERVED, ("a", (8, 60)), ("b", (9, 60))])
         assert reader.tuned_digest() == learner.tuned_digest()
 

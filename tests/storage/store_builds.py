@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from forging import frames_of, get_current, group_of, log_of, read_log, spoil_row, write_log
 from scroll_tactile_store import CompactedError, Store, check_store
-from scroll_tactile_store.row_encoding import row_sequence
+from scroll_tactile_store.rows import row_sequence
 
 LAST = 20
 IDENTITY = {"for": ["tests", 1]}

@@ -8,7 +8,6 @@ import pytest
 from forging import describe_again, get_current, group_of, refiled
 from numcodecs import zstd
 from scroll_tactile_store import DamageError, Store, check_store, checkpoint_files
-from scroll_tactile_store.archive import Files
 from scroll_tactile_store.checkpoint_files import CheckpointReader
 from store_builds import flip, newest, taking_at_most
 
@@ -104,7 +103,7 @@ def test_what_is_stored_is_verified_before_zarr_gets_it(path, monkeypatch):
 
     monkeypatch.setattr(checkpoint_files, "_read_zarr", reached)
     with pytest.raises(DamageError, match=r"array 'rows' of checkpoint 1 .*sha256 differs") as refused:
-        CheckpointReader(newest(path), Files(path)).arrays(["rows"])
+        CheckpointReader(newest(path)).arrays(["rows"])
     assert refused.value.path == newest(path) / "rows" / "c" / "0" / "0"
 
 
@@ -122,7 +121,7 @@ def test_an_array_that_claims_what_is_never_written_is_damage_and_takes_no_memor
     forge(path)
     with taking_at_most(40 * 2**20):
         require_damage(path)
-    assert list(CheckpointReader(newest(path), Files(path)).arrays(["one"])) == ["one"]
+    assert list(CheckpointReader(newest(path)).arrays(["one"])) == ["one"]
 
 
 def test_a_frame_that_claims_another_size_is_damage_and_takes_no_memory(path):

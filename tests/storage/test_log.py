@@ -4,17 +4,14 @@ import errno
 import os
 import shutil
 import struct
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import scroll_tactile_store.log
-import scroll_tactile_store.log_writer
-from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest
+from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest, writing
 from scroll_tactile_store import DamageError, RecordError, StoreClosedError, StoreError
-from scroll_tactile_store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, Frame, pack_frame
-from scroll_tactile_store.log import LogPlace, LogReader
-from scroll_tactile_store.log_file import PART
-from scroll_tactile_store.log_writer import AHEAD, LARGEST_STAGED, LogWriter, create_log
+from scroll_tactile_store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, LogPlace, pack_frame
+from scroll_tactile_store.log import AHEAD, LARGEST_STAGED, PART, Log, create_log, refuse
 from scroll_tactile_store.records import payload_digest
 
 
@@ -36,25 +33,29 @@ def before(frames, index):
 
 
 def batches_and_damage(path):
-    """What a reader yields, and the error that ends it."""
-    found = []
-    with LogReader(path) as log:
-        try:
-            for batch in log.refresh():
-                found.append([log.read(frame.offset, frame.size)[1] for frame in batch])
-        except DamageError as damage:
-            return found, damage
-    return found, None
+    """What a scan yields up to the first damage, and that."""
+    found, damaged = [], []
+    with Log(path) as log:
+
+        def stop(damage, before):
+            found.extend([[log.read(frame.offset, frame.size) for frame in before]] if before else [])
+            damaged.append(damage)
+            raise damage
+
+        with suppress(DamageError):
+            for batch in log.scan(stop):
+                found.append([log.read(frame.offset, frame.size) for frame in batch])
+    return found, damaged[0] if damaged else None
 
 
 def test_a_commit_is_one_write_and_one_sync_of_data(tmp_path, monkeypatch):
     path, calls = build(tmp_path / "log"), []
     write, sync = os.write, os.fdatasync
-    with LogWriter(path) as log:
+    with writing(path) as log:
         monkeypatch.setattr(os, "write", lambda *given: calls.append("write") or write(*given))
         monkeypatch.setattr(os, "fdatasync", lambda *given: calls.append("fdatasync") or sync(*given))
         monkeypatch.setattr(os, "fsync", lambda *given: calls.append("fsync"))
-        log.append(KIND, payload(2))
+        append(log, [payload(2)])
         append(log, BATCHES[3])
         monkeypatch.undo()
     assert calls == ["write", "fdatasync"] * 2
@@ -62,11 +63,11 @@ def test_a_commit_is_one_write_and_one_sync_of_data(tmp_path, monkeypatch):
 
 def test_the_file_is_longer_than_the_log_while_it_is_written(tmp_path):
     path = build(tmp_path / "log", [])
-    with LogWriter(path) as log:
-        log.append(KIND, b"a")
+    with writing(path) as log:
+        append(log, [b"a"])
         assert path.stat().st_size == AHEAD
         assert path.stat().st_blocks * 512 >= AHEAD  # no holes, or each sync waits for the file system's own journal
-        log.append(KIND, bytes(AHEAD))
+        append(log, [bytes(AHEAD)])
         assert path.stat().st_size == 2 * AHEAD
         assert read(path) == [[b"a"], [bytes(AHEAD)]]
     assert path.stat().st_size == FRAME_BYTES * 5 + len(HEADER) + 1 + AHEAD
@@ -79,13 +80,13 @@ def test_cut_at_every_byte_it_holds_the_batches_before(whole, tmp_path):
         path.write_bytes(data[:cut])
         if cut < FRAME_BYTES + len(HEADER):
             with pytest.raises(DamageError, match=r"begin as a log|payload of frame 0"):
-                LogReader(path)
+                Log(path)
             continue
         expected = BATCHES[: sum(commit <= cut for commit in commits)]
         assert read(path) == expected, cut
         if cut % 97 == 0:
-            with LogWriter(path) as log:
-                log.append(KIND, b"after")
+            with writing(path) as log:
+                append(log, [b"after"])
             assert read(path) == [*expected, [b"after"]]
 
 
@@ -98,7 +99,7 @@ def test_a_flipped_bit_is_damage_but_in_the_last_batch(whole, tmp_path):
         path.write_bytes(flipped)
         if place < begin:
             with pytest.raises(DamageError) as raised:
-                LogReader(path)
+                Log(path)
             assert (raised.value.offset, raised.value.frame, raised.value.path) == (0, 0, path)
             continue
         index = next(index for index, (_, _, end) in enumerate(frames) if place < end)
@@ -147,7 +148,7 @@ def test_two_logs_spliced_do_not_hold(whole, tmp_path):
         path.write_bytes(mine[:first] + theirs[first:end] + mine[end:])
         found, damage = batches_and_damage(path)
         assert found == before(frames, frames.index((batch, first, end))) and damage.offset == first
-        with LogReader(path) as log, pytest.raises(DamageError, match="holds no frame"):
+        with Log(path) as log, pytest.raises(DamageError, match="holds no frame"):
             log.read(first, end - first - FRAME_BYTES)
     path.write_bytes(theirs[:begin] + mine[begin:])
     assert batches_and_damage(path) == ([], None)
@@ -157,9 +158,9 @@ def test_two_histories_of_one_log_spliced_are_damage(whole, tmp_path):
     """A copy was gone on with: its frames have the same identity, numbers, batches and sizes."""
     paths = [Path(shutil.copy(whole, tmp_path / name)) for name in ("mine", "theirs")]
     for path, byte in zip(paths, (b"m", b"t"), strict=True):
-        with LogWriter(path) as log:
+        with writing(path) as log:
             for _ in range(3):
-                log.append(KIND, byte * 50)
+                append(log, [byte * 50])
     mine, theirs = (path.read_bytes() for path in paths)
     _, frames, commits = ends(paths[0])
     path = tmp_path / "spliced"
@@ -189,7 +190,7 @@ def test_an_opening_cuts_off_a_torn_end_and_syncs_what_is_before_it(copy, monkey
     copy.write_bytes(copy.read_bytes() + b"torn")
     size = copy.stat().st_size
     monkeypatch.setattr(os, "fsync", lambda file: calls.append(os.fstat(file).st_size) or sync(file))
-    with LogWriter(copy):
+    with writing(copy):
         assert calls == [size - 4, size - 4]
 
 
@@ -201,65 +202,64 @@ def test_all_rows_but_the_damaged_one_can_be_read(copy, frame, lost, inserted):
     # Something put in takes nothing away; a flipped bit takes its row.
     between = b"?" * 200 if inserted else bytes([data[begin] ^ 1])
     copy.write_bytes(data[:begin] + between + data[begin + (not inserted) :])
-    found = []
-    with LogReader(copy) as log:
-        with pytest.raises(DamageError):
-            for batch in log.refresh():
-                found += [log.read(each.offset, each.size)[1] for each in batch]
-        log.resume()
-        found += [each for batch in rest(log) for each in batch]
+    found, damaged = [], []
+    with Log(copy) as log:
+
+        def note(damage, before):
+            damaged.append(damage)
+            found.extend(before)
+
+        for batch in log.scan(note):
+            found += batch
+        found = [log.read(each.offset, each.size) for each in found]
+    assert len(damaged) == 1
     assert found == [payload(index) for index in range(8) if inserted or index != lost]
 
 
 def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy, monkeypatch):
-    with LogWriter(copy) as writer, LogReader(copy) as log:
-        frames = scroll_tactile_store.log.frames_behind
+    with writing(copy) as writer, Log(copy) as log:
+        frames = Log._frames_behind
 
-        def later(file, offset, mark):
+        def later(log, offset, mark):
             if writer.place.number == 14:
                 append(writer, [b"1"])
                 append(writer, [b"2"])
-            return frames(file, offset, mark)
+            return frames(log, offset, mark)
 
-        monkeypatch.setattr(scroll_tactile_store.log, "frames_behind", later)
+        monkeypatch.setattr(Log, "_frames_behind", later)
         assert rest(log) == [*BATCHES, [b"1"], [b"2"]]
 
 
 def test_a_batch_without_its_commit_is_not_there_and_the_next_writer_removes_it(copy):
-    with LogWriter(copy) as log:
+    with writing(copy) as log:
         staged = log.stage(KIND, bytes(LARGEST_STAGED))  # so large that it is written before its commit
         assert copy.stat().st_size > LARGEST_STAGED
         waiting = log.stage(KIND, b"in memory")
-        assert log.read(staged.offset, staged.size)[1] == bytes(LARGEST_STAGED)
-        assert log.read(waiting.offset, waiting.size)[1] == b"in memory"
+        assert log.read(staged.offset, staged.size) == bytes(LARGEST_STAGED)
+        assert log.read(waiting.offset, waiting.size) == b"in memory"
         assert read(copy) == BATCHES
         crashed = copy.read_bytes()
     assert copy.stat().st_size < LARGEST_STAGED  # closing forgets it
     copy.write_bytes(crashed)
     assert read(copy) == BATCHES
-    with LogWriter(copy) as log:
+    with writing(copy) as log:
         assert copy.stat().st_size < LARGEST_STAGED
-        log.append(KIND, b"next")
+        append(log, [b"next"])
     assert read(copy) == [*BATCHES, [b"next"]]
 
 
-def test_a_place_that_is_not_behind_a_commit_of_this_log_is_refused(copy, tmp_path):
-    with LogReader(copy) as log:
-        places = [log.place] + [log.place for _ in log.refresh()]
-    for index, place in enumerate(places):
-        with LogReader(copy, place=place) as log:
+def test_a_place_that_is_not_behind_a_commit_of_this_log_is_told(copy, tmp_path):
+    with Log(copy) as log:
+        places = [log.place] + [log.place for _ in log.scan(refuse)]
+        assert all(map(log.has_place, places))
+        place = places[2]
+        wrong = [place._replace(offset=offset) for offset in (-1, 0, 1, place.offset + 1, 2**40, 2**70)]
+        wrong += [place._replace(number=place.number + 1), place._replace(batch=1), place._replace(previous=bytes(16))]
+        assert not any(map(log.has_place, wrong))
+        for index, log.place in enumerate(places):
             assert rest(log) == BATCHES[index:]
-    other = build(tmp_path / "other")
-    place = places[2]
-    wrong = [place._replace(offset=offset) for offset in (-1, 0, 1, place.offset + 1, 2**40, 2**70)]
-    wrong += [place._replace(number=place.number + 1), place._replace(batch=1), place._replace(previous=bytes(16))]
-    for each in wrong:
-        with pytest.raises(DamageError, match="holds no batch"):
-            LogReader(copy, place=each)
-    with pytest.raises(DamageError, match="holds no batch"):
-        LogReader(other, place=place)
-    with pytest.raises(DamageError, match="holds no batch"):
-        LogWriter(other, place=place)
+    with Log(build(tmp_path / "other")) as other:
+        assert not other.has_place(place)
 
 
 def test_a_log_of_many_frames_replaces_another(tmp_path):
@@ -272,10 +272,12 @@ def test_a_log_of_many_frames_replaces_another(tmp_path):
 
 
 def test_a_frame_is_read_by_its_place_and_verified(copy):
-    with LogReader(copy) as log:
-        frames = [frame for batch in log.refresh() for frame in batch]
+    with Log(copy) as log:
+        frames = [frame for batch in log.scan(refuse) for frame in batch]
         for frame, expected in zip(frames, [each for batch in BATCHES for each in batch], strict=True):
-            assert log.read(frame.offset, frame.size) == (frame, expected)
+            assert log.read(frame.offset, frame.size) == expected
+            assert log.read(frame.offset, frame.size, first=20) == expected[:20]
+            assert log.frame_at(frame.offset) == frame
         size = copy.stat().st_size
         for offset, length in (
             (-1, 5),
@@ -298,7 +300,7 @@ def test_a_frame_is_read_by_its_place_and_verified(copy):
 @pytest.mark.parametrize("kind", [0, 1, 2**32])
 def test_what_a_frame_cannot_be_is_refused_and_the_batch_goes_on(tmp_path, kind):
     path = build(tmp_path / "log", [])
-    with LogWriter(path) as log:
+    with writing(path) as log:
         log.stage(KIND, b"1")
         with pytest.raises(RecordError):
             log.stage(kind, b"")
@@ -306,7 +308,7 @@ def test_what_a_frame_cannot_be_is_refused_and_the_batch_goes_on(tmp_path, kind)
         log.commit()  # of nothing
     assert read(path) == [[b"1"]]
     with pytest.raises(StoreClosedError):
-        log.append(KIND, b"")
+        append(log, [b""])
 
 
 # Forged: whoever makes frames makes right checksums.
@@ -315,19 +317,18 @@ def test_what_a_frame_cannot_be_is_refused_and_the_batch_goes_on(tmp_path, kind)
 def forged(whole, *frames, at=None):
     """A log that ends with these frames: (number, batch, kind, size that it says, payload)."""
     data = whole.read_bytes()[:at]
-    with LogReader(whole) as log:
+    with Log(whole) as log:
         identity = log.identity
-        for _ in log.refresh():
+        for _ in log.scan(refuse):
             pass
         before = log.place.previous
     for number, batch, kind, size, content in frames:
-        raw, frame = pack_frame(identity, 0, number, batch, kind, content, before)
+        raw, _ = pack_frame(identity, LogPlace(0, number, batch, before), kind, content)
         head = bytearray(raw[:FRAME_BYTES])
         head[36:40] = struct.pack("<I", size)
         head[72:] = payload_digest(bytes(head[:72]))
         data += bytes(head) + content
         before = bytes(head[72:])
-        assert isinstance(frame, Frame)
     return data
 
 
@@ -339,20 +340,10 @@ def test_a_forged_size_is_no_frame(whole, tmp_path, size):
     with path.open("r+b") as file:
         file.truncate(2**33)  # and all of it holes
     with pytest.raises(DamageError, match="are on the disk"):
-        LogReader(path)
-    with pytest.raises(DamageError, match="are on the disk"):
-        LogWriter(path)
+        Log(path)
 
 
 END = (15, 14, COMMIT, 0, b"")
-
-
-def test_a_place_behind_the_last_number_that_there_can_be_is_refused(whole, tmp_path):
-    path = tmp_path / "log"
-    path.write_bytes(forged(whole, (2**64 - 1, 2**64 - 1, COMMIT, 0, b"")))
-    place = LogPlace(path.stat().st_size, 2**64, 2**64, path.read_bytes()[-16:])
-    with pytest.raises(DamageError, match="holds no batch"):
-        LogWriter(path, place=place)
 
 
 # Full disks, short writes, errors of the disk.
@@ -365,23 +356,22 @@ def test_a_reader_learns_that_what_it_read_was_taken_back(tmp_path, monkeypatch)
         raise OSError(errno.EIO, "the disk")
 
     path = build(tmp_path / "log")
-    with LogWriter(path) as log, LogReader(path) as beside:
+    with writing(path) as log, Log(path) as beside:
         with monkeypatch.context() as broken:
             broken.setattr(os, "fdatasync", fails)
             broken.setattr(os, "ftruncate", fails)
             with pytest.raises(StoreError):
-                log.append(KIND, b"not durable")
+                append(log, [b"not durable"])
         assert rest(beside) == [*BATCHES, [b"not durable"]]
-        log.append(KIND, b"in its place")
-        with pytest.raises(StoreError, match="took a batch back"):
-            rest(beside)
-        with LogReader(path) as anew:
+        append(log, [b"in its place"])
+        assert not beside.has_place(beside.place)
+        with Log(path) as anew:
             assert rest(anew) == [*BATCHES, [b"in its place"]]
 
 
 def test_short_writes_are_gone_on_with(tmp_path, monkeypatch):
     path, write = build(tmp_path / "log"), os.write
-    with LogWriter(path) as log:
+    with writing(path) as log:
         monkeypatch.setattr(os, "write", lambda file, data: write(file, bytes(data)[:300]))
         append(log, [b"a" * 2000, b"b"])
         monkeypatch.undo()
@@ -390,7 +380,7 @@ def test_short_writes_are_gone_on_with(tmp_path, monkeypatch):
 
 def test_what_is_left_of_a_nearly_full_disk_is_for_others(small_disk):
     path = build(small_disk / "log", [])
-    with LogWriter(path) as log:
-        log.append(KIND, b"x" * 100)
+    with writing(path) as log:
+        append(log, [b"x" * 100])
         assert path.stat().st_size < 1000
         (small_disk / "other").write_bytes(bytes(500_000))

@@ -26,18 +26,11 @@ def ends(log):
 
 
 def require_named(path, rows, kept):
-    """Each reader names the loss, a writer is kept out, and a repair keeps what is before it."""
-    with Store.open(path, mode="read") as store:
-        assert store.last == rows
-        with pytest.raises(DamageError, match="missing"):
-            list(store.heads())
-        with pytest.raises(DamageError, match="missing"):
-            store.record(rows)
-    with pytest.raises(DamageError, match="repair the store"):
-        Store.open(path)
+    """Whoever opens it is told, and a repair keeps what is before the loss."""
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match=f"had row {rows}: .*repair the store"):
+            Store.open(path, mode=mode)
     assert [problem.kind for problem in check_store(path)] == ["lost"]
-    with pytest.raises(DamageError), Store.open(path, mode="read") as store:
-        store.backup(path.with_name("backup"))
     assert repair_store(path).kept == kept
     assert damage(path) == []
     with Store.open(path) as store:
@@ -72,12 +65,9 @@ def test_a_crashed_log_that_ends_before_a_checkpoints_place_is_named(tmp_path, b
         store.append("add", "behind it", b"")
         path = as_after_a_crash(store, tmp_path / "crashed")
     os.truncate(log_path(path, 1), read_current(path / CURRENT_FILE).newest.place.offset - by)
-    with pytest.raises(DamageError, match="repair the store"):
-        Store.open(path)
-    with Store.open(path, mode="read") as store:
-        assert store.last == 2
-        with pytest.raises(DamageError, match="row 2 is missing"):
-            list(store.records())
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match="repair the store"):
+            Store.open(path, mode=mode)
     # Without the commit frame alone the row is whole, and the place tells of what is behind it.
     assert [problem.kind for problem in damage(path)] == ["spare" if by <= FRAME_BYTES else "lost", "spare"]
     assert repair_store(path).kept == 2

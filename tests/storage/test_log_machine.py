@@ -8,9 +8,8 @@ from pathlib import Path
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from logs import KIND, names, rest
-from scroll_tactile_store.log import LogReader
-from scroll_tactile_store.log_writer import LogWriter, create_log
+from logs import KIND, names, rest, to_write
+from scroll_tactile_store.log import Log, create_log
 
 SECTOR = 512
 payloads = st.integers(0, 2000).flatmap(lambda size: st.integers(0, 255).map(lambda byte: bytes([byte]) * size))
@@ -21,13 +20,13 @@ class Recorded:
 
     def __init__(self, log):
         self.log, self.writes = log, []
-        write, file = log._file.write, log._file
+        write = log._put
 
         def noted(offset, data):
             self.writes.append((offset, bytes(data)))
             write(offset, data)
 
-        file.write = noted
+        log._put = noted
 
 
 class LogMachine(RuleBasedStateMachine):
@@ -42,7 +41,7 @@ class LogMachine(RuleBasedStateMachine):
         self.open()
 
     def open(self):
-        self.writer = LogWriter(self.path)
+        self.writer = to_write(self.path)
         self.recorded = Recorded(self.writer)
 
     @rule(payload=payloads)
@@ -66,7 +65,7 @@ class LogMachine(RuleBasedStateMachine):
 
     @rule()
     def reopen(self):
-        self.writer.close()
+        self.writer.close(trim=True)
         self.staged = []
         self.open()
 
@@ -90,9 +89,9 @@ class LogMachine(RuleBasedStateMachine):
         for log in self.readers:
             log[0].close()
         self.readers = []
-        self.writer._file.close()
+        self.writer.close()
         self.path.write_bytes(safe)
-        with LogReader(self.path) as log:
+        with Log(self.path) as log:
             found = rest(log)
         assert found in (self.durable, [*self.durable, self.staged])
         assert not all_came or found != self.durable
@@ -102,7 +101,7 @@ class LogMachine(RuleBasedStateMachine):
     @precondition(lambda self: len(self.readers) < 4)
     @rule()
     def read(self):
-        self.readers.append((LogReader(self.path), []))
+        self.readers.append((Log(self.path), []))
 
     @rule(which=st.integers(0, 3))
     def refresh(self, which):
@@ -110,7 +109,9 @@ class LogMachine(RuleBasedStateMachine):
             log, found = self.readers[which]
             found += rest(log)
             assert found == self.durable
-            with LogReader(self.path, place=log.place) as again:
+            with Log(self.path) as again:
+                assert again.has_place(log.place)
+                again.place = log.place
                 assert rest(again) == []
 
     @rule(keep=st.integers(0, 3))
@@ -129,7 +130,7 @@ class LogMachine(RuleBasedStateMachine):
 
     @invariant()
     def holds(self):
-        with LogReader(self.path) as log:
+        with Log(self.path) as log:
             assert rest(log) == self.durable
         assert names(self.home) == ["log"]
 

@@ -9,8 +9,8 @@ import pytest
 from scroll_tactile_store import RecordError, Store, check_store, repair_store
 from scroll_tactile_store.archive import write_archive
 from scroll_tactile_store.checkpoint_files import INDEX
+from scroll_tactile_store.framing import LogPlace
 from scroll_tactile_store.layout import read_current, write_current
-from scroll_tactile_store.log import LogReader
 from scroll_tactile_store.rows import Rows
 
 SUM = {"sum": np.arange(4)}
@@ -55,11 +55,11 @@ def require_all(path, keys):
 
 def scans(path, keys, monkeypatch):
     """Whether the log is read for where rows are, which are all found."""
-    read, calls = LogReader.reader_of_heads, []
+    catch_up, begun = Rows.catch_up, []
     with monkeypatch.context() as patch:
-        patch.setattr(LogReader, "reader_of_heads", lambda log: [calls.append(log), read(log)][1])
+        patch.setattr(Rows, "catch_up", lambda rows, *of: [begun.append(rows.first), catch_up(rows, *of)][1])
         require_all(path, keys)
-    return bool(calls)
+    return 0 in begun
 
 
 def index_of(path):
@@ -122,8 +122,9 @@ def test_a_repaired_log_is_not_read_by_the_index_of_the_one_before(path, keys, m
 def test_an_index_that_is_none_is_refused_and_rows_beyond_the_log_are_not_taken():
     for wrong in (np.zeros((4, 2)), np.zeros(4, np.uint64), np.zeros((3, 2), np.uint64)):
         with pytest.raises(ValueError, match="no array of"):
-            Rows.of_table(wrong, 100)
-    assert len(Rows.of_table(np.array([[1, 2], [88, 2**64 - 1], [9, 9], [0, 0]], np.uint64), 100)) == 1
+            Rows.of_table(wrong, LogPlace(100, 2, 2, b""))
+    table = np.array([[1, 2], [88, 2**64 - 1], [9, 9], [0, 0]], np.uint64)
+    assert len(Rows.of_table(table, LogPlace(100, 2, 2, b""))) == 1
 
 
 def test_a_name_of_the_stores_own_is_refused(path, keys):

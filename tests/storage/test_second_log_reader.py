@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import second_reader
-from logs import append, build
+from logs import append, build, writing
 from scroll_tactile_store import DamageError, Store
 from scroll_tactile_store.encoding import encode_payload
-from scroll_tactile_store.log import LogReader
-from scroll_tactile_store.log_writer import LogWriter, create_log
+from scroll_tactile_store.log import Log, create_log
 from scroll_tactile_store.records import payload_digest
-from scroll_tactile_store.row_encoding import ROW, decode_row, encode_row
+from scroll_tactile_store.rows import ROW, decode_row, encode_row
 
 ARRAYS = {"codes": np.arange(700, dtype=np.int16), "none": np.zeros((0, 3), np.float32)}
 PAYLOAD = encode_payload(ARRAYS)
@@ -34,10 +33,12 @@ def encoded(*fields):
 def path(tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "log"
     create_log(path, b'{"identity":1}')
-    with LogWriter(path) as log:
+    with writing(path) as log:
         for fields in FIELDS[:2]:
-            log.append(ROW, encoded(*fields))
-        log.append(99, b"of a later release")
+            log.stage(ROW, encoded(*fields))
+            log.commit()
+        log.stage(99, b"of a later release")
+        log.commit()
         for fields in FIELDS[2:]:
             log.stage(ROW, encoded(*fields))
         log.commit()
@@ -45,14 +46,19 @@ def path(tmp_path_factory):
 
 
 def ours(path):
-    rows, damage = [], None
-    with LogReader(path) as log:
+    frames, damage = [], None
+
+    def stop(error, before):
+        frames.extend(before)
+        raise error
+
+    with Log(path) as log:
         try:
-            for batch in log.refresh():
-                rows += [decode_row(log.read(frame.offset, frame.size)[1]) for frame in batch if frame.kind == ROW]
+            for batch in log.scan(stop):
+                frames += batch
         except DamageError as error:
             damage = (error.frame, error.offset)
-    return rows, damage
+        return [decode_row(log.read(frame.offset, frame.size)) for frame in frames if frame.kind == ROW], damage
 
 
 def theirs(path):
@@ -86,7 +92,7 @@ def test_both_read_a_checkpoint(tmp_path):
         opened.append("a", "b", b"key", arrays=ARRAYS)
         opened.commit(ARRAYS, last_sequence=1, attributes={"ü": [1, None]})
         ours = opened.latest()
-        log = opened._journal.current().log_identity
+        log = opened._log.identity
     known, found = second_reader.checkpoint(tmp_path / "s" / "checkpoints" / "00000001")
     assert (known["format"], known["number"], known["last_sequence"]) == (3, 1, 1)
     assert (known["attributes"], known["identity"]) == (ours.attributes, {"of": "tests"})
@@ -113,13 +119,13 @@ def test_both_find_the_same_damage(path, tmp_path):
 def test_it_finds_torn_tails_as_ours_does(tmp_path, payloads, lost):
     path = build(tmp_path / "log")
     size = path.stat().st_size
-    with LogWriter(path) as log:
+    with writing(path) as log:
         append(log, payloads)
         data = path.read_bytes()[: log.place.offset]
     path.write_bytes(data[:size] + bytes(lost) + data[size + lost :])
     _, whole, damage = second_reader.frames(path.read_bytes())
-    with LogReader(path) as log:
-        assert sum(len(batch) + 1 for batch in log.refresh()) == len(whole) == 13
+    with Log(path) as log:
+        assert sum(len(batch) + 1 for batch in log.scan(None)) == len(whole) == 13
     assert damage is None
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scroll_tactile_store.checkpoints
+import scroll_tactile_store.store
 from quick_checkpoints import READ_BY_ZARR, WRITTEN_BY_ZARR, read_zarr, write_zarr
 from scroll_tactile_store import DamageError, Store, StoreError, check_store
 from scroll_tactile_store.checkpoint_files import CheckpointDraft, CheckpointReader, write_checkpoint
@@ -22,8 +22,8 @@ class Gate:
 
     def __init__(self, monkeypatch):
         self.open, self.reached, self.last_sequences = threading.Event(), threading.Event(), []
-        self.write = scroll_tactile_store.checkpoints.write_checkpoint
-        monkeypatch.setattr(scroll_tactile_store.checkpoints, "write_checkpoint", self)
+        self.write = scroll_tactile_store.store.write_checkpoint
+        monkeypatch.setattr(scroll_tactile_store.store, "write_checkpoint", self)
 
     def __call__(self, parent, number, draft, identity):
         self.last_sequences.append(draft.last_sequence)
@@ -102,7 +102,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
     with monkeypatch.context() as broken:
         broken.setattr(scroll_tactile_store.files, "sync_tree", fail)
         opened.commit_later(ONE, last_sequence=0)
-        opened._checkpoints.wait()
+        opened._wait()
     with pytest.raises(StoreError, match="the disk says no"):
         surface(opened)
     assert [record.levelno for record in caplog.records] == [logging.ERROR]
@@ -113,7 +113,7 @@ def test_a_failure_in_the_background_surfaces_once_and_is_logged(opened, monkeyp
 
 
 def test_an_error_of_the_caller_is_not_hidden_by_one_of_the_background(tmp_path, monkeypatch):
-    monkeypatch.setattr(scroll_tactile_store.checkpoints, "write_checkpoint", fail)
+    monkeypatch.setattr(scroll_tactile_store.store, "write_checkpoint", fail)
     with pytest.raises(KeyError), Store.open(tmp_path, identity={}) as opened:
         opened.commit_later(ONE, last_sequence=0)
         raise KeyError
@@ -134,7 +134,7 @@ def test_a_loss_of_memory_is_not_taken_for_damage(opened, monkeypatch):
 @pytest.mark.parametrize("instant", ["CheckpointReader", "_verified"])
 def test_a_reader_whose_checkpoint_is_replaced_while_it_reads_gets_the_new_one(opened, monkeypatch, instant, caplog):
     opened.commit(ONE, last_sequence=0)
-    owner = scroll_tactile_store.checkpoints if instant == "CheckpointReader" else CheckpointReader
+    owner = scroll_tactile_store.store if instant == "CheckpointReader" else CheckpointReader
     real = getattr(owner, instant)
     waiting = [2, 3, 4]
 

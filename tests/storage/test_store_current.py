@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from folder_attacks import CURRENTS, behind_all, newest_is
+from folder_attacks import CURRENTS, newest_is
 from forging import frames_of, get_current, log_of, set_current, write_log
 from scroll_tactile_store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
 from scroll_tactile_store.layout import log_path
@@ -71,14 +71,6 @@ def test_what_it_never_said_is_named_and_repaired(plain, forge):
     with Store.open(plain) as opened:
         assert add(opened, opened.last + 1).sequence == opened.last
     assert damage(plain) == []
-
-
-def test_a_place_behind_rows_that_its_checkpoint_does_not_contain_is_found(plain):
-    """Only a forger writes it: who opens the store does not read what is before the place."""
-    set_current(plain, **behind_all(plain))
-    assert "has no place behind which" in damage(plain)[0].what
-    assert repair_store(plain).kept == LAST
-    assert agrees(plain, latest=15)
 
 
 @pytest.mark.parametrize("current", ["of now", "gone"])
@@ -167,22 +159,18 @@ def test_of_an_empty_store_nothing_is_lost_with_it(tmp_path):
         assert opened.identity == {"a": 2}
 
 
-def test_behind_an_older_frame_at_the_end_nothing_can_be_read(plain):
-    frame = frames_of(plain)[18]
-    data = log_of(plain).read_bytes()
-    log_of(plain).write_bytes(data + data[frame.offset : frame.end])
-    with Store.open(plain, mode="read") as opened:
-        assert [row.sequence for row in opened.records()] == list(range(1, LAST + 1))
-    assert repair_store(plain).kept == LAST
-    assert agrees(plain, latest=15)
-
-
-def test_a_frame_that_is_no_row_keeps_a_writer_out(plain):
-    write_log(plain, [b"no row"])
-    with pytest.raises(DamageError, match="no row"):
-        Store.open(plain)
-    with Store.open(plain, mode="read") as opened:
-        assert opened.last == LAST
+@pytest.mark.parametrize("harm", ["an older frame at the end", "a frame that is no row"])
+def test_what_was_never_appended_keeps_all_out(plain, harm):
+    if harm == "a frame that is no row":
+        write_log(plain, [b"no row"])
+    else:
+        frame, data = frames_of(plain)[18], log_of(plain).read_bytes()
+        log_of(plain).write_bytes(data + data[frame.offset : frame.end])
+    for mode in ("read", "write"):
+        with pytest.raises(DamageError, match="repair the store"):
+            Store.open(plain, mode=mode)
     assert damage(plain)
-    assert repair_store(plain).kept == 15
+    kept = repair_store(plain).kept
+    assert kept == (15 if harm == "a frame that is no row" else LAST)
     assert folders(plain) == ["00000001"]
+    assert agrees(plain, kept=kept, latest=15, **({} if kept == LAST else {"compacted": 15, "lost": range(1, 16)}))

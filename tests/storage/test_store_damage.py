@@ -21,7 +21,7 @@ from store_builds import (
 )
 
 
-@pytest.mark.parametrize(("row", "covered"), [(1, "checkpoint 1 (up to row 15)"), (14, "checkpoint 1"), (17, "no")])
+@pytest.mark.parametrize(("row", "covered"), [(1, "checkpoint 1 (up to row 15)"), (14, "checkpoint 1")])
 @pytest.mark.parametrize("arrays", [False, True])
 def test_a_flipped_bit_in_a_row_is_named_and_gone_around(plain, row, covered, arrays):
     flip_row(plain, row, arrays=arrays)
@@ -36,14 +36,18 @@ def test_a_flipped_bit_in_a_row_is_named_and_gone_around(plain, row, covered, ar
         assert [each.sequence for each in opened.records(row)] == list(range(row + 1, LAST + 1))
 
 
-def test_a_writer_goes_on_behind_damage_that_a_checkpoint_covers_and_refuses_behind_any_other(plain):
+def test_behind_damage_that_no_checkpoint_covers_nobody_goes_on(plain):
     flip_row(plain, 14)
     with Store.open(plain) as opened:
         assert opened.append("a", "b", b"").sequence == LAST + 1
-    flip_row(plain, 17)
-    before = log_of(plain).read_bytes()
-    with pytest.raises(DamageError, match="repair the store"):
-        Store.open(plain)
+    with Store.open(plain, mode="read") as reader:
+        flip_row(plain, 17)
+        before = log_of(plain).read_bytes()
+        for mode in ("write", "read"):
+            with pytest.raises(DamageError, match="repair the store"):
+                Store.open(plain, mode=mode)
+        with pytest.raises(DamageError, match="row 17 is"):
+            reader.record(17)
     assert log_of(plain).read_bytes() == before
 
 
@@ -55,13 +59,11 @@ def test_exchanged_and_doubled_rows_are_found(plain, row):
     def double(found):
         found[row + 1] = found[row]
 
-    for change, said in ((swap, f"row {row} is"), (double, f"row {row + 1} is")):
+    for change in (swap, double):
         path = shutil.copytree(plain, plain.with_name(change.__name__))
         change_rows(path, change)
-        found = []
-        with Store.open(path, mode="read") as opened, pytest.raises(DamageError, match=said):
-            found.extend(head.sequence for head in opened.heads())
-        assert found == list(range(1, row + (change is double)))
+        with pytest.raises(DamageError, match="repair the store"), Store.open(path, mode="read") as opened:
+            list(opened.heads())
 
 
 def test_missing_rows_are_named_and_their_numbers_not_given_again(plain):
@@ -72,10 +74,8 @@ def test_missing_rows_are_named_and_their_numbers_not_given_again(plain):
                 list(read())
             assert [row.sequence for row in read(caught.value.sequence)] == [19, 20]
     lose_rows(plain, 19, 20)
-    with Store.open(plain, mode="read") as opened:
-        assert opened.last == LAST
-        with pytest.raises(DamageError, match=f"rows 17 to {LAST} are missing"):
-            list(opened.records())
+    with pytest.raises(DamageError, match=f"ends with row 16, and had row {LAST}"):
+        Store.open(plain, mode="read")
     repair_store(plain)
     with Store.open(plain) as opened:
         assert opened.append("a", "b", b"").sequence == 17

@@ -60,7 +60,7 @@ def left(request, tmp_path):
         writer = Store.open(path)
         with Store.open(path, mode="read") as reader:
             add(writer, LAST + 1)
-            assert reader.last == LAST + 1
+            assert reader.state().last == LAST + 1
             writer.close()
     elif request.param.startswith("crashed"):
         writer = Store.open(path)

@@ -4,10 +4,12 @@ import json
 import multiprocessing
 import os
 
+import numpy as np
 import pytest
 import scroll_tactile_store.layout
 import scroll_tactile_store.store
 from scroll_tactile_store import (
+    CompactedError,
     LockedError,
     NotAStoreError,
     ReadOnlyError,
@@ -70,6 +72,8 @@ def test_a_reader_whose_folder_becomes_another_stores_reads_that_one(tmp_path):
     with Store.open(tmp_path / "one", mode="read") as reader:
         (tmp_path / "one").rename(tmp_path / "gone")
         (tmp_path / "other").rename(tmp_path / "one")
+        assert [head.label for head in reader.heads()] == ["one"]
+        assert reader.state() == (3, None, 0)
         assert [head.label for head in reader.heads()] == ["other"] * 3
 
 
@@ -145,3 +149,37 @@ def test_a_store_that_another_process_is_just_making_is_no_foreign_folder(tmp_pa
 def test_a_mode_is_read_or_write(tmp_path):
     with pytest.raises(RecordError, match="append"):
         Store.open(tmp_path, identity={}, mode="append")
+
+
+def test_a_reader_stays_with_what_it_asked_for_and_reads_current_once_for_all_that_is_new(tmp_path, monkeypatch):
+    read, calls = scroll_tactile_store.store.read_current, []
+    with Store.open(tmp_path, identity={}) as writer, Store.open(tmp_path, mode="read") as reader:
+        for number in range(3):
+            writer.append("a", f"{number}", b"k")
+        writer.commit({}, last_sequence=2)
+        assert (reader.last, reader.newest, list(reader.heads()), reader.latest()) == (0, None, [], None)
+        monkeypatch.setattr(
+            scroll_tactile_store.store, "read_current", lambda path: [calls.append(path), read(path)][1]
+        )
+        assert reader.state() == writer.state() == (3, 1, 0)
+        assert [row.label for row in reader.records()] == ["0", "1", "2"]
+        assert (reader.last, reader.compacted, reader.latest().last_sequence) == (3, 0, 2)
+        assert [head.sequence for head in reader.with_key(b"k")] == [1, 2, 3]
+        assert calls == [tmp_path / "CURRENT"]
+
+
+def test_a_reader_reads_on_what_a_writer_has_replaced(tmp_path):
+    with Store.open(tmp_path, identity={}) as writer:
+        for number in range(4):
+            writer.append("a", f"{number}", b"k", arrays={"x": np.arange(3)})
+        writer.commit({}, last_sequence=2)
+        with Store.open(tmp_path, mode="read") as reader:
+            writer.compact({}, last_sequence=3)
+            assert [row.sequence for row in reader.records()] == [1, 2, 3, 4]
+            assert reader.compaction() is None
+            writer.compact({}, last_sequence=4)
+            reader.state()
+            writer.compact({"new": np.arange(2)}, last_sequence=4)
+            with pytest.raises(CompactedError, match="read it anew"):
+                reader.compaction()
+            assert list(reader.compaction().arrays) == ["new"]

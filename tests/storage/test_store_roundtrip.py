@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scroll_tactile_store import Head, Record, RecordError, Store, VersionError, checkpoint_files
-from scroll_tactile_store.archive import Files
 
 DTYPES = ["|i1", "|u1", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "<f2", "<f4", "<f8"]
 arrays = st.dictionaries(
@@ -200,7 +199,7 @@ def test_some_arrays_of_a_checkpoint_are_read_without_the_others(tmp_path, caplo
         opened.commit(arrays, last_sequence=0)
         folder = tmp_path / "checkpoints" / "00000001"
         (folder / "b" / "zarr.json").unlink()
-        reader = checkpoint_files.CheckpointReader(folder, Files(tmp_path))
+        reader = checkpoint_files.CheckpointReader(folder)
         assert same(reader.arrays(["c", "none such", "a"]), {"a": arrays["a"], "c": arrays["c"]})
         assert opened.latest() is None
         assert "array 'b' of checkpoint 1" in caplog.text

@@ -50,7 +50,7 @@ from scroll_tactile.sensors import Sensor
 
 __all__ = ["FleetReport", "Processes", "learn"]
 
-SHARES_A_WORKER = 4  # at least, so that all have something to do to the end; a merge costs what 50 touches do
+SHARES_A_WORKER = 2  # at least, so that one is merged while another is learned; each costs what some 60 touches do
 MOST_SOURCES = 256  # of a share: what is lost with a worker
 
 

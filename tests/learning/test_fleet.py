@@ -62,7 +62,7 @@ def expected(touches=TOUCHES, **settings):
 
 
 def run(destination, sources, executor=None, **settings):
-    how = {"executor": executor or DyingExecutor(), "workers": 1}
+    how = {"executor": executor or DyingExecutor(), "workers": 2}
     return learn(sources, destination, BY_FOLDER, **SETTINGS | how | settings)
 
 
@@ -253,10 +253,12 @@ class TestGoingOn:
         left = tmp_path / "m.fleet" / "share-0.x.partial"  # of a worker that died
         (left / "whole").mkdir(parents=True)
         (tmp_path / "m.fleet" / "mine.txt").write_text("any")
+        (tmp_path / "m.fleet" / "share-known.json").unlink()
+        (tmp_path / "m.fleet" / "share-known.json").symlink_to("mine.txt")  # a link is not followed
         done = run(tmp_path / "m", [tmp_path / "in"], workers=3)
         assert len(learned) == len(set(learned)) == 12 == done.sources and done.repeated == 0
         require_learned(tmp_path / "m")
-        assert [path.name for path in (tmp_path / "m.fleet").iterdir()] == ["mine.txt"]
+        assert [path.read_text() for path in (tmp_path / "m.fleet").iterdir()] == ["any"]
 
     @pytest.mark.parametrize("merged", range(4))
     def test_a_full_disk_at_any_merge_costs_nothing(self, tmp_path, full, learned, merged):
@@ -264,10 +266,10 @@ class TestGoingOn:
         paths[-1].write_bytes(b"")
         full(merged)
         with pytest.raises(StoreFullError):
-            run(tmp_path / "m", [tmp_path / "in"], workers=1)
+            run(tmp_path / "m", [tmp_path / "in"])
         full(None)
         assert (tmp_path / "m").exists() == (merged > 0) and len(learned) == 14
-        done = run(tmp_path / "m", [tmp_path / "in"], workers=1)
+        done = run(tmp_path / "m", [tmp_path / "in"])
         assert done.held == 12 and [each.source for each in done.refused] == list(map(str, paths[:-3:-1]))[::-1]
         assert len(learned) == 14  # what could not be read is said by the run that goes on, which reads nothing again
         require_learned(tmp_path / "m")
@@ -276,7 +278,7 @@ class TestGoingOn:
     def test_a_folder_that_was_damaged_meanwhile_is_learned_again(self, tmp_path, sources, full, learned, place):
         full(0)
         with pytest.raises(StoreFullError):
-            run(tmp_path / "m", [tmp_path / "in"], workers=1)
+            run(tmp_path / "m", [tmp_path / "in"])
         full(None)
         path = min((tmp_path / "m.fleet").glob("share-*/memory/log-*"))
         whole = bytearray(path.read_bytes())
@@ -284,7 +286,7 @@ class TestGoingOn:
             whole[place] ^= 1
         path.write_bytes(bytes(whole if place is not None else whole[:-30]))
         learned.clear()
-        done = run(tmp_path / "m", [tmp_path / "in"], workers=1)
+        done = run(tmp_path / "m", [tmp_path / "in"])
         assert done.observations == 12 and not done.refused and 0 < len(learned) < 12
         require_learned(tmp_path / "m")
 
@@ -294,7 +296,7 @@ class TestGoingOn:
                 log = next(share.memory.glob("log-*"))
                 log.write_bytes(log.read_bytes()[:-30] + bytes(30))
 
-        done = run(tmp_path / "m", [tmp_path / "in"], Then(spoil), workers=1)
+        done = run(tmp_path / "m", [tmp_path / "in"], Then(spoil))
         (refused,) = done.refused
         assert refused.source == str(sources[4]) and "ended twice before it was learned" in refused.why
         require_learned(tmp_path / "m", TOUCHES[:4] + TOUCHES[5:])
@@ -306,10 +308,10 @@ class TestGoingOn:
         memory_of(tmp_path / "m", TOUCHES[:3])
         full(1)
         with pytest.raises(StoreFullError):  # shares are complete that left out what the memory had
-            run(tmp_path / "m", [tmp_path / "in"], workers=1)
+            run(tmp_path / "m", [tmp_path / "in"])
         full(None)
         shutil.rmtree(tmp_path / "m")
-        assert run(tmp_path / "m", [tmp_path / "in"], workers=1).observations == 12
+        assert run(tmp_path / "m", [tmp_path / "in"]).observations == 12
         require_learned(tmp_path / "m")
 
     def test_sources_in_another_order_after_a_cut_are_learned_as_one_process_does(self, tmp_path, full):
@@ -317,9 +319,9 @@ class TestGoingOn:
         full(0)
         for some in (paths[3:14:2], paths[::-1]):
             with pytest.raises(StoreFullError):
-                run(tmp_path / "m", some, workers=2)
+                run(tmp_path / "m", some)
         full(None)
-        done = run(tmp_path / "m", paths, workers=2)
+        done = run(tmp_path / "m", paths)
         rows, digest, skipped, refused = by_one_process(tmp_path / "one", paths)
         assert (done.digest, done.repeated, len(done.refused)) == (digest, skipped, len(refused))
         with TactileLearner.open(tmp_path / "m") as learner:
@@ -490,7 +492,7 @@ class TestRange:
         with pytest.warns(RangeWarning) as first:
             _, _, _, refused = by_one_process(tmp_path / "one", [beyond])
         with pytest.warns(RangeWarning, match="100 % of the values lie outside the range of sensor 'pad'") as met:
-            done = run(tmp_path / "m", [beyond], workers=2)  # a share of each source
+            done = run(tmp_path / "m", [beyond], workers=3)  # a share of each source
         assert [str(each.message) for each in met] == [str(each.message) for each in first] == [done.range_problem]
         assert met[0].filename == run.__code__.co_filename
         assert [(each.source, each.why) for each in done.refused] == refused
@@ -505,10 +507,10 @@ class TestRange:
         sources = [*paths, beyond / "b" / "4.npy", beyond]
         full(0)
         with pytest.raises(StoreFullError):
-            run(tmp_path / "m", sources, workers=1)
+            run(tmp_path / "m", sources)
         full(None)
         with pytest.warns(RangeWarning, match="91 % of the values"):
-            run(tmp_path / "m", sources, workers=1)
+            run(tmp_path / "m", sources)
 
     def test_the_command_line_says_it_as_one_line(self, tmp_path, beyond):
         (tmp_path / "pad.json").write_text(PAD.model_dump_json())

@@ -33,7 +33,7 @@ from typing import Any
 
 from scroll_tactile_store import DamageError, NotAStoreError, StoreError, StoreFullError, VersionError
 from scroll_tactile_store.exceptions import reported
-from scroll_tactile_store.files import remove_tree
+from scroll_tactile_store.files import new_file, remove_tree
 
 from scroll_tactile.clients.learning.learning import Learned, Progress, learn_sources
 from scroll_tactile.clients.learning.sources import Refused, SourceOptions, find_sources, is_memory, stored_source
@@ -50,7 +50,7 @@ from scroll_tactile.sensors import Sensor
 
 __all__ = ["FleetReport", "Processes", "learn"]
 
-SHARES_A_WORKER = 4  # at least, so that all have something to do to the end; a merge costs what 50 touches do
+SHARES_A_WORKER = 2  # at least, so that one is merged while another is learned; each costs what some 60 touches do
 MOST_SOURCES = 256  # of a share: what is lost with a worker
 
 
@@ -244,8 +244,7 @@ class _Run:
             if memory:
                 self._merge_memory(*sources)
             else:
-                done = learn_sources(self._learner, sources, self._options, self._learning)
-                self._note(done)
+                self._note(learn_sources(self._learner, sources, self._options, self._learning))
             self._came_in(len(sources))
 
     def learn_apart(self, found: Sequence[str], workers: int, executor: Executor | None) -> None:
@@ -268,8 +267,8 @@ class _Run:
                 known.setdefault(row.key.hex(), []).append(row.material)
         self._known = {bytes.fromhex(key) for key in known}
         quantities, file = tuple(learner.quantities.values()), folder / "share-known.json"
-        with reported(file, "writing which touches the memory has"):
-            file.write_text(json.dumps(known), encoding="utf-8")
+        with reported(file, "writing which touches the memory has"), new_file(file, "w") as opened:
+            json.dump(known, opened)
         share = Share((), folder / "share", learner._recipe, self._options, quantities, file)
         most = min(MOST_SOURCES, -(-len(found) // (SHARES_A_WORKER * workers)))
         shares = [(share.of(sources), memory) for sources, memory in _cut(found, most)]

@@ -76,10 +76,15 @@ class TactileLearner:
     camera. Of a camera's frames only those count in which the gel is pressed (see `signals.contact`).
     settings: readout, false_alarms, kept_touches and exemplars, by name; see `scroll_tactile.settings.Settings`.
 
-    A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Methods may be called from
-    any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that knows what this one knows at
-    that moment; its repr names the memory that it was taken of. One of a learner that was closed may not know which
-    touches it has: `names_of` and `observe` then raise StoreClosedError.
+    A learner made this way is in memory only; `TactileLearner.open` makes one with a path. Both keep a journal and do
+    the same; the journal of this one grows in RAM. Of each touch it has what takes it out of the sums again: its
+    readings (8 to 15 kB for 400 of a BioTac) where the embedding is exact, such as `Kernels`; else its codes, 4 bytes
+    for each feature of each window, beside readings where exemplars or kept touches are kept. `compact` gives both up
+    for a copy of the sums. Only `backup` and `reembed` take a path.
+
+    Methods may be called from any thread. `pickle` and `copy.deepcopy` make a snapshot: a learner in memory only that
+    knows what this one knows at that moment, as if it were compacted; its repr names the memory that it was taken of.
+    Of a learner with a path it is made before that is closed: StoreClosedError afterwards.
 
     Raises InputError for unknown settings, and for values that do not fit.
     """
@@ -166,12 +171,12 @@ class TactileLearner:
     @property
     def path(self) -> Path | None:
         """The folder of the memory; None where it is in memory only."""
-        return None if self._ledger.store is None else self._ledger.store.path
+        return self._ledger.path
 
     @property
     def has_health(self) -> bool:
-        """Whether `health` can be asked: the memory has a path, and its sensor 1 to 256 channels."""
-        return self.path is not None and has_numbers(self.sensor)
+        """Whether `health` can be asked: its sensor has 1 to 256 channels."""
+        return has_numbers(self.sensor)
 
     @property
     def memory(self) -> Memory:
@@ -269,7 +274,7 @@ class TactileLearner:
 
         For many touches: it waits for the disk once. If the process dies in the block, none of it is kept; after an
         exception, all that came before the exception is. Other threads wait for its end; fine-tuning, merging,
-        compacting and closing are refused in it. In a memory without a path it does nothing.
+        compacting and closing are refused in it.
 
         Raises StoreError where the batch could not be made durable: the memory is then as it was before it.
         """
@@ -286,11 +291,8 @@ class TactileLearner:
         return list(dict.fromkeys([*before, *self._ledger.names(touch.key)]))
 
     def observations(self) -> list[Observation]:
-        """Every observation in the journal, in order, and its state; none in a memory without a path.
-
-        Raises StoreError.
-        """
-        return self._ledger.read(lambda _, store: [] if store is None else observations(store))
+        """Every observation in the journal, in order, and its state. Raises StoreError."""
+        return self._ledger.read(lambda _, store: observations(store))
 
     def ranked_exemplars(self) -> dict[str, list[Exemplar]]:
         """Material → its exemplars with their readings (T, n) in the sensor's unit, in rank order.
@@ -309,7 +311,7 @@ class TactileLearner:
         made from it is gone. Its features stay in the journal, unused, until `compact`.
 
         Raises ObservationError (nothing was changed) for one that is not there, was retracted before or was
-        compacted, or for a receipt of another memory; InputError in a memory without a path; StoreError.
+        compacted, or for a receipt of another memory; StoreError.
         """
         self._ledger.retract(receipt)
 
@@ -331,8 +333,7 @@ class TactileLearner:
         address that files lie in, such as a robot's day.
 
         Raises UnknownMaterialError for a material never observed, and ObservationError (nothing was changed) where some
-        of them were compacted, or a source has none; InputError for both or neither, and in a memory without a path;
-        StoreError.
+        of them were compacted, or a source has none; InputError for both or neither; StoreError.
         """
         if (material is None) == (source is None):
             raise InputError("say what is to be forgotten: a material, or a source")
@@ -527,8 +528,7 @@ class TactileLearner:
         prediction that is known; None: the sensor at rest, which alone shows a gain or an offset of all its channels.
         Durable when this returns; some hundred bytes. Such a row stays behind where a memory is merged or packed.
 
-        Raises StreamError, MaterialError; InputError in a memory without a path, for a camera, and for more than 256
-        channels; StoreError.
+        Raises StreamError, MaterialError; InputError for a camera, and for more than 256 channels; StoreError.
         """
         name = "" if material is None else require_name(material)
         self._ledger.sense(name, corrected_stream(validate(stream, self.sensor), self._ledger.correction))
@@ -546,8 +546,7 @@ class TactileLearner:
         channel; touches are compared with earlier ones of the same material, of a similar length and level, so that no
         mixture of materials, lengths and forces is a change. See `health.watch`. The digest knows nothing of it.
 
-        Raises InputError for values that cannot be, for a camera, for more than 256 channels, and in a memory without a
-        path; StoreError.
+        Raises InputError for values that cannot be, for a camera, and for more than 256 channels; StoreError.
         """
         require_arguments({"bound": bound, "after": after}, {"until": until})
         checked = None if source is None else require_source(source)
@@ -581,11 +580,10 @@ class TactileLearner:
         `pack` leave it behind, a compaction, a backup and `reembed` keep it. An `exported` judge knows nothing of it.
 
         Raises StreamError, MaterialError; UnknownMaterialError for a material never observed; InputError for too few
-        touches or materials, for a camera, in a memory without a path, or one that does not know how touches of the
-        materials read by channel; StoreError.
+        touches or materials, for a camera, or in a memory that does not know how touches of the materials read by
+        channel; StoreError.
         """
         require_arguments({}, {"until": until})
-        self._ledger.require_store("be adapted")
         return adapt_to(self._ledger, known_touches(touches, self.sensor), self.sensor, until, self._unknown)
 
     def _unknown(self, touches: Iterable[Stream]) -> int:
@@ -602,8 +600,8 @@ class TactileLearner:
 
         It is the union of both: a stream that both observed, of one material with one content, counts once.
 
-        other: a memory with a path, its path, or a file that `pack` wrote; it stays as it is. Receipts of the other
-        memory are not receipts of this one.
+        other: a memory, the path of one, or a file that `pack` wrote; it stays as it is. Receipts of the other memory
+        are not receipts of this one.
         descriptions: which to keep of a material that both describe: "ours", "theirs", or "same", if they must agree.
 
         Raises MismatchError for a memory of another sensor, embedding or grid, or of a quantity with another unit or
@@ -611,9 +609,11 @@ class TactileLearner:
         ObservationError where a shared stream was compacted and cannot be left out; CapacityError, InputError,
         StoreError. Nothing was changed then.
         """
-        path = other._ledger.require_store("be merged").path if isinstance(other, TactileLearner) else other
-        require_arguments({"other": path, "descriptions": descriptions}, {"progress": progress})
-        return self._ledger.merge(path, MergeRules(descriptions=descriptions), progress or silent)[0]
+        source = other._ledger.merged_from() if isinstance(other, TactileLearner) else other
+        require_arguments({"descriptions": descriptions}, {"progress": progress})
+        if not isinstance(other, TactileLearner):
+            require_arguments({"other": other})
+        return self._ledger.merge(source, MergeRules(descriptions=descriptions), progress or silent)[0]
 
     def backup(
         self, destination: str | os.PathLike[str], *, progress: Callable[[str, int, int], object] | None = None
@@ -624,7 +624,7 @@ class TactileLearner:
         written or verified.
         """
         require_arguments({"destination": destination}, {"progress": progress})
-        self._ledger.require_store("be copied").backup(destination, progress=progress)
+        self._ledger.require_folder("be copied").backup(destination, progress=progress)
 
     def pack(
         self, path: str | os.PathLike[str], *, rows: bool = True, readings: bool = True, source: str | None = None
@@ -641,13 +641,13 @@ class TactileLearner:
         touch as it was read: rows, exemplars and kept touches. Such a file merges into memories made with exemplars=0
         and kept_touches=0. source: for observations that have none.
 
-        Raises InputError in a memory without a path, and for an invalid source; StoreError.
+        Raises InputError for an invalid source; StoreError.
         """
         require_arguments({"path": path})
         checked_source = None if source is None else require_source(source)
         ledger = self._ledger
         with ledger.lock:
-            store = ledger.require_store("be packed")
+            store = ledger.require_open()
             pack_memory(store, ledger.memory, Path(path), rows=rows, readings=readings, source=checked_source)
 
     def compact(self, *, keep: int = 0) -> Compacted:
@@ -656,7 +656,7 @@ class TactileLearner:
         keep: how many of the newest observations can still be retracted afterwards, by `retract` and `forget`; the
         older ones cannot any more. What was retracted before is gone from the disk, too.
 
-        Raises InputError for a keep below 0, in a batch, and in a memory without a path; StoreError.
+        Raises InputError for a keep below 0, and in a batch; StoreError.
         """
         return self._ledger.compact(keep)
 

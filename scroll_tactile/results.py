@@ -62,7 +62,7 @@ class Health:
 class Receipt:
     """The acknowledgement of one observation.
 
-    sequence: its row in the memory's journal, from 1; in a memory without a path, the count of observations.
+    sequence: its row in the memory's journal, from 1.
     material: its label. key: hash of the stream's content, 32 bytes.
     seconds: the stream's length; of a camera's, that of the frames in contact. clipped: values outside the sensor's
     range. durable: whether it is on disk; False in a memory without a path, and in a batch, which is durable at its

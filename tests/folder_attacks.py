@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from forging import get_current, get_identity, put_row, set_current, set_identity
+from forging import get_current, get_identity, log_of, put_row, set_current, set_identity
+from scroll_tactile_store.log import Log, refuse
 from touches import PAD, stream
 
 from scroll_tactile.memory.touch_rows import pack_readings
@@ -34,6 +35,14 @@ def placed(path: Path, **changes: Any) -> dict[str, Any]:
     return {"newest": newest_is(path, place=list(place.values()))}
 
 
+def behind_all(path: Path) -> dict[str, Any]:
+    """The newest checkpoint at the end of the log."""
+    with Log(log_of(path)) as log:
+        for _ in log.scan(refuse):
+            pass
+        return placed(path, offset=log.place.offset, number=log.place.number, previous=log.place.previous.hex())
+
+
 def _current(change: Callable[[Path], Mapping[str, Any]]) -> Attack:
     return lambda path: set_current(path, **change(path))
 
@@ -53,6 +62,9 @@ CURRENTS: dict[str, Attack] = {
         "a number above any": lambda path: {"newest": newest_is(path, number=2**64)},
         "a sha256 in capitals": lambda path: {"newest": newest_is(path, sha256="AB" * 32)},
         "a compaction checkpoint without a newest": lambda path: {"newest": None, "compaction": newest_is(path)},
+        "a compaction checkpoint newer than the newest": lambda path: {
+            "compaction": newest_is(path, last_sequence=get_current(path)["newest"]["last_sequence"] + 1)
+        },
         "a place in no frame": lambda path: placed(path, offset=newest_is(path)["place"][0] + 1),
         "a place beyond the end": lambda path: placed(path, offset=2**40),
         "a place of another number": lambda path: placed(path, number=3),

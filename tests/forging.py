@@ -111,7 +111,7 @@ def put_row(
 
     payload: bytes, or arrays by name. size: where the row is to say another than the right one.
     """
-    body = payload if isinstance(payload, bytes) else pack([raw(*one) for one in (payload or {}).items()])
+    body = payload if isinstance(payload, bytes) else pack([raw(*one) for one in sorted((payload or {}).items())])
     rows = {int.from_bytes(row[:8], "little"): row for row in read_log(path)[1]}
     if sequence is None:
         sequence = 1 + max([*rows, *(named["last_sequence"] for named in named_in(path))], default=0)
@@ -157,7 +157,7 @@ def raw(name: str, array: np.ndarray) -> Packed:
 def pack(arrays: Sequence[Packed], text: str | None = None) -> bytes:
     """A payload of arrays of which anything may be said; text: in place of what is said of them."""
     told = {name: [dtype, list(shape), stored] for name, dtype, shape, _, stored in arrays}
-    said = as_text(told if text is None else text).encode("utf-8", "surrogatepass")
+    said = (json.dumps(told) if text is None else text).encode("utf-8", "surrogatepass")  # in the order of the buffers
     return b"".join([struct.pack("<I", len(said)), said, *(buffer for _, _, _, buffer, _ in arrays)])
 
 

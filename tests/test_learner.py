@@ -465,7 +465,7 @@ def test_a_memory_can_be_opened_without_naming_its_sensor_and_with_either_readou
 
 
 def test_a_checkpoint_is_written_while_observing(tmp_path, monkeypatch, felt):
-    monkeypatch.setattr("scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY", 3)
+    monkeypatch.setattr("scroll_tactile.persistence.ledger.CHECKPOINT_EVERY", 3)
     learner = opened(tmp_path / "m")
     feel(learner)
     learner._ledger.store.flush()

@@ -106,5 +106,5 @@ def _expected(observed, described, exemplars, answers, settings):
 
 def spoil(path, number):
     """Damage a checkpoint's array on the disk."""
-    array = path / "checkpoints" / f"{number:08d}" / "observations" / "c"
+    array = path / "checkpoints" / f"{number:08d}" / "statistics-observations" / "c"
     next(file for file in array.rglob("*") if file.is_file()).unlink()

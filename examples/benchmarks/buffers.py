@@ -27,6 +27,7 @@ from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
+from scroll_tactile.persistence.replaying import exemplar_candidates
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
@@ -92,12 +93,14 @@ class UniformRandom:
 class _Pooled:
     def __init__(self, capacity: int, ratio: int, means: Mapping[str, IntArray]) -> None:
         self._pool, self._means = ExemplarSample(capacity, ratio=ratio), means
+        self._felt: list[Exemplar] = []
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
-        self._pool.add(material, key, Exemplar(material, key, {}, code, Scale("window", 1)))
+        self._pool.add(material, key, len(self._felt))
+        self._felt.append(Exemplar(material, key, {}, code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
-        held = [source for *_, source in self._pool if isinstance(source, Exemplar)]
+        held = [self._felt[place] for *_, place in self._pool]
         ranked = rank(held, self._pool.exemplars, lambda material, _: self._means[material])
         return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
@@ -198,8 +201,7 @@ def run_buffers(
     note("learning")
     for touch in train:
         learner.observe(*touch)
-    assert learner.memory.exemplars is not None
-    kept = [source for *_, source in learner.memory.exemplars if isinstance(source, Exemplar)]
+    kept = learner._ledger.read(exemplar_candidates)
     codes, keys = np.stack([exemplar.code for exemplar in kept]), [exemplar.key for exemplar in kept]
     f = float(np.mean([learner.predict(stream).material == name for name, stream in test]))
     records = []

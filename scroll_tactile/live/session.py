@@ -54,7 +54,7 @@ class HealthNotes:
     failure once: a full disk must not end a session. materials: whether answers are by materials, without which touches
     have no name.
 
-    A memory with a damaged row is warned of. Raises InputError as `TactileLearner.health` does: it needs one on disk.
+    A memory with a damaged row is warned of. Raises InputError as `TactileLearner.health` does.
     """
 
     def __init__(
@@ -431,7 +431,7 @@ class LiveSession:
             rule=rule,
             moments=sorted({-(-moment // frame) + before for moment in rule.moments}, reverse=True),
             earlier=earlier,
-            estimator=self._predictor.estimator() if self._predictor.ledger.memory.quantities else None,
+            estimator=self._predictor.estimator() if self._predictor.memory.quantities else None,
             widths=self._widths,
             rest=rest,
             correction=self._predictor.ledger.correction,

@@ -6,10 +6,9 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Annotated, Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import BeforeValidator, RootModel, ValidationError, model_validator
 
 from scroll_tactile.errors import DescriptionError
 from scroll_tactile.quantities import LONGEST_UNIT
@@ -69,21 +68,16 @@ def _property(pair: Sequence[Any]) -> Property:
     return [value + 0.0, unit]
 
 
-class _Constituents(RootModel[dict[Annotated[Any, BeforeValidator(_name)], Annotated[Any, BeforeValidator(_value)]]]):
-    """A description as it is kept."""
-
-    @model_validator(mode="after")
-    def _sum_to_one(self) -> Self:
-        if not self.root:
-            raise ValueError("expected at least one constituent; came none. None in place of the mapping removes it")
-        shares = [value for value in self.root.values() if isinstance(value, float)]
-        total, unknown = math.fsum(shares), None in self.root.values()
-        if shares and (total > 1 + SLACK or (total < 1 - SLACK and not unknown)):
-            raise ValueError(
-                f"expected the shares to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. Name all "
-                "constituents, or give None for those whose share is unknown"
-            )
-        return self
+def _require_sum(values: Collection[float | bool | Property | None]) -> None:
+    if not values:
+        raise ValueError("expected at least one constituent; came none. None in place of the mapping removes it")
+    shares = [value for value in values if isinstance(value, float)]
+    total, unknown = math.fsum(shares), None in values
+    if shares and (total > 1 + SLACK or (total < 1 - SLACK and not unknown)):
+        raise ValueError(
+            f"expected the shares to sum to {'at most ' if unknown else ''}one; they sum to {total:.6g}. Name all "
+            "constituents, or give None for those whose share is unknown"
+        )
 
 
 def checked(material: str, constituents: Mapping[str, Any]) -> Description:
@@ -99,13 +93,16 @@ def checked(material: str, constituents: Mapping[str, Any]) -> Description:
             f"expected {where} as a mapping from constituents to shares, such as {{'wool': 0.35, 'viscose': 0.65}}; "
             f"came {type(constituents).__name__} {constituents!r:.60}"
         )
-    ordered = dict(sorted(constituents.items(), key=lambda named: str(named[0])))
+    found: Description = {}
     try:
-        return dict(_Constituents.model_validate(ordered).root)
-    except ValidationError as error:
-        first = error.errors()[0]
-        of = f", {first['loc'][0]!r}" if first["loc"] else ""
-        raise DescriptionError(f"{where}{of}: {first['ctx']['error']}") from None
+        for name, value in sorted(constituents.items(), key=lambda named: str(named[0])):
+            where = f"the description of {material!r}, {name!r}"
+            found[_name(name)] = _value(value)
+        where = f"the description of {material!r}"
+        _require_sum(found.values())
+    except ValueError as error:
+        raise DescriptionError(f"{where}: {error}") from None
+    return found
 
 
 def describe(descriptions: dict[str, Description], material: str, constituents: Any) -> None:

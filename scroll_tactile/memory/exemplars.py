@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Annotated, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,32 +18,29 @@ import numpy.typing as npt
 from scroll_tactile.errors import InputError
 from scroll_tactile.memory.touch_rows import Arrays, Codes, Readings, unpack_readings
 from scroll_tactile.signals.windows import Scale
+from scroll_tactile.statistics.fields import Ints, Must, key_rows
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import one_thread
-from scroll_tactile.statistics.sample import Sample, SampledTouch, Stages
+from scroll_tactile.statistics.sample import Sample, SampledTouch, Stages, TouchFields
+from scroll_tactile.statistics.statistics import LONGEST_TOUCH
 
 __all__ = [
     "CANDIDATES",
     "Exemplar",
+    "ExemplarFields",
     "ExemplarSample",
-    "Source",
-    "exemplars_from_arrays",
-    "exemplars_to_arrays",
     "herd",
     "quotas",
     "rank",
 ]
 
-IntArray = npt.NDArray[np.int64]
-
 # Kept for each place in the buffer. With 3 the gap to the class mean is at most 1.08 times that of herding from every
 # touch (BioTac and RoboSkin, five folds, 5 to 20 exemplars a material); with 2 it reaches 1.24, with 4 it is 1.06.
 CANDIDATES = 3
 LARGEST_HERDED = 2 ** (53 - 2 * BITS)  # of codes: a product of two rows is then exact in float64
-LIMB_BITS = 32  # bits
 
 
-def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: IntArray, count: int) -> list[int]:
+def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: Ints, count: int) -> list[int]:
     """Places of the first `count` candidates (of all where there are fewer) in herding order.
 
     Step k takes argmin_x ‖μ − (x + Σ_{j<k} x_j) / k‖ of those not yet taken (iCaRL, algorithm 4; features as they
@@ -52,63 +49,44 @@ def herd(candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: IntAr
     and fewer are a beginning of more.
 
     candidates: codes of shape (N, d), of magnitude at most 2²⁰, d at most 8192. keys: N different content hashes.
-    mean: μ, codes of shape (d,). Raises InputError for anything else.
+    mean: μ, codes of shape (d,). Raises InputError for more features, or larger codes.
     """
-    _require_codes(candidates, keys, mean, count)
+    features, ends = (
+        candidates.shape[1],
+        [(int(each.min(initial=0)), int(each.max(initial=0))) for each in (candidates, mean)],
+    )
+    largest = max(max(-low, high) for low, high in ends)
+    if features > LARGEST_HERDED or largest > 2**BITS:
+        raise InputError(
+            f"expected codes of at most {LARGEST_HERDED} features, of magnitude at most {2**BITS}; came {features} "
+            f"features, and {largest}. Round features by to_codes"
+        )
     order = sorted(range(len(keys)), key=keys.__getitem__)
     rows, target = candidates[order].astype(np.float64), mean.astype(np.float64)
+    left, chosen = list(range(len(rows))), list[int]()
     with one_thread():
-        # Each product of rows is below 2⁵³, exact in any order. The score is kept in two limbs: at step k it may
-        # reach (4k − 1)·d·2⁴⁰, which from d·k = 2²¹ on would not fit 64 bits.
-        norms, towards = _exact(np.einsum("nd,nd->n", rows, rows)), _exact(rows @ target)
-        high, low = _carried(np.zeros_like(norms), norms - 2 * towards)
-        free = np.ones(len(rows), dtype=bool)
-        chosen: list[int] = []
-        while len(chosen) < min(count, len(rows)):
-            places = np.flatnonzero(free)
-            places = places[high[places] == high[places].min()]
-            pick = int(places[low[places].argmin()])  # the first of equal ones: by key
-            free[pick] = False
+        # Each product of rows is below 2⁵³, exact in any order. Scores are Python's integers: at step k they may reach
+        # (4k − 1)·d·2⁴⁰, which from d·k = 2²¹ on would not fit 64 bits.
+        towards = _whole(rows @ target)
+        scores = _whole(np.einsum("nd,nd->n", rows, rows)) - 2 * towards
+        while left and len(chosen) < count:
+            pick = min(left, key=scores.__getitem__)  # the first of equal ones: by key
+            left.remove(pick)
             chosen.append(order[pick])
-            change = 2 * (_exact(rows @ rows[pick]) - towards)
-            more, low = _carried(high, low + (change & (2**LIMB_BITS - 1)))
-            high = more + (change >> LIMB_BITS)
+            scores = scores + 2 * (_whole(rows @ rows[pick]) - towards)
     return chosen
 
 
-def _exact(values: npt.NDArray[np.float64]) -> IntArray:
-    return values.astype(np.int64)
-
-
-def _carried(high: IntArray, low: IntArray) -> tuple[IntArray, IntArray]:
-    return high + (low >> LIMB_BITS), low & (2**LIMB_BITS - 1)
-
-
-def _require_codes(
-    candidates: npt.NDArray[np.integer], keys: Sequence[bytes], mean: npt.NDArray[np.integer], count: int
-) -> None:
-    integers = candidates.dtype.kind in "iu" and mean.dtype.kind in "iu"
-    fits = candidates.ndim == 2 and mean.shape == candidates.shape[1:] and candidates.shape[1] <= LARGEST_HERDED
-    if not integers or not fits or len(set(keys)) != len(candidates) or len(keys) != len(candidates) or count < 0:
-        raise InputError(
-            f"expected integer codes of shape (N, d), d at most {LARGEST_HERDED}, a mean of shape (d,), N different "
-            f"keys and a count of 0 or more; came codes of {candidates.dtype} {candidates.shape}, a mean of "
-            f"{mean.dtype} {mean.shape}, {len(keys)} keys of which {len(set(keys))} differ, and {count}"
-        )
-    largest = max(max(int(array.max(initial=0)), -int(array.min(initial=0))) for array in (candidates, mean))
-    if largest > 2**BITS:
-        raise InputError(f"expected codes of magnitude at most {2**BITS}; came {largest}. Round features by to_codes")
+def _whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.object_]:
+    return values.astype(np.int64).astype(object)
 
 
 def quotas(available: Mapping[str, int], capacity: int) -> dict[str, int]:
     """Places of each material in a buffer: as even as can be, spare ones to the materials that have more.
 
     available: streams that there are of each. The sum is min(capacity, Σ available); a larger buffer takes a place
-    from nobody. Of materials with as many streams the first by name come first. Raises InputError for negative
-    numbers.
+    from nobody. Of materials with as many streams the first by name come first.
     """
-    if capacity < 0 or min(available.values(), default=0) < 0:
-        raise InputError(f"expected numbers of streams, 0 or more; came capacity {capacity} and {dict(available)}")
     places, left = {}, capacity
     ascending = sorted(available, key=lambda name: (available[name], name))
     for i, name in enumerate(ascending):
@@ -146,15 +124,41 @@ class Exemplar:
         return readings
 
 
-Source = int | Exemplar
-"""Where a candidate's readings lie: in this row of the journal; 0, or a compacted row: in the compaction checkpoint.
+@dataclass
+class HeldFields:
+    """What a store keeps of n touches whose rows it left behind.
 
-Without a journal it is the exemplar itself.
-"""
+    lengths: in readings, (n,). scales: the numbers of the scales of their codes, (n,). codes: see `Exemplar`, (n, d).
+    readings: one touch behind another in time, (Σ lengths, ...).
+    """
+
+    lengths: Annotated[Ints, Must("int64", "n", 0, LONGEST_TOUCH)]
+    scales: Annotated[Ints, Must("int64", "n", 1)]
+    codes: Annotated[npt.NDArray[np.int32], Must("int32", "n *", -(2**BITS), 2**BITS)]
+    readings: Annotated[npt.NDArray[np.float32], Must("float32", "* ...")]
 
 
-class ExemplarSample(Sample[Source]):
+@dataclass
+class ExemplarFields(TouchFields):
+    """What a store keeps of an `ExemplarSample`. sources: rows, (n,). held: their touches, where no row has them."""
+
+    sources: Annotated[Ints, Must("int64", "n", 0)]
+    held: HeldFields | None = None
+
+    def exemplars(self) -> list[Exemplar]:
+        """The exemplars that came with their readings."""
+        if self.held is None:
+            return []
+        parts = np.split(self.held.readings, np.cumsum(self.held.lengths)[:-1])
+        scales = [Scale.numbered(number) for number in self.held.scales.tolist()]
+        own = zip(self.named(), parts, self.held.codes, scales, strict=False)
+        return [Exemplar(name, key, {"readings": each}, code, scale) for (name, key, _), each, code, scale in own]
+
+
+class ExemplarSample(Sample[int]):
     """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
+
+    Of each it has the row of the journal in which its readings lie; 0 or a compacted row: the compaction checkpoint.
 
     exemplars: streams in the buffer; `ratio` times as many candidates are kept.
     ratio: at 1 the buffer is a random choice; more candidates come nearer to the class mean.
@@ -170,67 +174,31 @@ class ExemplarSample(Sample[Source]):
         super().__init__(ratio * exemplars)
         self.exemplars = exemplars
 
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """What a store keeps beside its journal: arrays by name, and JSON; all sources are rows."""
-        arrays = {"exemplar-keys": _keys([key for _, key, _ in self])}
-        arrays["exemplar-sources"] = np.array([source for *_, source in self], np.int64)
-        return arrays, {"materials": [material for material, *_ in self]}
-
-    @classmethod
-    def from_arrays(cls, arrays: Arrays, about: Mapping[str, Any], exemplars: int, source: int | None) -> Self:
-        """The sample that `to_arrays` gave, or that of the exemplars that `exemplars_to_arrays` gave.
-
-        exemplars: may be fewer than when it was made; a sample of more lacks what was dropped before. source: of those
-        for which the arrays name none; None where the journal is left behind.
-        """
-        sample = cls(exemplars)
-        if source is None:
-            sample.update((held.material, held.key, held) for held in exemplars_from_arrays(arrays, about))
-            return sample
-        keys = [key.tobytes() for key in arrays["exemplar-keys"]]
-        sources = arrays["exemplar-sources"].tolist() if "exemplar-sources" in arrays else [source] * len(keys)
-        sample.update(zip(about["materials"], keys, sources, strict=True))
-        return sample
-
-
-def exemplars_to_arrays(exemplars: Sequence[Exemplar]) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """What a compaction checkpoint keeps: readings one behind another in time, exemplar-lengths many of each."""
-    readings = [exemplar.readings for exemplar in exemplars]
-    arrays: dict[str, npt.NDArray[Any]] = {
-        "exemplar-keys": _keys([exemplar.key for exemplar in exemplars]),
-        "exemplar-lengths": np.array([len(stream) for stream in readings], np.int64),
-        "exemplar-scales": np.array([int(exemplar.scale) for exemplar in exemplars], np.int64),
-        "exemplar-codes": np.stack([one.code for one in exemplars]) if readings else np.zeros((0, 0), np.int32),
-        "exemplar-readings": np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
-    }
-    return arrays, {"materials": [exemplar.material for exemplar in exemplars]}
-
-
-def exemplars_from_arrays(arrays: Arrays, about: Mapping[str, Any]) -> list[Exemplar]:
-    """The exemplars that `exemplars_to_arrays` gave; none where the arrays hold no readings."""
-    if "exemplar-readings" not in arrays:
-        return []
-    readings = np.split(arrays["exemplar-readings"], np.cumsum(arrays["exemplar-lengths"])[:-1])
-    rows = zip(arrays["exemplar-keys"], readings, arrays["exemplar-codes"], arrays["exemplar-scales"], strict=False)
-    return [
-        Exemplar(
-            material=material,
-            key=key.tobytes(),
-            packed={"readings": stream},
-            code=code,
-            scale=Scale.numbered(int(scale)),
+    def to_fields(self, candidates: Sequence[Exemplar] | None = None) -> ExemplarFields:
+        """What a store keeps; candidates: with their readings, for what leaves the rows of the journal behind."""
+        if candidates is None:
+            return ExemplarFields(*self.named(), np.array(list(self.items()), np.int64))
+        readings = [candidate.readings for candidate in candidates]
+        held = HeldFields(
+            np.array([len(touch) for touch in readings], np.int64),
+            np.array([int(candidate.scale) for candidate in candidates], np.int64),
+            np.stack([candidate.code for candidate in candidates]) if readings else np.zeros((0, 0), np.int32),
+            np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
         )
-        for material, (key, stream, code, scale) in zip(about["materials"], rows, strict=True)
-    ]
+        names, keys = [one.material for one in candidates], key_rows([one.key for one in candidates])
+        return ExemplarFields(names, [], keys, np.zeros(len(names), np.int64), held)
+
+    def fill(self, kept: ExemplarFields, source: int) -> Self:
+        """Take in what `to_fields` gave. source: the row of those that come with their readings.
+
+        A sample of fewer keeps the first; one of more lacks what was dropped before.
+        """
+        sources = kept.sources.tolist() if kept.held is None else [source] * len(kept.materials)
+        self.update((*each[:2], row) for each, row in zip(kept.named(), sources, strict=True))
+        return self
 
 
-def _keys(keys: Sequence[bytes]) -> npt.NDArray[np.uint8]:
-    return np.array([list(key) for key in keys] or [[]], np.uint8)[: len(keys)]
-
-
-def rank(
-    candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale], IntArray]
-) -> dict[str, list[Exemplar]]:
+def rank(candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale], Ints]) -> dict[str, list[Exemplar]]:
     """The buffer: each material's exemplars, in herding order, cut to its quota; materials in alphabetical order.
 
     count: exemplars in the buffer. means: (material, scale) → the exact mean code there, rounded, int64 of shape (d,);
@@ -244,7 +212,7 @@ def rank(
     return {material: _herded(by_material[material], means, share) for material, share in places.items() if share}
 
 
-def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], IntArray], count: int) -> list[Exemplar]:
+def _herded(candidates: list[Exemplar], means: Callable[[str, Scale], Ints], count: int) -> list[Exemplar]:
     widest = max(exemplar.scale for exemplar in candidates)
     wide = [exemplar for exemplar in candidates if exemplar.scale == widest]
     brief = [exemplar for exemplar in candidates if exemplar.scale != widest]

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,7 @@ from scroll_tactile.errors import EmbeddingError, EmbeddingMismatchError, InputE
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.windows import COMPETING, ScaleKind
+from scroll_tactile.statistics.fields import first_wrong
 from scroll_tactile.statistics.grid import BITS
 
 __all__ = ["AbsentEmbedding", "EmbeddingIdentity", "FingerprintCheck", "Grid", "Identity", "absent_embedding"]
@@ -42,6 +43,18 @@ class _Kept(BaseModel):
     """A part of an identity, as JSON keeps it; fields that a later version adds are ignored."""
 
     model_config = ConfigDict(frozen=True)
+
+
+class Identified(Protocol):
+    """A store, as far as it says what it was made with."""
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        """What it was made with."""
 
 
 class EmbeddingIdentity(_Kept):
@@ -69,7 +82,7 @@ class EmbeddingIdentity(_Kept):
         try:
             return cls(**fields, configuration=configuration_of(embedding))
         except ValidationError as error:
-            raise EmbeddingError(f"the embedding {type(embedding).__name__} is none: {_first(error)}") from None
+            raise EmbeddingError(f"the embedding {type(embedding).__name__} is none: {first_wrong(error)}") from None
 
     @property
     def bare(self) -> bool:
@@ -128,10 +141,10 @@ class Identity(_Kept):
                 kept_touches=recipe.kept_touches,
             )
         except ValidationError as error:
-            raise InputError(f"no memory can be made with {_first(error)}") from None
+            raise InputError(f"no memory can be made with {first_wrong(error)}") from None
 
     @classmethod
-    def read(cls, store: Store) -> Self:
+    def read(cls, store: Identified) -> Self:
         """The identity that a store was made with.
 
         Raises MismatchError for a store that holds no memory of touch, DamageError for one that is none.
@@ -141,7 +154,9 @@ class Identity(_Kept):
         try:
             return cls.from_json(store.identity)
         except (ArithmeticError, RecursionError, TypeError, ValueError) as error:
-            what = _first(error) if isinstance(error, ValidationError) else f"{type(error).__name__}: {error!s:.200}"
+            what = (
+                first_wrong(error) if isinstance(error, ValidationError) else f"{type(error).__name__}: {error!s:.200}"
+            )
             raise DamageError(f"the identity of {store.path} cannot be read: {what}", path=store.path) from error
 
     @classmethod
@@ -182,7 +197,7 @@ class Identity(_Kept):
         return Recipe(self.sensor, embedding, request.settings.model_copy(update=kept))
 
     def _require(self, path: Path, request: RecipeRequest) -> None:
-        sensor, exemplars, kept_touches = request.sensor, request.settings.exemplars, request.settings.kept_touches
+        sensor = request.sensor
         if sensor is not None and sensor != self.sensor:
             differing = [
                 f"{name} {getattr(self.sensor, name)!r} there, {getattr(sensor, name)!r} here"
@@ -193,16 +208,15 @@ class Identity(_Kept):
                 f"{path} holds the memory of sensor {self.sensor.name!r}; it was opened for {sensor.name!r} "
                 f"({'; '.join(differing)}). Open it with its own sensor, or take another path"
             )
-        if exemplars not in (None, self.exemplars):
-            raise MismatchError(
-                f"{path} was made with exemplars={self.exemplars}; it was opened with {exemplars}. Readings that were "
-                "not kept are gone: leave exemplars out"
-            )
-        if kept_touches not in (None, self.kept_touches):
-            raise MismatchError(
-                f"{path} was made with kept_touches={self.kept_touches}; it was opened with {kept_touches}. Which "
-                "touches are kept is a function of all that were observed: leave kept_touches out"
-            )
+        for name, why in (
+            ("exemplars", "Readings that were not kept are gone"),
+            ("kept_touches", "Which touches are kept is a function of all that were observed"),
+        ):
+            made, asked = getattr(self, name), getattr(request.settings, name)
+            if asked not in (None, made):
+                raise MismatchError(
+                    f"{path} was made with {name}={made}; it was opened with {asked}. {why}: leave {name} out"
+                )
 
     def require_embedding(self, path: Path, embedding: Embedding) -> None:
         """Raise EmbeddingMismatchError for another embedding than the memory's; computing its fingerprint may embed."""
@@ -314,9 +328,3 @@ def _depth(value: Any) -> int:
         inside = [each for part in parts for each in part if isinstance(each, Mapping | list)]
         depth += 1
     return depth
-
-
-def _first(error: ValidationError) -> str:
-    """The first thing that is wrong: the field, what was expected, and what came."""
-    first = error.errors(include_url=False)[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}; came {first['input']!r:.80}"

@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any, Self, cast
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
-from scroll_tactile_store import Head, Record
+from scroll_tactile_store import Checkpoint, Head, Record
 
 from scroll_tactile.matching.kept_arrays import KeptTouch
-from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, Source, exemplars_to_arrays
+from scroll_tactile.memory.descriptions import Description, checked
+from scroll_tactile.memory.exemplars import Exemplar, ExemplarFields, ExemplarSample
 from scroll_tactile.memory.touch_rows import (
-    Arrays,
     Changed,
     Codes,
     Encode,
     Readings,
-    annotated,
     annotation_of,
     declaration,
+    place_of,
+    refusing,
     row_codes,
     unpack_readings,
 )
@@ -33,24 +33,21 @@ from scroll_tactile.recipe import Recipe
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.levels import LevelArray, levels_of
-from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, TargetSums
-from scroll_tactile.statistics.sample import Sample, SampledTouch, TouchSample
-from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation, TargetFields, TargetSums
+from scroll_tactile.statistics.fields import Bytes, Ints, Must, Name, decode, encode
+from scroll_tactile.statistics.sample import Sample, SampledTouch, SampleFields, TouchFields, TouchSample
+from scroll_tactile.statistics.statistics import LONGEST_TOUCH, Statistics, StatisticsFields
 
-__all__ = ["ANNOTATED", "MOST_CORRECTIONS", "WEIGHINGS", "KeptTouches", "Memory"]
+__all__ = ["MOST_CORRECTIONS", "KeptTouches", "Memory", "MemoryFields"]
 
-WEIGHINGS = "weighings"  # an array of JSON
-ANNOTATED = "sample-annotations", "kept-annotations"  # attributes: of each of their touches, how it was annotated
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
 MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
-Chosen = tuple[TouchSample, "KeptTouches | None", ExemplarSample | None]
 
 
 class KeptTouches(Sample[KeptTouch]):
     """Kept touches: a bounded sample of what was observed, as levels, to compare others with (see `matching.matcher`).
 
-    A function of the set of touches observed: at most `capacity` of a sensor's. In a checkpoint these are `kept-keys`
-    (n, 32), `kept-columns` (n), and `kept-levels`, each channel by channel; their materials are the attribute `kept`.
+    A function of the set of touches observed: at most `capacity` of a sensor's.
     """
 
     def __init__(self, sensor: Sensor, capacity: int) -> None:
@@ -68,7 +65,7 @@ class KeptTouches(Sample[KeptTouch]):
 
     def touches(self) -> list[KeptTouch]:
         """All of them, by material and key."""
-        return [touch for *_, touch in self]
+        return list(self.items())
 
     def take(
         self,
@@ -81,24 +78,65 @@ class KeptTouches(Sample[KeptTouch]):
         if readings is not None and self.wants(material, key):
             self.add(material, key, KeptTouch(material, key, self.levels(readings), annotation))
 
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-        """What a store keeps: arrays by name, and the material of each touch."""
-        kept = self.touches()
-        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept)])
-        return {
-            "kept-keys": np.array([list(touch.key) for touch in kept] or [[]], np.uint8)[: len(kept)],
-            "kept-columns": np.array([touch.levels.shape[1] for touch in kept], dtype=np.int64),
-            "kept-levels": levels,
-        }, [touch.material for touch in kept]
+    def to_fields(self) -> KeptFields:
+        """What a store keeps of them."""
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in self.items())])
+        columns = np.array([touch.levels.shape[1] for touch in self.items()], dtype=np.int64)
+        return KeptFields(*self.named(), columns, levels)
 
-    def fill(self, arrays: Arrays, materials: Sequence[str], annotations: Sequence[Annotation] = ()) -> None:
-        """Take in what `to_arrays` described; annotations: of each touch."""
-        noted = annotations or [NO_ANNOTATION] * len(materials)
-        columns, channels = arrays["kept-columns"], self.sensor.channels
-        parts = np.split(arrays["kept-levels"], np.cumsum(columns * channels)[:-1])
-        for i, material in enumerate(materials):
-            key, levels = arrays["kept-keys"][i].tobytes(), parts[i].reshape(channels, -1)
-            self.add(material, key, KeptTouch(material, key, levels, noted[i]))
+    def fill(self, kept: KeptFields) -> None:
+        """Take in what `to_fields` gave."""
+        channels = self.sensor.channels
+        parts = np.split(kept.levels, np.cumsum(kept.columns * channels)[:-1])
+        for (material, key, annotation), levels in zip(kept.named(), parts, strict=False):
+            self.add(material, key, KeptTouch(material, key, levels.reshape(channels, -1), annotation))
+
+
+@dataclass
+class KeptFields(TouchFields):
+    """What a store keeps of `KeptTouches`.
+
+    columns: the length of each touch, (n,). levels: of each touch, channel by channel, (Σ columns · channels,).
+    """
+
+    columns: Annotated[Ints, Must("int64", "n", 1, LONGEST_TOUCH)]
+    levels: Annotated[Bytes, Must("uint8", "*")]
+
+
+@dataclass
+class MemoryFields:
+    """What a checkpoint holds of a memory; see `Memory`, and `statistics.fields` for the names of its arrays.
+
+    retracted, excluded: rows of the journal, (n,). descriptions: by material. quantities: by name, without it.
+    corrections: the row of each, and its text. weighings: by axis, "" for materials.
+    """
+
+    statistics: StatisticsFields
+    sample: SampleFields
+    retracted: Annotated[Ints, Must("int64", "*", 1)]
+    excluded: Annotated[Ints, Must("int64", "*", 1)]
+    kept: KeptFields | None = None
+    exemplars: ExemplarFields | None = None
+    targets: TargetFields | None = None
+    tuned: Tuned | None = None
+    tuned_last_sequence: int = 0
+    descriptions: dict[Name, dict[str, Any]] = field(default_factory=dict)
+    quantities: dict[Name, dict[str, Any]] = field(default_factory=dict)
+    corrections: list[tuple[int, str]] = field(default_factory=list)
+    weighings: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, held: Checkpoint | Record, dimension: int, path: Path) -> Self:
+        """The fields of a checkpoint, or of a row that brought one. dimension: d. path: of the memory, for the error.
+
+        Raises DamageError.
+        """
+        with refusing(path, *place_of(held)):
+            sizes = {"d": dimension, "triangle": dimension * (dimension + 1) // 2}
+            made = decode(cls, held.arrays, held.attributes, sizes)
+            for material, constituents in made.descriptions.items():
+                checked(material, constituents)
+            return made
 
 
 class Memory:
@@ -168,57 +206,42 @@ class Memory:
         for old in list(self.corrections)[:-MOST_CORRECTIONS]:
             del self.corrections[old]
 
-    def add(
-        self,
-        material: str,
-        key: bytes,
-        columns: int,
-        codes: Codes,
-        sequence: int,
-        source: Source | None,
-        readings: Readings | None,
-        annotation: Annotation = NO_ANNOTATION,
-    ) -> None:
-        """Add an observation without a journal: a touch of so many columns, its rows of codes by scale, and its number.
+    def add(self, row: Record, codes: Codes | None = None) -> Changed:
+        """Add an observation; only `replaying.apply` does. codes: its own, where they are there already.
 
-        source: of its readings, for the exemplars. readings: for the kept touches. None: they are not kept.
-        `replaying.replay` adds what a journal has. Raises CapacityError before anything is added.
+        Raises CapacityError before anything is added.
         """
+        columns, codes = self.codes(row) if codes is None else (cast(int, row.attributes["columns"]), codes)
+        material, key, annotation = row.label, row.key, annotation_of(row.attributes)
         self.statistics.add(material, codes, columns)
         self.targets.add(material, key, annotation, codes, columns)
         if self.sample.wants(material, key):
             self.sample.add(material, key, self._touch(columns, codes, annotation))
-        if self.kept is not None and source is not None:
-            self.kept.take(material, key, readings, annotation)
-        if self.exemplars is not None and source is not None:
-            self.exemplars.add(material, key, source)
-        self.sequence = sequence
+        if self.kept is not None and self.kept.wants(material, key):
+            self.kept.take(material, key, unpack_readings(row.arrays), annotation)
+        self.add_exemplar(row)
+        return Changed(material, annotation.labels)
 
-    def undo(self, material: str, key: bytes, columns: int, annotation: Annotation) -> Callable[[], None]:
-        """What takes the next `add` back, of this touch, however much of it was done; it can be called again."""
-        parts = [sample.undo(material, key) for sample in self.samples if sample.wants(material, key)]
-        parts += [self.statistics.undo(material, columns), self.targets.undo(annotation, columns)]
-        sequence = self.sequence
+    def add_exemplar(self, row: Head) -> None:
+        """Add an observation to the candidates for exemplars, if its row holds readings."""
+        if self.exemplars is not None and row.attributes.get("nbytes"):
+            self.exemplars.add(row.label, row.key, row.sequence)
 
-        def undo() -> None:
-            for part in parts:
-                part()
-            self.sequence = sequence
+    def retract(self, row: Record) -> Changed:
+        """Subtract an observation from the sums; `replaying.refill` chooses again what was chosen.
 
-        return undo
-
-    def retract(self, record: Record) -> Changed:
-        """Subtract an observation from the sums; call `replaying.refill` afterwards, for what was chosen."""
-        material, key, annotation = record.label, record.key, annotation_of(record.attributes)
-        columns, codes = self.codes(record)
+        Raises UnknownMaterialError for one that the sums do not have.
+        """
+        material, key, annotation = row.label, row.key, annotation_of(row.attributes)
+        columns, codes = self.codes(row)
         self.statistics.remove(material, codes, columns)
         self.targets.remove(material, key, annotation, codes, columns)
-        self.retracted.add(record.sequence)
+        self.retracted.add(row.sequence)
         self.retractions += 1
         self.weighings.clear()
         if any(sample.holds(material, key) for sample in self.samples):
             self.stale = True
-        if record.sequence <= self.tuned_last_sequence:
+        if row.sequence <= self.tuned_last_sequence:
             self.tuned = None
         return Changed(material, annotation.labels)
 
@@ -226,14 +249,6 @@ class Memory:
     def samples(self) -> list[Sample[Any]]:
         """What was chosen among the observations, as far as the recipe keeps it."""
         return [sample for sample in (self.sample, self.kept, self.exemplars) if sample is not None]
-
-    def put_back(self, record: Record) -> None:
-        """Undo `retract` in the sums, exactly; the caller restores sample, exemplars and the tuned model."""
-        columns, codes = self.codes(record)
-        self.statistics.add(record.label, codes, columns)
-        self.targets.add(record.label, record.key, annotation_of(record.attributes), codes, columns)
-        self.retracted.discard(record.sequence)
-        self.stale = False
 
     def choose(self, heads: Sequence[Head], record: Callable[[int], Record], made: Memory) -> None:
         """Choose samples and exemplars among what they hold and some observations.
@@ -280,18 +295,12 @@ class Memory:
     def _touch(self, columns: int, codes: Codes, annotation: Annotation) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation)
 
-    @property
-    def chosen(self) -> Chosen:
-        """What was chosen among the observations: sample, kept touches and exemplars."""
-        return self.sample, self.kept, self.exemplars
-
-    @chosen.setter
-    def chosen(self, chosen: Chosen) -> None:
-        self.sample, self.kept, self.exemplars = chosen
-        self.stale = False
+    def take_chosen(self, other: Memory) -> None:
+        """Take sample, kept touches and exemplars of a memory in place of its own."""
+        self.sample, self.kept, self.exemplars, self.stale = other.sample, other.kept, other.exemplars, False
 
     def take_sums(self, memory: Memory, later: Memory, last_sequence: int) -> None:
-        """Take the sums of a memory without those of the rows behind one; `chosen` is of the rows up to it already."""
+        """Take the sums of a memory without those of the rows behind one; its own samples have none of these."""
         self.statistics, self.targets = memory.statistics - later.statistics, memory.targets - later.targets
         self.compacted, self.sequence, self.tuned = memory.compacted, last_sequence, None
         self.retracted = set(memory.retracted)
@@ -314,92 +323,61 @@ class Memory:
     def to_arrays(
         self, compaction_at: int | None = None, candidates: list[Exemplar] | None = None
     ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """Arrays and attributes of a checkpoint.
+        """Arrays and attributes of a checkpoint, see `MemoryFields`.
 
         compaction_at: of a compaction checkpoint, whose rows can no longer be retracted. candidates: those for
         exemplars, with their readings, for a compaction checkpoint and for what leaves the journal behind.
         """
-        arrays, names = self.statistics.to_arrays()
-        sampled, materials = self.sample.to_arrays()
-        attributes: dict[str, Any] = {
-            "dimension": self.statistics.dimension,
-            "scales": list(map(int, self.statistics.scales)),
-            "materials": names,
-            "sample": materials,
-            "tuned_last_sequence": self.tuned_last_sequence,
-            "descriptions": dict(sorted(self.descriptions.items())),
-        }
-        arrays |= sampled
-        if self.corrections:
-            rows = self.corrections.items()
-            attributes["corrections"] = [[sequence, correction.to_text()] for sequence, correction in rows]
-        if self.kept is not None:
-            levels, attributes["kept"] = self.kept.to_arrays()
-            arrays |= levels
-        if self.quantities:
-            declared = sorted(self.quantities.items())
-            attributes["quantities"] = {name: declaration(quantity) for name, quantity in declared}
-        if self.targets:
-            sums, attributes["targets"] = self.targets.to_arrays(self.statistics.touches)
-            arrays |= sums
-            for which, sample in zip(ANNOTATED, (self.sample, self.kept), strict=True):
-                if sample is not None:
-                    attributes[which] = [annotated(touch.annotation) for *_, touch in sample]
         # The rows after a compaction checkpoint are replayed, and say themselves which of them were retracted.
         retracted = sorted(self.retracted if compaction_at is None else ())
         compacted = self.compacted if compaction_at is None else compaction_at
         excluded = sorted(row for row in self.retracted | self.excluded if row <= compacted)
-        arrays["retracted"], arrays["excluded"] = (np.array(rows, dtype=np.int64) for rows in (retracted, excluded))
-        if self.exemplars is not None:
-            held = self.exemplars.to_arrays() if candidates is None else exemplars_to_arrays(candidates)
-            arrays |= held[0]
-            attributes["exemplars"] = held[1]
-        if self.weighings and candidates is None and compaction_at is None:
-            arrays[WEIGHINGS] = np.frombuffer(json.dumps(self.weighings).encode(), np.uint8)
-        if self.tuned is not None:
-            own, attributes["tuned"] = self.tuned.to_arrays()
-            arrays |= own
-        return arrays, attributes
+        weighed = candidates is None and compaction_at is None
+        return encode(
+            MemoryFields(
+                statistics=self.statistics.to_fields(),
+                sample=self.sample.to_fields(self.statistics.dimension),
+                kept=None if self.kept is None else self.kept.to_fields(),
+                exemplars=None if self.exemplars is None else self.exemplars.to_fields(candidates),
+                targets=self.targets.to_fields(self.statistics.touches) if self.targets else None,
+                tuned=self.tuned,
+                retracted=np.array(retracted, dtype=np.int64),
+                excluded=np.array(excluded, dtype=np.int64),
+                tuned_last_sequence=self.tuned_last_sequence,
+                descriptions=dict(sorted(self.descriptions.items())),
+                quantities={name: declaration(quantity) for name, quantity in sorted(self.quantities.items())},
+                corrections=[(row, correction.to_text()) for row, correction in self.corrections.items()],
+                weighings=dict(self.weighings) if weighed else {},
+            )
+        )
 
-    def fill(
-        self,
-        arrays: Arrays,
-        attributes: Any,
-        sequence: int = 0,
-        *,
-        source: int | None = None,
-    ) -> Self:
-        """This memory, empty before, filled with what `to_arrays` gave; the arrays are taken over.
+    def fill(self, held: Checkpoint | Record, path: Path, source: int = 0) -> Self:
+        """This memory, empty before, filled with what a checkpoint holds, or a row that brought one.
 
-        sequence: the last row that they hold. source: the row that has the readings of exemplars for which the arrays
-        name none, 0 for the compaction checkpoint; None where the arrays have them.
+        The arrays are taken over. path: of the memory where they were read, for the error. source: the row that has the
+        readings of exemplars which come with them, 0 for the compaction checkpoint. Raises DamageError.
         """
-        self.sequence = sequence
-        names, scales = attributes["materials"], self.plan.scales
-        self.statistics = Statistics.from_arrays(self.statistics.dimension, scales, arrays, names)
-        if "targets" in attributes:
-            self.targets = TargetSums.from_arrays(self.statistics, arrays, attributes["targets"])
-        noted, kept_noted = ([annotation_of(told) for told in attributes.get(which, ())] for which in ANNOTATED)
-        self.sample = TouchSample.from_arrays(arrays, attributes["sample"], noted)
-        if self.kept is not None:
-            self.kept.fill(arrays, attributes["kept"], kept_noted)
-        if self.exemplars is not None and "exemplars" in attributes:
-            self.exemplars = ExemplarSample.from_arrays(arrays, attributes["exemplars"], self.recipe.exemplars, source)
-        self.retracted, self.excluded = (set(arrays[name].tolist()) for name in ("retracted", "excluded"))
-        self.descriptions = dict(attributes.get("descriptions", {}))  # a merge brings them as rows
-        for name, fields in attributes.get("quantities", {}).items():
-            self.quantities[name] = Quantity(name=name, **fields)
-        for row, text in attributes.get("corrections", ()):
-            self.corrections[row] = Correction.from_text(text, self.recipe.sensor)
-        self.take_tuned(arrays, attributes)
-        if WEIGHINGS in arrays:
-            self.weighings = json.loads(arrays[WEIGHINGS].tobytes())
+        made, sensor = MemoryFields.of(held, self.statistics.dimension, path), self.recipe.sensor
+        self.sequence = 0 if isinstance(held, Record) else held.last_sequence
+        with refusing(path, *place_of(held)):
+            self.statistics = Statistics.of(self.statistics.dimension, self.plan.scales, made.statistics)
+            if made.targets is not None:
+                self.targets = TargetSums.of(self.statistics, made.targets)
+            self.sample = TouchSample.of(made.sample)
+            if self.kept is not None and made.kept is not None:
+                self.kept.fill(made.kept)
+            if self.exemplars is not None and made.exemplars is not None:
+                self.exemplars.fill(made.exemplars, source)
+            self.quantities = {name: Quantity(name=name, **fields) for name, fields in made.quantities.items()}
+            self.corrections = {row: Correction.from_text(text, sensor) for row, text in made.corrections}
+        self.retracted, self.excluded = set(made.retracted.tolist()), set(made.excluded.tolist())
+        self.descriptions, self.weighings = made.descriptions, made.weighings
+        self.take_tuned(made)
         return self
 
-    def take_tuned(self, arrays: Arrays, attributes: Any) -> None:
+    def take_tuned(self, made: MemoryFields) -> None:
         """Take the tuned model of a checkpoint, if it has another one."""
-        if "tuned" in attributes:
-            self.tuned_last_sequence = attributes["tuned_last_sequence"]
-            tuned = Tuned.from_arrays(arrays, attributes["tuned"])
-            if self.tuned is None or self.tuned.digest() != tuned.digest():
-                self.tuned = tuned
+        if made.tuned is not None:
+            self.tuned_last_sequence = made.tuned_last_sequence
+            if self.tuned is None or self.tuned.digest() != made.tuned.digest():
+                self.tuned = made.tuned

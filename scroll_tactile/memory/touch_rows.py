@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scroll_tactile_store import Head
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
+from scroll_tactile_store import Checkpoint, DamageError, Head
 
-from scroll_tactile.errors import MismatchError, StreamError
-from scroll_tactile.quantities import Quantity
+from scroll_tactile.errors import InputError, MismatchError, StreamError
+from scroll_tactile.quantities import MOST_QUANTITIES, MOST_STEPS, Quantity
+from scroll_tactile.settings import require_source
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
+from scroll_tactile.statistics.annotations import MOST_AXES, NO_ANNOTATION, Annotation
+from scroll_tactile.statistics.fields import Arrays, Name, Unexpected, first_wrong
+from scroll_tactile.statistics.statistics import LONGEST_TOUCH
 
 __all__ = [
     "ADAPT",
@@ -40,6 +46,7 @@ __all__ = [
     "Codes",
     "Encode",
     "Readings",
+    "RowFields",
     "active_rows",
     "annotated",
     "annotation_of",
@@ -48,6 +55,9 @@ __all__ = [
     "only_readings",
     "pack_codes",
     "pack_readings",
+    "place_of",
+    "quantities_of",
+    "refusing",
     "require_row",
     "retracted_by",
     "row_codes",
@@ -71,7 +81,6 @@ CHANNELS = "channels"  # of an observation or a sense: numbers of the channels, 
 CORRECTION, RETRACTS = "correction", "retracts"  # of an adapt: `Correction.to_text`, or the row that is taken back
 KINDS = [OBSERVE, RETRACT, MERGE, MEMBER, DESCRIBE, DECLARE, SENSE, ADAPT]
 
-Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = dict[Scale, npt.NDArray[np.int32]]
 Readings = npt.NDArray[np.float32]
 Encode = Callable[[Readings], Codes]
@@ -85,11 +94,60 @@ class Changed(NamedTuple):
     labels: tuple[tuple[str, str], ...] = ()
 
 
+# What reading values of wrong types can raise; what is no error of the values, such as ctrl-C, is none of them.
+WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
 MOST_BYTES = 2**28  # of the readings of a touch as float32: a row is read into memory whole
 CODES = "codes-"  # and a scale
 PACKED_WHOLE = "readings-2e"  # and a number: whole numbers, in units of two to that power
 PACKED_SHAPE, PACKED_ZERO, PACKED_REST = "readings-shape", "readings-zero", "readings-rest"
 MANTISSA, LARGEST_EXPONENT = 24, 128  # bits of a float32's mantissa, and its largest exponent
+
+
+Whole = Annotated[int, Field(strict=True)]
+
+
+class RowFields(BaseModel):
+    """What the attributes of a row must be, where they are there; see the kinds above.
+
+    columns: of the touch. nbytes: of its readings, where the row has them.
+    """
+
+    columns: Annotated[Whole, Field(ge=1, le=LONGEST_TOUCH)] | None = None
+    nbytes: Annotated[Whole, Field(ge=1, le=MOST_BYTES)] | None = None
+    source: Annotated[str, AfterValidator(require_source)] | None = None
+    values: dict[Name, Annotated[Whole, Field(ge=0, le=MOST_STEPS)]] = Field({}, max_length=MOST_QUANTITIES)
+    labels: dict[Name, Name] = Field({}, max_length=MOST_AXES)
+    sequences: list[tuple[Whole, Whole]] | None = None
+    retracts: Whole | None = None
+    correction: str | None = None
+    constituents: dict[str, Any] | None = None
+
+
+def place_of(held: Head | Checkpoint) -> tuple[str, int | None]:
+    """What `refusing` calls a row or a checkpoint, and the sequence of a row."""
+    return (f"row {held.sequence}", held.sequence) if isinstance(held, Head) else (f"checkpoint {held.number}", None)
+
+
+@contextmanager
+def refusing(path: Path, what: str, sequence: int | None = None) -> Iterator[None]:
+    """Name the place of what is found wrong there: as MismatchError what this version does not know, else DamageError.
+
+    what: such as "row 3". sequence: of a row.
+    """
+    try:
+        yield
+    except MismatchError as error:
+        advice = "Open the memory with the version that wrote it, or a newer one"
+        raise MismatchError(f"{what} of {path} {error}. {advice}") from None
+    except WRONG as error:
+        came = str(error) if isinstance(error, Unexpected | InputError) else f"{type(error).__name__}: {error!s:.200}"
+        came = first_wrong(error) if isinstance(error, ValidationError) else came
+        raise DamageError(
+            f"{what} of {path} is not what is written there: {came}. It is damaged, or was made by another program: "
+            "use none of this memory before you know who made it (scroll-tactile memory check)",
+            path=path,
+            sequence=sequence,
+        ) from error
 
 
 def require_row(stream: Stream) -> None:
@@ -160,6 +218,11 @@ def declared_by(row: Head) -> Quantity:
     """The quantity that a row declares. Raises InputError for what is none."""
     fields: dict[str, Any] = {name: row.attributes.get(name) for name in ("unit", "low", "high", "resolution")}
     return Quantity(name=row.label, **fields)
+
+
+def quantities_of(attributes: Mapping[str, Any]) -> dict[str, Quantity]:
+    """The quantities that a checkpoint's attributes declare. Raises InputError for what is none."""
+    return {name: Quantity(name=name, **fields) for name, fields in attributes.get("quantities", {}).items()}
 
 
 def annotated(annotation: Annotation) -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+
+from scroll_tactile.statistics.fields import Must, Name
 
 __all__ = ["TuneMode", "TuneReport", "Tuned"]
 
@@ -45,10 +46,10 @@ class Tuned:
     where only the head was trained. mode: see TuneMode. kept: whether it answers. report: of how it was made.
     """
 
-    names: list[str]
-    heads: dict[int, npt.NDArray[np.float64]]
-    bias: npt.NDArray[np.float64]
-    network: dict[str, npt.NDArray[np.float32]]
+    names: Annotated[list[Name], Must("", "C")]
+    heads: Annotated[dict[int, npt.NDArray[np.float64]], Must("float64", "d C")]
+    bias: Annotated[npt.NDArray[np.float64], Must("float64", "C")]
+    network: Annotated[dict[str, npt.NDArray[np.float32]], Must("float32", "...")]
     mode: TuneMode
     kept: bool
     report: dict[str, Any] = field(default_factory=dict)
@@ -62,26 +63,6 @@ class Tuned:
         for _, tensor in sorted(self.network.items()):
             digest.update(repr(tensor.shape).encode() + tensor.astype("<f4").tobytes())
         return digest.hexdigest()
-
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """What a store keeps: arrays by name, and JSON beside them."""
-        arrays: dict[str, npt.NDArray[Any]] = {f"tuned-head-{scale}": head for scale, head in self.heads.items()}
-        arrays["tuned-bias"] = self.bias
-        arrays |= {f"tuned-net-{name}": tensor for name, tensor in self.network.items()}
-        about = {"names": self.names, "mode": self.mode, "kept": self.kept, "report": self.report}
-        return arrays, about
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], about: Mapping[str, Any]) -> Tuned:
-        """The tuned model that `to_arrays` gave."""
-
-        def named(prefix: str) -> dict[str, npt.NDArray[Any]]:
-            return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-
-        heads = {int(scale): head for scale, head in named("tuned-head-").items()}
-        network = named("tuned-net-")
-        names, bias, report = list(about["names"]), arrays["tuned-bias"], dict(about["report"])
-        return cls(names, heads, bias, network, about["mode"], about["kept"], report)
 
     @staticmethod
     def described(report: TuneReport) -> dict[str, Any]:

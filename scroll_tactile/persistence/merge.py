@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from pydantic import BaseModel
-from scroll_tactile_store import Checkpoint, Head, Store
+from scroll_tactile_store import Head, Store
 from scroll_tactile_store.files import same_folder
 
 from scroll_tactile.errors import AnnotationError, DescriptionError, MismatchError, ObservationError
-from scroll_tactile.memory.descriptions import Description, describe, require_units
+from scroll_tactile.memory.descriptions import Description, require_units
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -22,22 +21,21 @@ from scroll_tactile.memory.touch_rows import (
     MEMBER,
     MERGE,
     OBSERVE,
-    RETRACT,
     SOURCE,
     VALUES,
     active_rows,
     annotation_of,
     declaration,
 )
-from scroll_tactile.persistence.contents import ListedContents, Rows, StoredContents, refusal
+from scroll_tactile.persistence.observations import TouchRows, refusal, rows_with
 from scroll_tactile.persistence.packing import sums_without
-from scroll_tactile.persistence.replaying import append_row
+from scroll_tactile.persistence.ram_store import AnyStore
+from scroll_tactile.persistence.replaying import note
 from scroll_tactile.quantities import Quantity, require_declarable
-from scroll_tactile.validation.expected import quantities_of
-from scroll_tactile.validation.gate import MemoryStore, wrong_retractions, wrong_values
 
-__all__ = ["Choice", "MergePlan", "MergeRules"]
+__all__ = ["Choice", "Merge", "MergeRules"]
 
+MEMBERS = SOURCE, VALUES, LABELS  # attributes of an observation that stay where it comes in without its features
 Choice = Literal["same", "ours", "theirs"]
 """Whose description of a material is kept where two memories describe it; "same": they must agree."""
 
@@ -57,262 +55,192 @@ class MergeRules:
     default_source: str | None = None
 
 
-@dataclass(frozen=True)
-class MergePlan:
-    """What a merge will append to our journal, in order.
+class Merge:
+    """A merge of another memory into ours: what it will append to our journal, in order.
 
-    source: the other memory. rows: heads of its journal that are appended. compaction: its compaction checkpoint, which
-    stands for the rows that it compacted. shared: how many streams both observed, or the other has twice. left_out:
-    rows that are not appended: shared streams, and refused ones. refused: touches that have another name already, each
-    with the reason. descriptions: material → the description that is taken over. quantities: that ours lacks.
-    default_source: see `MergeRules`. newest: its newest checkpoint, whose sums may be added in place of its rows.
+    ours, memory: our journal and what it holds. theirs: the journal of the other.
+
+    shared: how many streams both observed, or the other has twice; they do not come in. refused: nor do touches that
+    have another name already, each with the reason. descriptions: material → the description that is taken over.
+
+    Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a shared stream, or
+    their descriptions and `descriptions` is "same"; ObservationError where a touch that must be left out was compacted;
+    DamageError for a damaged row of theirs.
     """
 
-    source: MemoryStore
-    compaction: Checkpoint | None
-    rows: list[Head]
-    shared: int
-    left_out: set[int]
-    refused: list[tuple[Head, str]]
-    descriptions: dict[str, Description]
-    quantities: list[Quantity]
-    default_source: str | None
-    newest: Checkpoint | None
-
-    @classmethod
-    def of(
-        cls,
-        ours: Store,
-        memory: Memory,
-        theirs: MemoryStore,
-        contents: ListedContents | StoredContents,
-        rules: MergeRules,
-    ) -> Self:
-        """Plan a merge from both journals. contents: which touches ours has.
-
-        Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a shared
-        stream, or their descriptions and `descriptions` is "same"; ObservationError where a touch that must be
-        left out was compacted; DamageError for a damaged row of theirs, and for a shared stream whose readings do not
-        hash to its key, in either memory.
-        """
-        _require_mergeable(ours, memory, theirs)
-        compacted, found, heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
-        quantities = _quantities(ours, memory, theirs, found, heads)
-        incoming = active_rows(heads)
-        declared = memory.quantities | {quantity.name: quantity for quantity in quantities}
-        known, refused = _already_there(incoming, contents, ours.path, compacted, rules, declared)
-        if refused and not rules.one_name:
-            raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {refused[0][1]}")
-        left_out = {*known, *(head.sequence for head, _ in refused)}
-        out = [head for head in incoming if head.sequence in left_out]
-        if fixed := [head for head in out if head.sequence <= compacted or head.kind == MEMBER]:
-            raise _cannot_be_left_out(ours, theirs, fixed, refused)
-        rows = [head for head in incoming if head.sequence not in left_out]
-        bare = [head for head in rows if head.kind == OBSERVE and "nbytes" not in head.attributes]
-        if bare and memory.exemplars is not None:
+    def __init__(self, ours: AnyStore, memory: Memory, theirs: AnyStore, rules: MergeRules) -> None:
+        self._ours, self._memory, self._theirs, self._rules = ours, memory, theirs, rules
+        self._compacted, self._compaction, self._heads = theirs.compacted, theirs.compaction(), list(theirs.heads())
+        incoming = active_rows(self._heads)
+        self._require_same_making(whole=bool(self._compacted) or any(head.kind == MERGE for head in self._heads))
+        said = memory.empty_like()
+        if self._compaction is not None:
+            said.fill(self._compaction, theirs.path)
+        for head in self._heads:
+            if head.sequence > self._compacted:
+                note(said, head)
+        self._quantities = self._missing_quantities(said.quantities)
+        known, self.refused = self._there(incoming)
+        self.shared = len(known)
+        if self.refused and not rules.one_name:
+            raise self._refusing(self.refused[0][1])
+        self._left_out = {*known, *(head.sequence for head, _ in self.refused)}
+        self._require_able_to_leave_out([head for head in incoming if head.sequence in self._left_out])
+        # A merge before the compaction checkpoint is a part of it.
+        within = {head.sequence for head in incoming if head.kind == MERGE and head.sequence <= self._compacted}
+        self._rows = [head for head in incoming if head.sequence not in self._left_out | within]
+        if memory.exemplars is not None and any(
+            head.kind == OBSERVE and "nbytes" not in head.attributes for head in self._rows
+        ):
             raise MismatchError(
                 f"{theirs.path} kept no readings of what it observed (exemplars=0), of which {ours.path} keeps "
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
-        described = _descriptions(ours, memory, theirs, found, rules.descriptions)
-        newest = _require_sound(theirs, heads, coming={head.sequence for head in rows})
-        for sequence in known.values():
-            if sequence > ours.compacted and next(ours.heads(sequence - 1)).kind == OBSERVE:
-                ours.record(sequence)
-        source = rules.default_source
-        return cls(theirs, found, rows, len(known), left_out, refused, described, quantities, source, newest)
+        self.descriptions = self._chosen_descriptions(said.descriptions)
 
-    def append_to(self, ours: Store, memory: Memory, progress: Callable[[int, int], object]) -> int:
-        """Append the rows to our journal and add them to our memory; returns the number of observations added.
+    @property
+    def added(self) -> int:
+        """How many observations come in."""
+        return sum(head.kind in (OBSERVE, MEMBER) for head in self._rows)
 
-        The caller opens a batch around it: where one row does not pass the gate none is kept. progress: called with
-        (rows done, rows in all).
-        """
-        compaction = self.compaction
-        # A compaction checkpoint comes in as one row, and the merges before it are a part of it.
-        part = (
-            0
-            if compaction is None
-            else sum(head.kind == MERGE and head.sequence <= compaction.last_sequence for head in self.rows) - 1
-        )
-        total = len(self.rows) - part
-        for quantity in self.quantities:
-            append_row(memory, ours, DECLARE, quantity.name, attributes=declaration(quantity))
+    @property
+    def total(self) -> int:
+        """How many rows it appends."""
+        return len(self._quantities) + len(self.descriptions) + (self._compaction is not None) + len(self._rows)
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """The rows that it appends, each as the arguments of `Ledger`'s append."""
+        for quantity in self._quantities:
+            yield {"kind": DECLARE, "label": quantity.name, "attributes": declaration(quantity)}
         for material, description in self.descriptions.items():
-            append_row(memory, ours, DESCRIBE, material, attributes={"constituents": description})
-        sums = self._sums(memory)
-        for done, (kind, label, key, attributes, arrays, time) in enumerate(self._rows_to_append(compaction), start=1):
-            if sums is None:
-                append_row(memory, ours, kind, label, key, attributes=attributes, arrays=arrays, time=time)
-            else:
-                head = ours.append(kind, label, key, attributes=attributes, arrays=arrays, time=time)
-                if memory.exemplars is not None and "nbytes" in attributes:
-                    memory.exemplars.add(label, key, head.sequence)
-                memory.sequence = head.sequence
-            progress(done, total)
-        if sums is not None:
-            memory.join(sums, exemplars=False)
-        return sum(head.kind in (OBSERVE, MEMBER) for head in self.rows)
-
-    def _sums(self, memory: Memory) -> Memory | None:
-        """The sums of the rows that come in, from the packed memory's own; None where the rows must be replayed."""
-        source = self.source
-        if self.newest is None or source.compacted:
-            return None
-        if memory.kept is not None and Identity.read(source).kept_touches != memory.kept.capacity:
-            return None
-        return sums_without(source, self.newest, memory, self.left_out)
-
-    def _rows_to_append(
-        self, compaction: Checkpoint | None
-    ) -> Iterator[tuple[str, str, bytes, Any, Any, float | None]]:
-        if compaction is not None:
+            yield {"kind": DESCRIBE, "label": material, "attributes": {"constituents": description}}
+        if (compaction := self._compaction) is not None:
             left_out = ("tuned", "corrections", "descriptions")  # these stay there, and descriptions come as rows
             attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
             arrays = {name: array for name, array in compaction.arrays.items() if not name.startswith("tuned")}
-            yield MERGE, "", b"", attributes, arrays, self.rows[0].time if self.rows else None
-        for head in self.rows:
-            if compaction is not None and head.sequence <= compaction.last_sequence:
-                if head.kind != MERGE:  # a merge before the compaction checkpoint is a part of it
-                    attributes = self._attributes_of(head)
-                    kept = {name: value for name, value in attributes.items() if name in (SOURCE, VALUES, LABELS)}
-                    yield MEMBER, head.label, head.key, kept, None, head.time
+            time = self._rows[0].time if self._rows else None
+            yield {"kind": MERGE, "label": "", "attributes": attributes, "arrays": arrays, "time": time}
+        for head in self._rows:
+            row = {"label": head.label, "key": head.key, "time": head.time}
+            attributes, source = dict(head.attributes), self._rules.default_source
+            if head.kind != MERGE and source is not None:
+                attributes = {SOURCE: source} | attributes
+            if head.sequence > self._compacted:
+                arrays = dict(self._theirs.record(head.sequence).arrays)
+                yield row | {"kind": head.kind, "attributes": attributes, "arrays": arrays}
             else:
-                record = self.source.record(head.sequence)
-                yield head.kind, head.label, head.key, self._attributes_of(head), record.arrays, head.time
+                kept = {name: value for name, value in attributes.items() if name in MEMBERS}
+                yield row | {"kind": MEMBER, "attributes": kept}
 
-    def _attributes_of(self, head: Head) -> dict[str, Any]:
-        touch = head.kind in (OBSERVE, MEMBER) and self.default_source is not None
-        return {**({SOURCE: self.default_source} if touch else {}), **head.attributes}
+    def sums(self) -> Memory | None:
+        """The sums of the rows that come in, from those of the other memory; None where the rows must be replayed.
 
+        Raises DamageError.
+        """
+        if self._compaction is not None or len(self._left_out) > len(self._rows):
+            return None
+        kept = self._memory.kept
+        if kept is not None and Identity.read(self._theirs).kept_touches != kept.capacity:
+            return None
+        return sums_without(self._theirs, self._heads, self._memory, self._left_out)
 
-def _quantities(
-    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, heads: Sequence[Head]
-) -> list[Quantity]:
-    """Their quantities that ours lacks. Raises MismatchError where one is another under the same name."""
-    declared = quantities_of({} if compaction is None else compaction.attributes)
-    for wrong in wrong_values(theirs.path, (head for head in heads if head.sequence > theirs.compacted), declared):
-        raise wrong
-    both = dict(memory.quantities)
-    for name, quantity in sorted(declared.items()):
-        try:
-            require_declarable(both, quantity)
-        except AnnotationError as error:
-            raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {error}") from None
-        both[name] = quantity
-    return [quantity for name, quantity in both.items() if name not in memory.quantities]
+    def _refusing(self, why: object) -> MismatchError:
+        return MismatchError(f"{self._theirs.path} cannot be merged into {self._ours.path}: {why}")
 
+    def _require_same_making(self, whole: bool) -> None:
+        """whole: whether memories that were compacted come in."""
+        ours, theirs = self._ours.path, self._theirs.path
+        if isinstance(self._theirs, Store) and same_folder(ours, theirs):
+            raise MismatchError(f"{ours} cannot be merged into itself: it has all of it already")
+        mine, other = Identity.read(self._ours), Identity.read(self._theirs)
+        for part in ("sensor", "embedding", "reading", "views", "grid"):
+            own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
+            if own != incoming:
+                raise self._refusing(
+                    f"their {part.removesuffix('s')}s differ. Here it is {_formatted(own)}, there "
+                    f"{_formatted(incoming)}. Merge memories of one sensor and one embedding"
+                )
+        for what, kept in (("exemplars", self._memory.exemplars), ("kept_touches", self._memory.kept)):
+            if whole and kept is not None and getattr(mine, what) != getattr(other, what):
+                raise MismatchError(
+                    f"{theirs} was compacted and keeps {what} {getattr(other, what)}; {ours} keeps "
+                    f"{getattr(mine, what)}, and the readings for the others are gone"
+                )
 
-def _already_there(
-    incoming: Sequence[Head],
-    contents: ListedContents | StoredContents,
-    where: Path,
-    compacted: int,
-    rules: MergeRules,
-    declared: Mapping[str, Quantity],
-) -> tuple[dict[int, int], list[tuple[Head, str]]]:
-    """The touches that our memory, or an earlier row of theirs, has under the same name: their row → ours, 0 of theirs.
+    def _missing_quantities(self, theirs: Mapping[str, Quantity]) -> list[Quantity]:
+        """Their quantities that ours lacks."""
+        both = dict(self._memory.quantities)
+        for name, quantity in sorted(theirs.items()):
+            try:
+                require_declarable(both, quantity)
+            except AnnotationError as error:
+                raise self._refusing(error) from None
+            both[name] = quantity
+        return [quantity for name, quantity in both.items() if name not in self._memory.quantities]
 
-    Also those that are refused, each with the reason: these have other values or labels there, or by `one_name`
-    another name. where: our memory. compacted: rows of theirs that cannot be left out.
-    """
-    came: dict[bytes, Rows] = {}
-    known: dict[int, int] = {}
-    refused: list[tuple[Head, str]] = []
-    for head in (head for head in incoming if head.kind != MERGE):
-        ours, theirs = contents.rows(head.key), came.setdefault(head.key, {})
-        there, annotation = ours.get(head.label) or theirs.get(head.label), annotation_of(head.attributes)
-        why = refusal(list(ours or theirs), head.label, head.key in rules.clipped) if rules.one_name else None
-        if why is None and annotation and there is not None and annotation != there[1]:
-            why = (
-                f"row {there[0]} of {where if head.label in ours else 'the same memory'} has this touch of "
-                f"{head.label!r} with {there[1].shown(declared)}; row {head.sequence} comes with "
-                f"{annotation.shown(declared)}: retract one of them"
-            )
+    def _there(self, incoming: Sequence[Head]) -> tuple[set[int], list[tuple[Head, str]]]:
+        """Their rows of touches that ours has under the same name, or an earlier row of theirs.
+
+        Also those that are refused, each with the reason: these have other values or labels there, or by `one_name`
+        another name.
+        """
+        declared = self._memory.quantities | {quantity.name: quantity for quantity in self._quantities}
+        came: dict[bytes, TouchRows] = {}
+        known: set[int] = set()
+        refused: list[tuple[Head, str]] = []
+        for head in (head for head in incoming if head.kind != MERGE):
+            ours, theirs = rows_with(self._ours, self._memory, head.key), came.setdefault(head.key, {})
+            there, annotation = ours.get(head.label) or theirs.get(head.label), annotation_of(head.attributes)
+            why = None
+            if self._rules.one_name:
+                why = refusal(list(ours or theirs), head.label, head.key in self._rules.clipped)
+            if why is None and annotation and there is not None and annotation != there[1]:
+                why = (
+                    f"row {there[0]} of {self._ours.path if head.label in ours else 'the same memory'} has this touch "
+                    f"of {head.label!r} with {there[1].shown(declared)}; row {head.sequence} comes with "
+                    f"{annotation.shown(declared)}: retract one of them"
+                )
+            if why is not None:
+                refused.append((head, why))
+            elif there is None:
+                theirs[head.label] = head.sequence, annotation
+            elif head.label in ours or (head.kind == OBSERVE and head.sequence > self._compacted):
+                known.add(head.sequence)
+        return known, refused
+
+    def _require_able_to_leave_out(self, rows: Sequence[Head]) -> None:
+        fixed = [head for head in rows if head.sequence <= self._compacted or head.kind == MEMBER]
+        if not fixed:
+            return
+        theirs, why = self._theirs.path, {head.sequence: why for head, why in self.refused}.get(fixed[0].sequence)
         if why is not None:
-            refused.append((head, why))
-        elif head.label in ours:
-            known[head.sequence] = ours[head.label][0]
-        elif there is None:
-            theirs[head.label] = head.sequence, annotation
-        elif head.kind == OBSERVE and head.sequence > compacted:
-            known[head.sequence] = 0
-    return known, refused
-
-
-def _cannot_be_left_out(
-    ours: Store, theirs: MemoryStore, fixed: Sequence[Head], refused: Sequence[tuple[Head, str]]
-) -> ObservationError:
-    named = {head.sequence: why for head, why in refused}
-    if why := named.get(fixed[0].sequence):
-        more = f" (and {len(fixed) - 1} more of its touches)" if len(fixed) > 1 else ""
-        return ObservationError(f"{why}{more}; {theirs.path} was compacted, and none of them can be left out")
-    return ObservationError(
-        f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be left out: "
-        f"{theirs.path} was compacted, and their features given up there. Merge the other way round, if {ours.path} "
-        "was not compacted"
-    )
-
-
-def _descriptions(
-    ours: Store, memory: Memory, theirs: MemoryStore, compaction: Checkpoint | None, choice: Choice
-) -> dict[str, Description]:
-    """Their descriptions that are taken over."""
-    told: Mapping[str, Any] = {} if compaction is None else compaction.attributes
-    theirs_now: dict[str, Description] = dict(told.get("descriptions", {}))
-    for head in theirs.heads(0 if compaction is None else compaction.last_sequence):
-        if head.kind in (DESCRIBE, RETRACT):
-            describe(theirs_now, head.label, head.attributes.get("constituents"))
-    ours_now = memory.descriptions
-    new = {name: theirs_now[name] for name in sorted(theirs_now) if repr(ours_now.get(name)) != repr(theirs_now[name])}
-    differing = [name for name in new if name in ours_now]
-    if differing and choice == "same":
-        name = differing[0]
-        raise MismatchError(
-            f"{len(differing)} materials are described differently in {ours.path} and {theirs.path}, such as {name!r}: "
-            f"here it is {ours_now[name]}, there {new[name]}. Choose with descriptions='ours' or 'theirs'"
+            more = f" (and {len(fixed) - 1} more of its touches)" if len(fixed) > 1 else ""
+            raise ObservationError(f"{why}{more}; {theirs} was compacted, and none of them can be left out")
+        raise ObservationError(
+            f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be left out: {theirs} "
+            f"was compacted, and their features given up there. Merge the other way round, if {self._ours.path} was "
+            "not compacted"
         )
-    taken = {name: new[name] for name in new if choice != "ours" or name not in ours_now}
-    for name, description in taken.items():
-        try:
-            require_units({**ours_now, **taken}, name, description)
-        except DescriptionError as error:
-            raise MismatchError(f"{theirs.path} cannot be merged into {ours.path}: {error}") from None
-    return taken
 
-
-def _require_mergeable(ours: Store, memory: Memory, theirs: MemoryStore) -> None:
-    if same_folder(ours.path, theirs.path):
-        raise MismatchError(f"{ours.path} cannot be merged into itself: it has all of it already")
-    mine, other = Identity.read(ours), Identity.read(theirs)
-    for part in ("sensor", "embedding", "reading", "views", "grid"):
-        own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
-        if own != incoming:
+    def _chosen_descriptions(self, theirs: Mapping[str, Description]) -> dict[str, Description]:
+        """Their descriptions that are taken over."""
+        ours = self._memory.descriptions
+        new = {name: theirs[name] for name in sorted(theirs) if repr(ours.get(name)) != repr(theirs[name])}
+        differing = [name for name in new if name in ours]
+        if differing and self._rules.descriptions == "same":
+            name = differing[0]
             raise MismatchError(
-                f"{theirs.path} cannot be merged into {ours.path}: their {part.removesuffix('s')}s differ. Here it is "
-                f"{_formatted(own)}, there {_formatted(incoming)}. Merge memories of one sensor and one embedding"
+                f"{len(differing)} materials are described differently in {self._ours.path} and {self._theirs.path}, "
+                f"such as {name!r}: here it is {ours[name]}, there {new[name]}. Choose with descriptions='ours' or "
+                "'theirs'"
             )
-    whole = theirs.compacted or any(True for _ in theirs.heads(kind=MERGE))
-    if whole and memory.exemplars is not None and mine.exemplars != other.exemplars:
-        raise MismatchError(
-            f"{theirs.path} was compacted and keeps exemplars {other.exemplars}; "
-            f"{ours.path} keeps {mine.exemplars}, and the readings for the others are gone"
-        )
-    if whole and memory.kept is not None and mine.kept_touches != other.kept_touches:
-        raise MismatchError(
-            f"{theirs.path} was compacted and keeps {other.kept_touches} touches to match with; {ours.path} keeps "
-            f"{mine.kept_touches}, and the readings for the others are gone"
-        )
-
-
-def _require_sound(theirs: MemoryStore, heads: Sequence[Head], coming: Set[int]) -> Checkpoint | None:
-    """Their newest checkpoint. Verifies the rows that stay behind, too: raises DamageError where one fails the gate."""
-    for wrong in wrong_retractions(theirs.path, heads):
-        raise wrong
-    for head in heads:
-        if head.kind in (OBSERVE, MERGE) and head.sequence > theirs.compacted and head.sequence not in coming:
-            theirs.record(head.sequence)
-    return theirs.latest()
+        taken = {name: new[name] for name in new if self._rules.descriptions != "ours" or name not in ours}
+        for name, description in taken.items():
+            try:
+                require_units({**ours, **taken}, name, description)
+            except DescriptionError as error:
+                raise self._refusing(error) from None
+        return taken
 
 
 def _without_configuration(part: Any) -> Any:

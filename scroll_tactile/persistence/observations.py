@@ -1,10 +1,16 @@
-"""The observations in a journal: their state, and which of them can be retracted."""
+"""The observations in a journal: their state, which of them can be retracted, and which have some readings.
+
+Equal readings are one touch. One that the memory has under the same name is never learned twice. One that it has under
+another name is refused in learning from files, by one process or a fleet; `observe` and `merge` accept it.
+"""
 
 from __future__ import annotations
 
-from typing import Literal, cast
+from collections.abc import Sequence
+from itertools import takewhile
+from typing import cast
 
-from scroll_tactile_store import Head, Record, Store
+from scroll_tactile_store import Head, Record
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
@@ -12,6 +18,7 @@ from scroll_tactile.memory.touch_rows import (
     ADAPT,
     DECLARE,
     MEMBER,
+    MERGE,
     OBSERVE,
     RETRACTS,
     SOURCE,
@@ -20,20 +27,52 @@ from scroll_tactile.memory.touch_rows import (
     declared_by,
     retracted_by,
 )
+from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
+from scroll_tactile.signals.ranges import CURE
+from scroll_tactile.statistics.annotations import Annotation
 
 __all__ = [
+    "TouchRows",
     "adaptation_of",
     "compaction_point",
     "is_from",
     "observation_of",
     "observations",
-    "observations_from",
-    "observations_of",
+    "observations_to_forget",
+    "refusal",
+    "rows_with",
 ]
 
+TouchRows = dict[str, tuple[int, Annotation]]
+"""Material → the row that has some readings under this name, and its annotation; the oldest first."""
 
-def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Record:
+
+def rows_with(store: AnyStore, memory: Memory, key: bytes) -> TouchRows:
+    """The rows of observations that count and have readings with this hash; of each name the first."""
+    found: TouchRows = {}
+    for head in takewhile(lambda head: head.sequence <= memory.sequence, store.with_key(key)):
+        if head.kind in (OBSERVE, MEMBER) and not memory.is_gone(head.sequence):
+            found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
+    return found
+
+
+def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str | None:
+    """Why a touch that is there under these names cannot be learned as a material; None where it can.
+
+    clipped: whether all its values lay outside the sensor's range, so that clipping may have made it equal another.
+    """
+    if not names or material in names:
+        return None
+    if clipped:
+        return (
+            f"all its values lie outside the sensor's range, and the memory has what clipping leaves of them already, "
+            f"as {names[0]!r} and not as {material!r}: {CURE}"
+        )
+    return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
+
+
+def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> Record:
     """The journal's row of an observation that can be retracted.
 
     Raises ObservationError where there is none, it was retracted before, or compacted.
@@ -59,7 +98,7 @@ def observation_of(store: Store, memory: Memory, receipt: Receipt | int) -> Reco
     return record
 
 
-def adaptation_of(store: Store, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
+def adaptation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
     """The row of an adaptation that counts; None where the receipt is of anything else.
 
     Raises ObservationError for an adaptation that was not kept, counts no more, or is one of another memory.
@@ -82,83 +121,62 @@ def adaptation_of(store: Store, memory: Memory, receipt: Receipt | Adaptation | 
     return sequence
 
 
-def observations_of(store: Store, memory: Memory, material: str) -> list[int]:
-    """The sequences of all observations of a material, ascending.
+def observations_to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:
+    """The sequences of all observations of a material, or from a source: a file, or all in a folder or address.
 
-    Raises UnknownMaterialError for one never observed, ObservationError where some were compacted, and DamageError
-    where a damaged row may be one of them.
+    Raises UnknownMaterialError for a material never observed, ObservationError where a source has none, and where some
+    were compacted, and DamageError where a damaged row may be one of them.
     """
-    count = memory.statistics.materials.get(material, 0)
-    if not count:
+    if material is not None and material not in memory.statistics.materials:
         raise UnknownMaterialError(
             f"{material!r} was never observed; observed were {list(memory.statistics.materials)[:30]}"
         )
-    found = [head.sequence for head in _retractable(store, memory, material)]
-    if len(found) != count:
-        for _ in store.heads(memory.compacted):  # raises DamageError for a damaged row, which `_retractable` skips
-            pass
-        raise ObservationError(
-            f"{material!r} cannot be forgotten: {count - len(found)} of its {count} observations in {store.path} were "
-            "compacted, and their features given up. Retract the others one by one, by their receipts"
-        )
-    return found
-
-
-def _retractable(store: Store, memory: Memory, material: str | None = None) -> list[Head]:
-    """The observations whose arrays the journal still holds, of one material or all, in order; no damaged ones."""
-    rows = store.heads(memory.compacted, kind=OBSERVE, label=material)
-    return [head for head in rows if head.sequence not in memory.retracted]
-
-
-def observations_from(store: Store, memory: Memory, source: str) -> list[int]:
-    """The sequences of all observations from a source, ascending: a file, or all that lies in a folder or address.
-
-    Raises ObservationError where there are none, and where some were compacted.
-    """
     mine = [
-        head for head in active_rows(store.heads()) if is_from(cast("str | None", head.attributes.get(SOURCE)), source)
+        head
+        for head in active_rows(store.heads())
+        if head.kind != MERGE and (is_from(_source(head), source) if material is None else head.label == material)
     ]
-    held = {head.sequence for head in _retractable(store, memory)}
     if not mine:
         raise ObservationError(
             f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
         )
-    if gone := [head for head in mine if head.sequence not in held]:
+    if gone := [head for head in mine if head.kind == MEMBER or head.sequence <= memory.compacted]:
+        what = f"what comes from {source!r}" if material is None else f"{material!r}"
         raise ObservationError(
-            f"what comes from {source!r} cannot be forgotten: {len(gone)} of its {len(mine)} observations in "
-            f"{store.path} were compacted, there or before they were merged, and their features given up"
+            f"{what} cannot be forgotten: {len(gone)} of its {len(mine)} observations in {store.path} were compacted, "
+            "there or before they were merged, and their features given up. Retract the others one by one, by their "
+            "receipts"
         )
     return [head.sequence for head in mine]
 
 
-def is_from(recorded: str | None, source: str) -> bool:
+def _source(head: Head) -> str | None:
+    return cast("str | None", head.attributes.get(SOURCE))
+
+
+def is_from(recorded: str | None, source: str | None) -> bool:
     """Whether an observation's recorded source is this one: the same file, or a file in this folder or address."""
-    place = source.rstrip("/")
+    place = (source or "").rstrip("/")
     # A file's name is followed by an interval in brackets or a topic, a folder's by a file.
     ends = "/[ " if "." in place.rpartition("/")[2] else "/"
     return recorded is not None and (recorded == source or recorded.startswith(tuple(place + end for end in ends)))
 
 
-def observations(store: Store) -> list[Observation]:
+def observations(store: AnyStore) -> list[Observation]:
     """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
-
-    def state(head: Head) -> Literal["kept", "compacted", "retracted"]:
-        if head.sequence in retracted:
-            return "retracted"
-        return "compacted" if head.sequence <= compacted or head.kind == MEMBER else "kept"
-
     quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
+        gone = head.sequence <= compacted or head.kind == MEMBER
         return Observation(
             sequence=head.sequence,
             material=head.label,
             key=head.key,
             time=head.time,
-            state=state(head),
+            state="retracted" if head.sequence in retracted else "compacted" if gone else "kept",
             source=_source(head),
             values=annotation.measured(quantities),
             labels=dict(annotation.labels),
@@ -167,15 +185,12 @@ def observations(store: Store) -> list[Observation]:
     return [observation(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
 
 
-def _source(head: Head) -> str | None:
-    return cast("str | None", head.attributes.get(SOURCE))
-
-
-def compaction_point(store: Store, memory: Memory, keep: int) -> int:
+def compaction_point(store: AnyStore, memory: Memory, keep: int) -> int:
     """The last row to be compacted, so that the newest `keep` observations can still be retracted."""
     if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
     if keep == 0:
         return store.last
-    sequences = [head.sequence for head in _retractable(store, memory)]
+    kept = store.heads(memory.compacted, kind=OBSERVE)
+    sequences = [head.sequence for head in kept if head.sequence not in memory.retracted]
     return memory.compacted if len(sequences) <= keep else sequences[-keep] - 1

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Sequence
 from copy import copy
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any
 
-from scroll_tactile_store import Checkpoint, DamageError, Head, Store
+from scroll_tactile_store import Head, Store
 from scroll_tactile_store.archive import write_archive
 from scroll_tactile_store.exceptions import reported
 
@@ -29,14 +28,14 @@ from scroll_tactile.memory.touch_rows import (
     annotation_of,
     declaration,
 )
+from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.persistence.replaying import exemplar_candidates
-from scroll_tactile.validation.gate import MemoryStore
 
 __all__ = ["pack_memory", "sums_without"]
 
 
 def pack_memory(
-    store: Store, memory: Memory, path: Path, *, rows: bool = True, readings: bool = True, source: str | None = None
+    store: AnyStore, memory: Memory, path: Path, *, rows: bool = True, readings: bool = True, source: str | None = None
 ) -> None:
     """Write all that a memory learned as a packed memory; the arguments are those of `TactileLearner.pack`."""
     found = active_rows(store.heads())
@@ -76,7 +75,7 @@ def pack_memory(
         write_archive(Path(folder), path)
 
 
-def _append(into: Store, store: Store, head: Head, source: str | None, *, arrays: bool, readings: bool) -> Head:
+def _append(into: Store, store: AnyStore, head: Head, source: str | None, *, arrays: bool, readings: bool) -> Head:
     """Append a touch to a packed memory and return its row there. Raises StoreError."""
     attributes = {key: value for key, value in head.attributes.items() if readings or key not in ("nbytes", CHANNELS)}
     attributes |= {} if source is None or SOURCE in attributes else {SOURCE: source}
@@ -92,22 +91,18 @@ def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
     return exemplars
 
 
-def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_out: Collection[int]) -> Memory | None:
-    """The sums of a packed memory without some of its touches, exactly; None where its rows must be replayed instead.
+def sums_without(source: AnyStore, heads: Sequence[Head], memory: Memory, left_out: Collection[int]) -> Memory | None:
+    """The sums of another memory without some of its touches, exactly; None where its rows must be replayed instead.
 
-    found: its newest checkpoint. memory: any with the same recipe. Raises DamageError, also where the sums count other
-    touches than the rows name.
+    heads: its rows. memory: any with the same recipe. Raises DamageError.
     """
-    if found.last_sequence != source.last:
+    observed = [head for head in heads if head.kind == OBSERVE]
+    if len(observed) != sum(head.kind not in (DECLARE, DESCRIBE, SENSE, ADAPT) for head in heads):
         return None
-    heads = [head for head in source.heads() if head.kind == OBSERVE]
-    observed = found.arrays["observations"]
-    counts = dict(zip(cast("list[str]", found.attributes["materials"]), observed.tolist(), strict=True))
-    if len(heads) != sum(1 for head in source.heads() if head.kind not in (DECLARE, DESCRIBE, SENSE, ADAPT)):
+    found = source.latest()
+    if found is None or found.last_sequence != heads[-1].sequence:
         return None
-    if observed.ndim != 1 or counts != Counter(head.label for head in heads):
-        raise DamageError(f"{source.path} counts other touches than it names", path=source.path)
-    sums = memory.empty_like().fill(found.arrays, found.attributes)
+    sums = memory.empty_like().fill(found, source.path)
     if not left_out:
         return sums
     gone, rest = memory.empty_like(), memory.empty_like()
@@ -118,5 +113,5 @@ def sums_without(source: MemoryStore, found: Checkpoint, memory: Memory, left_ou
         gone.targets.add(record.label, record.key, annotation_of(record.attributes), codes, steps)
     rest.statistics, rest.targets = sums.statistics - gone.statistics, sums.targets - gone.targets
     rest.exemplars = None  # the rows have them
-    rest.choose([head for head in heads if head.sequence not in left_out], source.record, sums)
+    rest.choose([head for head in observed if head.sequence not in left_out], source.record, sums)
     return rest

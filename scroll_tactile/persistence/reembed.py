@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from scroll_tactile_store import Record, Store, StoreError
 from scroll_tactile_store.exceptions import reported
@@ -22,6 +23,7 @@ from scroll_tactile_store.files import is_there, sync_folder
 from scroll_tactile_store.lock import WriterLock
 
 from scroll_tactile.errors import MismatchError
+from scroll_tactile.memory.gate import MemoryStore, beside, finish_interrupted
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -37,15 +39,14 @@ from scroll_tactile.memory.touch_rows import (
     pack_readings,
     unpack_readings,
 )
-from scroll_tactile.persistence.replaying import append_row, load, refill
+from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.replaying import refill
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.validation.gate import MemoryStore, beside, finish_interrupted
 
 __all__ = ["Reembedding"]
 
 ROWS_TOGETHER = 64  # rows that wait for the disk together
 WITHOUT_READINGS = RETRACT, DESCRIBE, DECLARE, SENSE, ADAPT
-CHECKPOINT_EVERY = 256  # rows between checkpoints of the new memory: a resumed run embeds no more than these again
 
 
 class Reembedding:
@@ -64,9 +65,8 @@ class Reembedding:
         self.recipe = recipe
         self._source, self._encode, self._bare = source, encode, identity.embedding.bare
         folder = beside(source.path, "reembedding")
-        if is_there(
-            whole := beside(source.path, "reembedded")
-        ):  # it was complete; the old memory may have more rows now
+        whole = beside(source.path, "reembedded")
+        if is_there(whole):  # it was complete; the old memory may have more rows now
             with reported(folder, "going on with a memory embedded anew"):
                 whole.rename(folder)
         self._draft = MemoryStore.open(folder, identity=identity.to_json())
@@ -74,24 +74,21 @@ class Reembedding:
             self._draft.close()
             shutil.rmtree(folder)
             self._draft = MemoryStore.open(folder, identity=identity.to_json())
-        self._memory = load(Memory(recipe, lambda readings: encode(readings)[1]), self._draft)
+        self._made = Ledger(Memory(recipe, lambda readings: encode(readings)[1]), self._draft, self._bare)
 
     def copy(self, progress: Callable[[str, int, int], object]) -> None:
         """Embed the rows that the new memory does not have yet; the old one stays usable meanwhile.
 
         progress: called with (what is being done, rows done, rows in all).
         """
-        memory, draft = self._memory, self._draft
+        made, draft = self._made, self._draft
         while draft.last < self._source.last:
-            with draft.batch():
-                for record in islice(self._source.records(after=memory.sequence), ROWS_TOGETHER):
+            with made.batch():
+                for record in islice(self._source.records(after=draft.last), ROWS_TOGETHER):
                     self._carry(record)
-            refill(memory, draft)
-            if memory.sequence - memory.saved >= CHECKPOINT_EVERY:
-                self._write_checkpoint()
+                refill(made.memory, draft)
             progress("embedding", draft.last, self._source.last)
-        if memory.sequence > memory.saved:  # here, and not when both are exchanged: a full disk stops it before that
-            self._write_checkpoint()
+        made.save()  # here, and not when both are exchanged: a full disk stops it before that
 
     def _carry(self, record: Record) -> None:
         attributes, arrays = dict(record.attributes), dict(record.arrays)
@@ -102,13 +99,8 @@ class Reembedding:
             steps, codes = self._encode(readings)
             attributes |= {"columns": steps, "nbytes": readings.nbytes}
             arrays = pack_readings(readings) | ({} if self._bare else pack_codes(codes))
-        of = record.kind, record.label, record.key
-        append_row(self._memory, self._draft, *of, attributes=attributes, arrays=arrays, time=record.time, codes=codes)
-
-    def _write_checkpoint(self) -> None:
-        arrays, attributes = self._memory.to_arrays()
-        self._draft.commit(arrays, last_sequence=self._memory.sequence, attributes=attributes)
-        self._memory.saved = self._memory.sequence
+        row: Any = {"attributes": attributes, "arrays": arrays, "time": record.time, "codes": codes}
+        self._made.append(record.kind, record.label, record.key, **row)
 
     def put_in_place(self) -> Path:
         """Close both memories and exchange them; returns the folder of the old one.

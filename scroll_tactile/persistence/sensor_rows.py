@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import takewhile
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scroll_tactile_store import Head, Store, StoreError
+from scroll_tactile_store import Head, StoreError
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
@@ -23,7 +24,7 @@ from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import CHANNELS, OBSERVE, RETRACT, SENSE, SOURCE, retracted_by
 from scroll_tactile.persistence.ledger import Ledger
 from scroll_tactile.persistence.observations import is_from
-from scroll_tactile.persistence.open_memory import OpenMemory
+from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Health
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import require_name
@@ -42,13 +43,13 @@ LIKELIER = math.log(100)  # that the touches have to be, each by the correction 
 FEWEST_SPREAD = 8  # touches of materials that were touched before, by which it is known how touches differ
 
 
-def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
+def health_of(ledger: Ledger, channels: int, rules: WatchRules) -> Health:
     """The health that the rows chosen by rules tell, in the journal's order; retracted ones are not there.
 
     It goes on from the rows that were read last by the same rules. Two threads that ask at once read them both.
     """
     with ledger.lock:
-        ledger.require_store("tell how its sensor is")
+        ledger.require_open()
         _ = ledger.memory  # which may have lost rows, and says so as it is read
         watched = ledger.watched.pop(rules, None)
         if watched is None or watched.lost != ledger.lost:
@@ -61,13 +62,13 @@ def health_of(ledger: OpenMemory, channels: int, rules: WatchRules) -> Health:
         _keep(ledger, watched)
         raise
     with ledger.lock:
-        store = ledger.require_store("tell how its sensor is")
+        store = ledger.require_open()
         found = watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
         _keep(ledger, watched)  # from here on another thread may take it further
         return found
 
 
-def _keep(ledger: OpenMemory, watched: WatchedRows) -> None:
+def _keep(ledger: Ledger, watched: WatchedRows) -> None:
     """Go on from these rows at the next question by the same rules; those by the last few rules are kept."""
     with ledger.lock:
         ledger.watched[watched.rules] = watched
@@ -75,38 +76,35 @@ def _keep(ledger: OpenMemory, watched: WatchedRows) -> None:
             del ledger.watched[next(iter(ledger.watched))]
 
 
-def _piece(ledger: OpenMemory, watched: WatchedRows) -> list[WatchedRow]:
+def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
     """The next rows to be taken, none at the end, and after an alarm; those retracted meanwhile are taken back."""
     with ledger.lock:
-        store, memory = ledger.require_store("tell how its sensor is"), ledger.memory
-        _take_back(store, memory, watched)
+        store, memory, rules = ledger.require_open(), ledger.memory, watched.rules
+        if memory.sequence > watched.known:
+            new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
+            for gone in sorted(retracted_by(new), reverse=True):
+                watched.take_back(gone)
+            watched.known = memory.sequence
+        rows: list[WatchedRow] = []
         if watched.watch.alarmed is not None:
-            return []
-        until, rows = watched.rules.until, list[WatchedRow]()
-        last = memory.sequence if until is None else min(until, memory.sequence)
-        for head in store.heads(watched.last):
-            if head.sequence > last or len(rows) == PIECE:
+            return rows
+        for head in _heads(store, memory, rules.until, watched.last):
+            source = cast("str | None", head.attributes.get(SOURCE))
+            counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
+            if counts and (rules.source is None or is_from(source, rules.source)):
+                numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
+                rows.append(WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers))
+            else:
+                rows.append(WatchedRow(head.sequence))
+            if len(rows) == PIECE:
                 break
-            rows.append(_row(head, memory, watched))
         return rows
 
 
-def _take_back(store: Store, memory: Memory, watched: WatchedRows) -> None:
-    """Have what was retracted since it was last read go."""
-    if memory.sequence > watched.known:
-        new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
-        for gone in sorted(retracted_by(new), reverse=True):
-            watched.take_back(gone)
-        watched.known = memory.sequence
-
-
-def _row(head: Head, memory: Memory, watched: WatchedRows) -> WatchedRow:
-    own, source = watched.rules.source, cast("str | None", head.attributes.get(SOURCE))
-    counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
-    if not counts or (own is not None and not is_from(source, own)):
-        return WatchedRow(head.sequence)
-    numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
-    return WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
+def _heads(store: AnyStore, memory: Memory, until: int | None, after: int = 0) -> Iterator[Head]:
+    """The rows behind one, as far as the memory knows them; until: the last of them."""
+    last = memory.sequence if until is None else min(until, memory.sequence)
+    return takewhile(lambda head: head.sequence <= last, store.heads(after))
 
 
 def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor: Sensor) -> dict[Stream, str]:
@@ -121,11 +119,9 @@ def known_touches(touches: Mapping[str, Any] | Iterable[tuple[str, Any]], sensor
             + ("pixels" if sensor.camera else f"{sensor.channels}; at most {MOST_CHANNELS} can be told apart")
         )
     found: dict[Stream, str] = {}
+    given = touches.items() if isinstance(touches, Mapping) else touches
     try:
-        pairs = [
-            (material, readings)
-            for material, readings in (touches.items() if isinstance(touches, Mapping) else touches)
-        ]
+        pairs = [(material, readings) for material, readings in given]
     except (TypeError, ValueError):
         raise InputError(
             "expected touches as pairs of a material and its readings, or a mapping from materials to readings; came "
@@ -155,14 +151,13 @@ def adapt_to(
 ) -> Adaptation:
     """As `TactileLearner.adapt`, for touches that `known_touches` gave. unknown_of: how many are called unknown."""
     with ledger.lock:
-        store, memory = ledger.require_store("be adapted"), ledger.memory
-        ledger.require_write_mode()
+        store, memory = ledger.require_write_mode(), ledger.memory
         if unknown := sorted(set(touches.values()) - set(memory.statistics.materials)):
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
         own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
         out = own if until is None else own | {head.key for head in store.heads(until)}
         kept = [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
-        reference = _reference(store, memory, sensor.channels, own, until)
+        reference = _reference(_heads(store, memory, until), memory, sensor.channels, own)
     _require_known(reference, sorted(set(touches.values())), store)
     at_ends = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]  # of levels (n, T)
     ends: Floats = np.mean(at_ends, axis=0) if kept else np.ones(sensor.channels)
@@ -193,13 +188,10 @@ def adapt_to(
     )
 
 
-def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], until: int | None) -> Reference:
-    """What the rows up to one say of touches, without those by which the memory is to be adapted."""
-    last = memory.sequence if until is None else min(until, memory.sequence)
+def _reference(heads: Iterable[Head], memory: Memory, channels: int, own: set[bytes]) -> Reference:
+    """What some rows say of touches, without those by which the memory is to be adapted."""
     reference = Reference(channels)
-    for head in store.heads():
-        if head.sequence > last:
-            break
+    for head in heads:
         if head.kind == OBSERVE and not memory.is_gone(head.sequence) and head.key not in own:
             numbers = from_text(head.attributes.get(CHANNELS), channels)
             if numbers is not None:
@@ -207,13 +199,13 @@ def _reference(store: Store, memory: Memory, channels: int, own: set[bytes], unt
     return reference
 
 
-def _require_known(reference: Reference, materials: Sequence[str], store: Store) -> None:
+def _require_known(reference: Reference, materials: Sequence[str], store: AnyStore) -> None:
     """Raise InputError where the rows do not say how touches of these materials read, and how touches differ."""
     if missing := [name for name in materials if not reference.counts.get(name)]:
         raise InputError(
             f"the journal of {store.path} has no numbers of the channels of earlier touches of {missing[:5]}: they are "
-            "those by which it is to be adapted, lie behind `until`, came in with a compacted memory, or were observed "
-            "by a version before 0.14. Take touches of other materials"
+            "those by which it is to be adapted, lie behind `until`, or came in with a compacted memory. Take touches "
+            "of other materials"
         )
     if reference.total - len(reference.counts) < FEWEST_SPREAD:
         raise InputError(

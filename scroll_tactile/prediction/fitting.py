@@ -19,7 +19,7 @@ from scroll_tactile.matching.kept_arrays import KeptTouch, at_places
 from scroll_tactile.matching.likelihood import CLEAN
 from scroll_tactile.matching.matcher import Match, TouchMatcher, independent
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.persistence.open_memory import give_back_scratch
+from scroll_tactile.persistence.ledger import give_back_scratch
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.prediction.model import WITHIN, HeldOut, Model, Paces, Row, Trajectories, Weighing
 from scroll_tactile.readouts.calibration import AHEAD, calibrate_stage, dependence_of, fit_weights, softmax, tempered

@@ -23,16 +23,18 @@ import numpy.typing as npt
 from scroll_tactile_store import Store
 
 from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
+from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
+from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory, sound_rows
 from scroll_tactile.memory.identity import FingerprintCheck, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
-from scroll_tactile.persistence.contents import ListedContents
-from scroll_tactile.persistence.ledger import AxisLedger, Ledger
+from scroll_tactile.persistence.ledger import Ledger
+from scroll_tactile.persistence.ram_store import AnyStore, RamStore
 from scroll_tactile.persistence.reembed import Reembedding
-from scroll_tactile.persistence.replaying import exemplar_candidates, load
+from scroll_tactile.persistence.replaying import exemplar_candidates
 from scroll_tactile.prediction.composition import Composer
 from scroll_tactile.prediction.features import Encoded, FeatureExtractor, Readings
 from scroll_tactile.prediction.fitting import Draft
@@ -45,7 +47,6 @@ from scroll_tactile.results import Composition, Constituent, Estimate, Predictio
 from scroll_tactile.settings import Settings, candidates_of
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.validation.gate import MemoryStore, finish_interrupted, open_memory
 
 __all__ = ["LogitsReader", "Predictor", "embed_again", "nothing_known", "reembed_memory"]
 
@@ -83,12 +84,12 @@ class LogitsReader(Protocol):
 class Predictor:
     """All objects of one open memory: its feature extractor, its ledger and its model; it answers from them.
 
-    recipe: of the memory. tuned_reader: made when a tuned model first answers. replaced: whether the memory was
-    embedded again since; then another predictor has it.
+    recipe: of the memory. axis: of labels, by which it answers; "" for materials. tuned_reader: made when a tuned model
+    first answers. replaced: whether the memory was embedded again since; then another predictor has it.
     """
 
-    def __init__(self, recipe: Recipe, extractor: FeatureExtractor, ledger: Ledger) -> None:
-        self.recipe, self.extractor, self.ledger = recipe, extractor, ledger
+    def __init__(self, recipe: Recipe, extractor: FeatureExtractor, ledger: Ledger, axis: str = "") -> None:
+        self.recipe, self.extractor, self.ledger, self.axis = recipe, extractor, ledger, axis
         self.tuned_reader: LogitsReader | None = None
         self.replaced = False
         self._axes: dict[str, Predictor] = {}
@@ -103,7 +104,7 @@ class Predictor:
     @classmethod
     def new(cls, recipe: Recipe) -> Self:
         """Of an empty memory without a path. Raises InputError for an embedding that does not read the sensor."""
-        return cls(recipe, _extractor(recipe), Ledger(partial(Memory, recipe), contents=ListedContents()))
+        return cls._of(recipe, _extractor(recipe), RamStore(recipe), configuration_of(recipe.embedding) is not None)
 
     @classmethod
     def open(
@@ -113,13 +114,7 @@ class Predictor:
         store, identity, recipe = open_memory(path, request, mode)
         try:
             check = FingerprintCheck(identity, store.path) if request.embedding is None else None
-            extractor, bare = _extractor(recipe, check), identity.embedding.bare
-
-            def encode(readings: npt.NDArray[np.float32]) -> Codes:
-                return extractor.learned(Stream(recipe.sensor, readings))[1]
-
-            encodes = encode if bare or capabilities_of(recipe.embedding).exact else None
-            return cls(recipe, extractor, Ledger(partial(load, Memory(recipe, encodes), store), store, bare))
+            return cls._of(recipe, _extractor(recipe, check), store, identity.embedding.configuration is not None)
         except BaseException:
             store.close()
             raise
@@ -128,16 +123,27 @@ class Predictor:
     def of_snapshot(cls, state: Mapping[str, Any]) -> Self:
         """Of the memory that `snapshot` described, in memory only."""
         recipe: Recipe = state["recipe"]
-        ledger = Ledger(lambda: Memory(recipe).fill(*state["held"]), contents=state["contents"])
-        return cls(recipe, _extractor(recipe, state["check"]), ledger)
+        configured = configuration_of(recipe.embedding) is not None
+        return cls._of(recipe, _extractor(recipe, state["check"]), state["store"], configured)
+
+    @classmethod
+    def _of(cls, recipe: Recipe, extractor: FeatureExtractor, store: AnyStore, configured: bool) -> Self:
+        """Of the memory in a store. configured: whether the embedding can be made again by what the memory knows."""
+
+        def encode(readings: npt.NDArray[np.float32]) -> Codes:
+            return extractor.learned(Stream(recipe.sensor, readings))[1]
+
+        exact = capabilities_of(recipe.embedding).exact
+        return cls(recipe, extractor, Ledger(Memory(recipe, encode if exact else None), store, exact and configured))
 
     def snapshot(self) -> dict[str, Any]:
-        """All that the memory knows at this moment, to be pickled."""
+        """All that the memory knows at this moment, to be pickled; its touches are compacted there."""
         with self.ledger.lock:
-            memory = self.ledger.memory
-            arrays, attributes = memory.to_arrays(candidates=exemplar_candidates(memory, self.ledger.store))
-            found = {"held": (arrays, attributes, memory.sequence), "contents": self.ledger.copied_contents()}
-            return found | {"recipe": self.recipe, "check": self.extractor.check}
+            store, memory = self.ledger.store, self.ledger.memory
+            kept = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
+            heads = sound_rows(store.heads, logger.warning)
+            held = RamStore.compacted_to(self.recipe, heads, memory.sequence, kept)
+            return {"store": held, "recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:
         """The predictor of an axis of labels, made when it is first asked for.
@@ -151,8 +157,13 @@ class Predictor:
                     f"expected an axis that touches have labels on, out of {sorted(axes)}; came {axis!r:.60}"
                 )
             if axis not in self._axes:
-                self._axes[axis] = Predictor(self.recipe, self.extractor, AxisLedger(self.ledger, axis))
+                self._axes[axis] = Predictor(self.recipe, self.extractor, self.ledger, axis)
             return self._axes[axis]
+
+    @property
+    def memory(self) -> Memory:
+        """The memory that it answers from, as it is now; of an axis that of its labels."""
+        return self.ledger.memory_of(self.axis)
 
     def stream(self, readings: Readings) -> Stream:
         """The validated stream of some readings, read through the correction of the memory, if its skin changed.
@@ -227,7 +238,7 @@ class Predictor:
     def estimator(self) -> Estimator:
         """What estimates quantities in the present memory; it keeps its heads while the sampled touches stay."""
         with self.ledger.lock:
-            memory = self.ledger.memory
+            memory = self.memory
             least = max(1, memory.statistics.fifth_percentile_length)
             self._estimator = Estimator.of(memory.plan, memory.sample, memory.quantities, least, self._estimator)
             return self._estimator
@@ -236,7 +247,7 @@ class Predictor:
         """The model of the present memory, which never changes. Raises EmbeddingMismatchError."""
         self.extractor.verified()
         with self.ledger.lock, enough_memory():
-            memory = self.ledger.memory  # first: after an interrupted change this reads the memory again, a new version
+            memory = self.memory  # first: after an interrupted change this reads the memory again, a new version
             self._note_changes()
             fit = self._fit
             if self._job is not None and self._job[0].done():
@@ -286,7 +297,8 @@ class Predictor:
             self._process, self._worker, self._job = os.getpid(), None, None
         if self.ledger.version == self._version:
             return
-        changed, self.ledger.changed, self._version = self.ledger.changed, set(), self.ledger.version
+        changed = self.ledger.changed_since(self._version, self.axis)
+        self._version = self.ledger.version
         for fit in (self._fit, self._job and self._job[1]):
             if fit is not None:
                 fit.changed = None if fit.changed is None or changed is None else fit.changed | changed
@@ -295,7 +307,7 @@ class Predictor:
         """Begin a fit if enough touches came or went. A lack of memory or threads raises nothing here."""
         if self._fit is None or self._job is not None:
             return
-        model, memory = self._fit.model, self.ledger.memory
+        model, memory = self._fit.model, self.memory
         fitted = 0 if model.weighing is None else model.weighing.touches
         if abs(memory.statistics.touches - fitted) < max(LEAST, fitted // GROWTH):
             return
@@ -310,9 +322,9 @@ class Predictor:
 
         It was fitted to these touches or to fewer: a retraction drops it.
         """
-        if (text := self.ledger.take_weighing()) is None:
+        if (text := self.ledger.memory.weighings.pop(self.axis, None)) is None:
             return None
-        memory = self.ledger.memory
+        memory = self.memory
         try:
             model = read_weighing(text, Draft.of(memory, self.recipe.settings.readout).solved())
         except ValueError as error:
@@ -321,7 +333,7 @@ class Predictor:
         return _Fit(model, -1, memory.retractions)
 
     def _fit_now(self, before: Model | None) -> Model:
-        self._fit, self._job, memory = None, None, self.ledger.memory
+        self._fit, self._job, memory = None, None, self.memory
         model = Draft.of(memory, self.recipe.settings.readout, before).fit()
         self._fit = _Fit(model, self._version, memory.retractions)
         return model
@@ -345,7 +357,7 @@ class Predictor:
                 if worker is not None:
                     worker.shutdown()
                 # Where something was retracted since, what it was fitted to counts no more.
-                fit, now = predictor._fit, predictor.ledger.memory.retractions
+                fit, now = predictor._fit, self.ledger.memory.retractions
                 if fit is not None and fit.retractions == now and (text := weighing_text(fit.model)):
                     weighings[axis] = text
             self.ledger.close(weighings)
@@ -353,7 +365,7 @@ class Predictor:
     def fitted(self) -> Model:
         """As `TactileLearner.model`."""
         with self.ledger.lock, enough_memory():
-            return Draft.of(self.ledger.memory, self.recipe.settings.readout).fit()
+            return Draft.of(self.memory, self.recipe.settings.readout).fit()
 
 
 def _followed(fit: _Fit, memory: Memory) -> Model | None:
@@ -389,7 +401,7 @@ def embed_again(
     """As `TactileLearner.reembed`; also returns the predictor of the new memory."""
     ledger = predictor.ledger
     with ledger.lock:  # not in the midst of another thread's batch
-        store = ledger.require_store("be embedded again")
+        store = ledger.require_folder("be embedded again")
         ledger.require_writing()
     carried = _reembedding(store, embedding)
     try:

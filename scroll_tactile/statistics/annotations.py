@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -21,14 +21,13 @@ from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.settings import require_name
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.statistics import SECOND, Statistics
+from scroll_tactile.statistics.fields import Ints, Must, Name
+from scroll_tactile.statistics.statistics import Algebra, Statistics, StatisticsFields
 
-__all__ = ["AXIS", "MOST_AXES", "NO_ANNOTATION", "Annotation", "TargetSums", "axis_arrays"]
+__all__ = ["MOST_AXES", "NO_ANNOTATION", "Annotation", "TargetFields", "TargetSums"]
 
 MOST_AXES = 16  # of a memory: each has second moments of its own where some touches lack its label
-AXIS = "axis-"  # the beginning of the names of an axis's arrays, before its number
 MODULUS = 2**256
-Arrays = Mapping[str, npt.NDArray[Any]]
 Codes = Mapping[Scale, npt.NDArray[np.int32]]
 Sums = tuple[int, int, int]
 
@@ -92,12 +91,33 @@ class Annotation:
 NO_ANNOTATION = Annotation()
 
 
-class TargetSums:
+@dataclass
+class AxisFields:
+    """What a store keeps of an axis: its name, and the statistics of its labels (see `StatisticsFields`)."""
+
+    name: Name
+    statistics: StatisticsFields
+
+
+@dataclass
+class TargetFields:
+    """What a store keeps of the sums of values and labels.
+
+    touches: how many have an annotation. total: the sum of their numbers (see `Annotation.number`), in hexadecimal.
+    of: the quantity and material of each row of the sums. sums: n, Σ t and Σ t² (see `TargetSums.sums`), (p, 3).
+    """
+
+    touches: int
+    total: str
+    of: Annotated[list[tuple[Name, Name]], Must("", "p")]
+    sums: Annotated[Ints, Must("int64", "p 3")]
+    axes: list[AxisFields]
+
+
+class TargetSums(Algebra):
     """The exact sums of values and labels; empty where no touch has any.
 
     axes: by the name of each, the statistics of the touches with a label on it; see `Statistics`.
-
-    `+` joins two, `-` takes one out of another, `==` compares digests.
     """
 
     def __init__(self, dimension: int, scales: Sequence[Scale]) -> None:
@@ -121,25 +141,22 @@ class TargetSums:
 
     def add(self, material: str, key: bytes, annotation: Annotation, codes: Codes, columns: int) -> None:
         """Add the annotation of an observation, of so many columns and these rows of codes by scale."""
-        if annotation:
-            self._count(material, key, annotation, 1)
-            for axis, label in annotation.labels:
-                if axis not in self.axes:
-                    self.axes[axis] = Statistics(self._dimension, self._scales)
-                self.axes[axis].add(label, codes, columns)
+        self._count(material, key, annotation, 1)
+        for axis, label in annotation.labels:
+            self.axes.setdefault(axis, Statistics(self._dimension, self._scales)).add(label, codes, columns)
 
     def remove(self, material: str, key: bytes, annotation: Annotation, codes: Codes, columns: int) -> None:
         """Take out one that was added. Raises UnknownMaterialError for a label without such an observation."""
-        if annotation:
-            self._count(material, key, annotation, -1)
-            for axis, label in annotation.labels:
-                self.axes.setdefault(axis, Statistics(self._dimension, self._scales)).remove(label, codes, columns)
-                if not self.axes[axis].touches:
-                    del self.axes[axis]
+        self._count(material, key, annotation, -1)
+        for axis, label in annotation.labels:
+            self.axes.setdefault(axis, Statistics(self._dimension, self._scales)).remove(label, codes, columns)
+            if not self.axes[axis].touches:
+                del self.axes[axis]
 
     def _count(self, material: str, key: bytes, annotation: Annotation, sign: int) -> None:
-        self._touches += sign
-        self._total = (self._total + sign * annotation.number(material, key)) % MODULUS
+        if annotation:
+            self._touches += sign
+            self._total = (self._total + sign * annotation.number(material, key)) % MODULUS
         for name, steps in annotation.values:
             self._change((name, material), (1, steps, steps * steps), sign)
 
@@ -150,18 +167,6 @@ class TargetSums:
         if not any(self._quantities[of]):
             del self._quantities[of]
 
-    def undo(self, annotation: Annotation, columns: int) -> Callable[[], None]:
-        """What takes the next `add` back, of this annotation, however much of it was done; it can be called again."""
-        axes, quantities, counts = dict(self.axes), dict(self._quantities), (self._touches, self._total)
-        parts = [self.axes[axis].undo(label, columns) for axis, label in annotation.labels if axis in self.axes]
-
-        def undo() -> None:
-            for part in parts:
-                part()
-            self.axes, self._quantities, (self._touches, self._total) = dict(axes), dict(quantities), counts
-
-        return undo
-
     def digest(self) -> str:
         """Hex of a SHA-256 over all of it: equal where the annotations are those of the same touches."""
         digest = hashlib.sha256(repr((self._touches, self._total, sorted(self._quantities.items()))).encode())
@@ -169,21 +174,8 @@ class TargetSums:
             digest.update(repr((axis, self.axes[axis].digest())).encode())
         return digest.hexdigest()
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, TargetSums):
-            return NotImplemented
-        return self.digest() == other.digest()
-
-    __hash__ = None  # type: ignore[assignment]  # it changes
-
-    def __add__(self, other: TargetSums) -> TargetSums:
-        return self._combined(other, 1)
-
-    def __sub__(self, other: TargetSums) -> TargetSums:
-        return self._combined(other, -1)
-
-    def _combined(self, other: TargetSums, sign: int) -> TargetSums:
-        joint = TargetSums(self._dimension, self._scales)
+    def _combined(self, other: Self, sign: int) -> Self:
+        joint = type(self)(self._dimension, self._scales)
         joint._touches = self._touches + sign * other._touches
         joint._total = (self._total + sign * other._total) % MODULUS
         joint._quantities = dict(self._quantities)
@@ -199,46 +191,28 @@ class TargetSums:
             raise InputError("sums of values can be taken only out of sums that contain them")
         return joint
 
-    def to_arrays(self, touches: int) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-        """What a store keeps: arrays by name, and what says of what they are; see `from_arrays`.
+    def to_fields(self, touches: int) -> TargetFields:
+        """What a store keeps of them; touches: all that the memory has.
 
-        touches: all that the memory has; of an axis on which each has a label no second moments are kept.
+        Of an axis on which each of these has a label no second moments are kept: they are those of the materials.
         """
-        pairs = sorted(self._quantities)
-        rows = np.array([self._quantities[pair] for pair in pairs], dtype=np.int64).reshape(-1, 3)
-        arrays, axes = {"quantity-sums": rows}, []
-        for number, axis in enumerate(sorted(self.axes)):
-            own, labels = self.axes[axis].to_arrays()
-            if self.axes[axis].touches == touches:
-                own = {name: array for name, array in own.items() if not name.startswith(SECOND)}
-            arrays |= {f"{AXIS}{number}-{name}": array for name, array in own.items()}
-            axes.append([axis, labels])
-        total = f"{self._total:064x}"
-        return arrays, {"touches": self._touches, "total": total, "sums": [list(pair) for pair in pairs], "axes": axes}
+        pairs, axes = sorted(self._quantities), []
+        for axis, own in sorted(self.axes.items()):
+            kept = own.to_fields()
+            axes.append(AxisFields(axis, replace(kept, codes={}, second={}) if own.touches == touches else kept))
+        sums = np.array([self._quantities[pair] for pair in pairs], dtype=np.int64).reshape(-1, 3)
+        return TargetFields(self._touches, f"{self._total:064x}", pairs, sums, axes)
 
     @classmethod
-    def from_arrays(cls, statistics: Statistics, arrays: Arrays, about: Mapping[str, Any]) -> TargetSums:
-        """The sums that `to_arrays` described; the arrays are taken over.
-
-        statistics: of the materials, of the same moment. about: `touches`: how many have an annotation; `total`: in
-        hexadecimal; `sums`: the quantity and material of each row of `quantity-sums` (n, 3); `axes`: of each its name
-        and its labels, in the order of the arrays named `axis-0-…`.
-        """
+    def of(cls, statistics: Statistics, kept: TargetFields) -> TargetSums:
+        """The sums that these fields were made of; statistics: of the materials, of the same moment."""
         made = cls(statistics.dimension, statistics.scales)
-        made._touches, made._total = about["touches"], int(about["total"], 16)
-        rows = arrays["quantity-sums"].tolist() if about["sums"] else []
-        made._quantities = {(which, name): tuple(row) for (which, name), row in zip(about["sums"], rows, strict=True)}
-        for number, (axis, labels) in enumerate(about["axes"]):
-            made.axes[axis] = Statistics.from_arrays(
-                made._dimension, made._scales, axis_arrays(arrays, number), labels, like=statistics
-            )
+        made._touches, made._total = kept.touches, int(kept.total, 16)
+        made._quantities = {pair: tuple(row) for pair, row in zip(kept.of, kept.sums.tolist(), strict=True)}
+        for axis in kept.axes:
+            own = Statistics.of(made._dimension, made._scales, axis.statistics, statistics)
+            made.axes[axis.name] = own
         return made
-
-
-def axis_arrays(arrays: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """The arrays of an axis, by the names that those of the materials have."""
-    first = f"{AXIS}{number}-"
-    return {name.removeprefix(first): array for name, array in arrays.items() if name.startswith(first)}
 
 
 def _mapping(what: str, given: Any) -> Mapping[Any, Any]:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
-from typing import Generic, TypeVar
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -49,71 +47,93 @@ def require_room(rows: int, more: int) -> None:
 class SecondMoment:
     """A = Σ x xᵀ over rows of codes, as exact int64; the lower triangle is asked for, row after row.
 
-    While there are no more rows than features, the rows themselves are kept (`_Rows`): they say what A is in half the
-    numbers or less, and take a fraction of its bytes on a disk. From then on the triangle is kept (`_Triangle`).
+    While there are no more rows than features, all rows are kept: they take a fraction of the triangle's bytes on a
+    disk. Later rows wait until there are 512 of them, or the triangle is asked for.
 
     Products are formed by BLAS in float64, of 512 rows at a time: products of integers below 2²¹ and their sums below
     2⁵³ are exact there, in any order and with any number of threads. The triangle is never changed in place: whoever
-    has it keeps it as it is, and what is cut short by ctrl-C has changed nothing.
+    has it keeps it as it is.
     """
 
-    def __init__(self, dimension: int, rows: int = 0, kept: _Rows | _Triangle | None = None) -> None:
+    def __init__(self, dimension: int) -> None:
         self.dimension = dimension
-        self.rows = rows
-        self._kept: _Rows | _Triangle = _Rows(dimension) if kept is None else kept
+        self.rows = 0
+        self._codes = np.empty((0, dimension), dtype=np.int32)  # the rows that are kept, with room for more
+        self._kept = 0
+        self._all = True  # whether these are all rows
+        self._packed: IntArray | None = None  # the triangle of all rows but those kept behind the first `_formed`
+        self._formed = 0
 
     @classmethod
-    def of(cls, packed: IntArray | Callable[[], IntArray], rows: int, dimension: int) -> SecondMoment:
-        """A second moment of a given lower triangle, which it takes over, and number of rows.
-
-        packed: or what reads the triangle, called when it is needed, and again where that failed.
-        """
-        return cls(dimension, rows, _Triangle(dimension, packed))
+    def of(cls, packed: IntArray, rows: int, dimension: int) -> SecondMoment:
+        """A second moment of a given lower triangle, which it takes over, and number of rows."""
+        made = cls(dimension)
+        made.rows, made._packed, made._all = rows, packed, False
+        return made
 
     @classmethod
-    def of_codes(cls, codes: Codes | Callable[[], Codes], rows: int, dimension: int) -> SecondMoment:
-        """A second moment of given rows, at most `dimension`, which it takes over; or of what reads them (see `of`)."""
-        return cls(dimension, rows, _Rows(dimension, codes))
+    def of_codes(cls, codes: Codes, dimension: int) -> SecondMoment:
+        """A second moment of given rows, (rows, d), at most d, which it takes over."""
+        made = cls(dimension)
+        made._codes, made.rows, made._kept = codes, len(codes), len(codes)
+        return made
 
     def add(self, codes: Codes) -> None:
         """Add rows of codes, shape (rows, d). Raises CapacityError before anything is added."""
         require_room(self.rows, len(codes))
         for first in range(0, len(codes), BLOCK):
             block = codes[first : first + BLOCK]
-            if isinstance(self._kept, _Rows) and self.rows + len(block) > self.dimension:
-                self._kept = _Triangle(self.dimension, self._kept.packed())
-            self._kept.add(block)
+            self._all = self._all and self.rows + len(block) <= self.dimension
+            if not self._all and self._kept + len(block) > BLOCK:
+                self.packed()
+            last = self._kept + len(block)
+            if last > len(self._codes):
+                longer = np.empty((max(2 * self._kept, last, FIRST), self.dimension), np.int32)
+                longer[: self._kept] = self._codes[: self._kept]
+                self._codes = longer
+            self._codes[self._kept : last] = block
+            self._kept = last
             self.rows += len(block)
 
     def remove(self, codes: Codes) -> None:
         """Take rows out again that were added, shape (rows, d): as if they had never been."""
-        self._kept = self._kept.without(codes)
+        left = _without(self._codes[: self._kept], codes) if self._all else None
+        packed = None
+        if left is None or self._packed is not None:
+            packed = self.packed().copy()
+            _add_products(packed, codes, np.subtract)
+        self._take(packed, left)
         self.rows -= len(codes)
+
+    def _take(self, packed: IntArray | None, codes: Codes | None) -> None:
+        """Keep this triangle, and these rows, all that it is of; None for rows that are not there any more."""
+        self._all = codes is not None
+        self._codes = np.empty((0, self.dimension), dtype=np.int32) if codes is None else codes
+        self._packed, self._kept, self._formed = packed, len(self._codes), 0 if packed is None else len(self._codes)
 
     def packed(self) -> IntArray:
         """The lower triangle of A as it is now, row after row, shape (d·(d+1)/2,): not to be changed."""
-        return self._kept.packed()
+        if self._packed is None or self._formed < self._kept:
+            size = self.dimension * (self.dimension + 1) // 2
+            packed = np.zeros(size, np.int64) if self._packed is None else self._packed.copy()
+            _add_products(packed, self._codes[self._formed : self._kept], np.add)
+            self._take(packed, self._codes[: self._kept] if self._all else None)
+            return packed
+        return self._packed
 
     def codes(self) -> Codes | None:
         """All rows, (rows, d), in an order that does not depend on the one they came in; None where they are not there.
 
         Not to be changed.
         """
-        return self._kept.codes() if isinstance(self._kept, _Rows) else None
+        rows = self._codes[: self._kept]
+        return rows[sorted(range(len(rows)), key=[row.tobytes() for row in rows].__getitem__)] if self._all else None
 
     def copy(self) -> SecondMoment:
-        """One that changes independently; a triangle is of both until it changes."""
-        return SecondMoment(self.dimension, self.rows, self._kept.copy())
-
-    def undo(self) -> Callable[[], None]:
-        """What takes the next `add` back, however much of it was done; it can be called again."""
-        kept, state, rows = self._kept, dict(self._kept.__dict__), self.rows
-
-        def undo() -> None:
-            kept.__dict__.update(state)
-            self._kept, self.rows = kept, rows
-
-        return undo
+        """One that changes independently; the triangle is of both until it changes."""
+        other = copy.copy(self)
+        other._codes = self._codes[: self._kept].copy()
+        return other
 
     def joined(self, other: SecondMoment, sign: int) -> SecondMoment:
         """This one and another; with a sign of −1 this one without the other."""
@@ -121,139 +141,8 @@ class SecondMoment:
         if ours is not None and theirs is not None and rows <= self.dimension:
             both = np.concatenate([ours, theirs]) if sign > 0 else _without(ours, theirs)
             if both is not None:
-                return SecondMoment.of_codes(both, rows, self.dimension)
+                return SecondMoment.of_codes(both, self.dimension)
         return SecondMoment.of(self.packed() + sign * other.packed(), rows, self.dimension)
-
-
-T = TypeVar("T", bound=npt.NDArray[np.integer])
-
-
-class _Late(Generic[T]):
-    """Codes or a triangle, read when they are first needed: once for all copies, of whatever thread.
-
-    What reads them has one place in one file, and two threads would move it.
-    """
-
-    def __init__(self, read: Callable[[], T]) -> None:
-        self._read, self._lock = read, threading.Lock()
-        self._found: T | None = None
-
-    def __call__(self) -> T:
-        with self._lock:
-            if self._found is None:
-                self._found = self._read()
-            return self._found
-
-    def __deepcopy__(self, memo: object) -> _Late[T]:
-        return self
-
-
-class _Rows:
-    """All rows of a second moment, at most as many as features, with room for more; read when they are first needed."""
-
-    def __init__(self, dimension: int, codes: Codes | Callable[[], Codes] | None = None) -> None:
-        self._dimension = dimension
-        self._late = _Late(codes) if callable(codes) else None
-        self._codes = np.empty((0, dimension), dtype=np.int32) if codes is None or callable(codes) else codes
-        self._count = len(self._codes)
-        self._packed: IntArray | None = None
-        self._formed = 0  # of the rows, in the triangle
-
-    def copy(self) -> _Rows:
-        """The same rows, with room of their own."""
-        other = copy.copy(self)
-        other._codes = self._codes.copy()
-        return other
-
-    def add(self, codes: Codes) -> None:
-        """Add rows."""
-        last = self._count + len(codes)
-        self._codes = _with_room(self._codes, self._count, last, self._dimension)
-        self._codes[self._count : last] = codes
-        self._count = last
-
-    def _read(self) -> Codes:
-        """The rows that are there, read where that was left for later."""
-        if self._late is not None:
-            rows = np.concatenate([self._late().astype(np.int32, copy=False), self._codes[: self._count]])
-            self._codes, self._count, self._late = rows, len(rows), None
-        return self._codes[: self._count]
-
-    def packed(self) -> IntArray:
-        """The lower triangle."""
-        rows = self._read()
-        if self._packed is None or self._formed < len(rows):
-            size = self._dimension * (self._dimension + 1) // 2
-            packed = np.zeros(size, np.int64) if self._packed is None else self._packed.copy()
-            _add_products(packed, rows[self._formed :], np.add)
-            self._packed, self._formed = packed, len(rows)
-        return self._packed
-
-    def codes(self) -> Codes:
-        """The rows in the order of their bytes."""
-        rows = self._read()
-        return rows[sorted(range(len(rows)), key=[row.tobytes() for row in rows].__getitem__)]
-
-    def without(self, codes: Codes) -> _Rows | _Triangle:
-        """The same without some rows; of rows that are not all there the sums that are left."""
-        left = _without(self.codes(), codes)
-        if left is not None and self._packed is None:
-            return _Rows(self._dimension, left)
-        packed = self.packed().copy()
-        _add_products(packed, codes, np.subtract)
-        if left is None:
-            return _Triangle(self._dimension, packed)
-        rows = _Rows(self._dimension, left)
-        rows._packed, rows._formed = packed, len(left)
-        return rows
-
-
-class _Triangle:
-    """The lower triangle of a second moment, and a block of at most 512 rows that waits to be added to it."""
-
-    def __init__(self, dimension: int, packed: IntArray | Callable[[], IntArray]) -> None:
-        self._dimension, self._packed = dimension, _Late(packed) if callable(packed) else packed
-        self._waiting = np.empty((0, dimension), dtype=np.int32)
-        self._count = 0  # of rows that wait
-
-    def copy(self) -> _Triangle:
-        """The same triangle, with rows of its own that wait."""
-        other = copy.copy(self)
-        other._waiting = self._waiting.copy()
-        return other
-
-    def add(self, codes: Codes) -> None:
-        """Add at most 512 rows."""
-        if self._count + len(codes) > BLOCK:
-            self.packed()
-        last = self._count + len(codes)
-        self._waiting = _with_room(self._waiting, self._count, last, BLOCK)
-        self._waiting[self._count : last] = codes
-        self._count = last
-
-    def packed(self) -> IntArray:
-        """The lower triangle, with all rows that waited."""
-        packed = self._packed().astype(np.int64, copy=False) if callable(self._packed) else self._packed
-        if self._count:
-            packed = packed.copy()
-            _add_products(packed, self._waiting[: self._count], np.add)
-        self._packed, self._waiting, self._count = packed, self._waiting[:0], 0
-        return packed
-
-    def without(self, codes: Codes) -> _Triangle:
-        """The same without some rows."""
-        packed = self.packed().copy()
-        _add_products(packed, codes, np.subtract)
-        return _Triangle(self._dimension, packed)
-
-
-def _with_room(codes: Codes, count: int, needed: int, most: int) -> Codes:
-    """The first rows, so many, with room for those that are needed: twice as many at once, but no more than `most`."""
-    if len(codes) >= needed:
-        return codes
-    longer = np.empty((min(most, max(2 * count, needed, FIRST)), codes.shape[1]), np.int32)
-    longer[:count] = codes[:count]
-    return longer
 
 
 def _without(rows: Codes, gone: Codes) -> Codes | None:

@@ -9,18 +9,22 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, Annotation
-from scroll_tactile.statistics.grid import mean_code
+from scroll_tactile.statistics.fields import Bytes, Ints, Must, Name, key_rows
+from scroll_tactile.statistics.grid import BITS, mean_code
+from scroll_tactile.statistics.moments import MOST_ROWS
 
-__all__ = ["CAPACITY", "Sample", "SampledTouch", "Stages", "TouchSample", "stage_rows"]
+__all__ = ["CAPACITY", "Sample", "SampleFields", "SampledTouch", "Stages", "TouchFields", "TouchSample", "stage_rows"]
 
 CAPACITY = 256  # touches: a false-alarm rate of 5 % then rests on thirteen of them
+MOST_STAGES = 2**10  # of a touch, and scales that judge at one
+MOST_PAIRS = MOST_STAGES**2
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -97,6 +101,16 @@ class Sample(Generic[T]):
             for key in self._keys[material]:
                 yield material, key, self._items[material, key]
 
+    def items(self) -> Iterator[T]:
+        """The items alone."""
+        return (item for *_, item in self)
+
+    def named(self) -> tuple[list[str], list[Annotation], Bytes]:
+        """The fields of `TouchFields`."""
+        noted = [getattr(item, "annotation", NO_ANNOTATION) for item in self.items()]
+        keys = key_rows([key for _, key, _ in self])
+        return [material for material, *_ in self], noted if any(noted) else [], keys
+
     def holds(self, material: str, key: bytes) -> bool:
         """Whether it holds this stream; if not, the stream can be retracted without a change here."""
         return (material, key) in self._items
@@ -120,21 +134,6 @@ class Sample(Generic[T]):
             del self._items[last, self._keys[last].pop()]
             self._greatest = None
 
-    def undo(self, material: str, key: bytes) -> Callable[[], None]:
-        """What takes the next `add` back, of an item that is wanted; however much was done, and repeatedly."""
-        touched = {material, self._last()[2]} if len(self) >= self.capacity else {material}
-        keys = {name: list(self._keys.get(name, [])) for name in touched}
-        # What falls out is the last of its material.
-        items = {(name, own[-1]): self._items[name, own[-1]] for name, own in keys.items() if own}
-
-        def undo() -> None:
-            self._items.pop((material, key), None)
-            self._items.update(items)
-            self._keys.update(keys)
-            self._greatest = None
-
-        return undo
-
     def update(self, items: Iterable[tuple[str, bytes, T]]) -> None:
         """Add several items (material, key, item), such as another sample."""
         for material, key, item in items:
@@ -154,43 +153,59 @@ class Sample(Generic[T]):
         return self._greatest
 
 
+@dataclass
+class TouchFields:
+    """What a store keeps of any sample of n touches, in the order of materials and keys.
+
+    materials, annotations: of each touch; no annotations where no touch has any. keys: content hashes, (n, 32).
+    """
+
+    materials: Annotated[list[Name], Must("", "n")]
+    annotations: list[Annotation]
+    keys: Annotated[Bytes, Must("uint8", "n 32")]
+
+    def named(self) -> list[tuple[str, bytes, Annotation]]:
+        """The material, the key and the annotation of each touch."""
+        noted = self.annotations or [NO_ANNOTATION] * len(self.materials)
+        return list(zip(self.materials, map(bytes, self.keys), noted, strict=True))
+
+
+@dataclass
+class SampleFields(TouchFields):
+    """What a store keeps of a `TouchSample`, whose touches have p rows in all.
+
+    sizes: how many of the rows are each touch's own, (n,). pairs: see `SampledTouch`, (p, 3). rows: feature by feature,
+    which takes less on the disk, (d, p); they are ordered by stage and scale, and among these by touch.
+    """
+
+    sizes: Annotated[Ints, Must("int64", "n", 1, MOST_PAIRS)]
+    pairs: Annotated[Ints, Must("int64", "p 3", 0, (MOST_STAGES, MOST_STAGES, MOST_ROWS))]
+    rows: Annotated[npt.NDArray[np.int32], Must("int32", "d p", -(2**BITS), 2**BITS)]
+
+
 class TouchSample(Sample[SampledTouch]):
     """At most `capacity` touches of all materials: a function of the set of touches observed."""
 
-    def to_arrays(self) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-        """What a store keeps: arrays by name, and the material of each touch.
-
-        The rows lie feature by feature, those of a stage and a scale together: half the bytes on the disk.
-        """
-        touches = [touch for *_, touch in self]
+    def to_fields(self, dimension: int) -> SampleFields:
+        """What a store keeps of it."""
+        touches = list(self.items())
         pairs = np.concatenate([np.zeros((0, 3), np.int64), *(touch.pairs for touch in touches)])
-        rows = np.concatenate([touch.rows for touch in touches]) if touches else np.zeros((0, 0), np.int32)
-        return {
-            "sample-keys": np.array([list(key) for _, key, _ in self] or [[]], np.uint8)[: len(self)],
-            "sample-sizes": np.array([len(touch.pairs) for touch in touches], dtype=np.int64),
-            "sample-pairs": pairs,
-            "sample-rows": np.ascontiguousarray(rows[_by_scale(pairs)].T),
-        }, [material for material, *_ in self]
+        rows = np.concatenate([np.zeros((0, dimension), np.int32), *(touch.rows for touch in touches)])
+        sizes = np.array([len(touch.pairs) for touch in touches], dtype=np.int64)
+        return SampleFields(*self.named(), sizes, pairs, np.ascontiguousarray(rows[_by_scale(pairs)].T))
 
     @classmethod
-    def from_arrays(
-        cls,
-        arrays: Mapping[str, npt.NDArray[Any]],
-        materials: Sequence[str],
-        annotations: Sequence[Annotation] = (),
-    ) -> TouchSample:
-        """The sample that `to_arrays` described; annotations: of each touch."""
-        sample, noted = cls(), annotations or [NO_ANNOTATION] * len(materials)
-        edges = np.cumsum(arrays["sample-sizes"])[:-1]
-        joined = np.empty(arrays["sample-rows"].shape[::-1], np.int32)
-        joined[_by_scale(arrays["sample-pairs"])] = arrays["sample-rows"].T
-        rows, pairs = np.split(joined, edges), np.split(arrays["sample-pairs"], edges)
-        for i, material in enumerate(materials):
-            touch = SampledTouch(rows[i], pairs[i], noted[i])
-            sample.add(material, arrays["sample-keys"][i].tobytes(), touch)
+    def of(cls, kept: SampleFields) -> TouchSample:
+        """The sample that these fields were made of."""
+        sample, edges = cls(), np.cumsum(kept.sizes)[:-1]
+        joined = np.empty(kept.rows.shape[::-1], np.int32)
+        joined[_by_scale(kept.pairs)] = kept.rows.T
+        rows, pairs = np.split(joined, edges), np.split(kept.pairs, edges)
+        for i, (material, key, annotation) in enumerate(kept.named()):
+            sample.add(material, key, SampledTouch(rows[i], pairs[i], annotation))
         return sample
 
 
-def _by_scale(pairs: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
+def _by_scale(pairs: Ints) -> npt.NDArray[np.intp]:
     """The order in which the rows of a stage and a scale lie together."""
     return np.lexsort((pairs[:, 1], pairs[:, 0]))

@@ -13,14 +13,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from uuid import uuid4
 
+from scroll_tactile_store.encoding import NAME
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, reported
 from scroll_tactile_store.files import dense_size, regular_file, replacing
 from scroll_tactile_store.layout import CHECKPOINTS, CURRENT_FILE, LOG, checkpoint_path, log_path, read_current
 
-__all__ = ["ARCHIVE_BYTES", "is_archive", "unpacked", "write_archive"]
-
 NAMES = re.compile(
-    rf"{CURRENT_FILE}|{LOG}\d{{8,18}}|{CHECKPOINTS}/\d{{8,18}}/(zarr\.json|[\w.-]{{1,100}}/(zarr\.json|c(/\d{{1,18}}){{0,64}}))",
+    rf"{CURRENT_FILE}|{LOG}\d{{8,18}}|{CHECKPOINTS}/\d{{8,18}}/(zarr\.json|{NAME}/(zarr\.json|c(/\d{{1,18}}){{0,64}}))",
     re.ASCII,
 )
 BEFORE_NAME = 30  # bytes of the header before each file, which its name follows

@@ -23,8 +23,6 @@ from scroll_tactile_store.log import Log
 from scroll_tactile_store.rows import Rows
 from scroll_tactile_store.survey import Progress, check_store
 
-__all__ = ["back_up"]
-
 LARGEST_FILE = 2**30  # of a checkpoint
 PART = 2**20  # bytes that are copied at once
 ATTEMPTS = 100  # while a writer commits one checkpoint after another

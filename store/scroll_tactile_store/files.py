@@ -19,30 +19,6 @@ except ImportError:  # Windows has none
 else:
     FULL_SYNC = getattr(fcntl, "F_FULLFSYNC", None)
 
-__all__ = [
-    "CAREFULLY",
-    "copy_regular",
-    "dense_size",
-    "file_size",
-    "is_file",
-    "is_real_folder",
-    "is_there",
-    "new_file",
-    "open_regular",
-    "read_regular",
-    "regular_file",
-    "remove_tree",
-    "replacing",
-    "same_folder",
-    "store_folder",
-    "sync_file",
-    "sync_folder",
-    "sync_open",
-    "sync_tree",
-    "tree_size",
-    "tree_sizes",
-]
-
 # Not through a link, nor waiting for whoever might write into a pipe. Windows has neither.
 CAREFULLY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
@@ -97,14 +73,9 @@ def file_size(path: Path) -> int:
         return 0
 
 
-def tree_sizes(path: Path) -> Iterator[int]:
-    """Yield the bytes of each file below `path`; files may vanish meanwhile."""
-    return (file_size(Path(folder, name)) for folder, _, files in os.walk(path) for name in files)
-
-
 def tree_size(path: Path) -> int:
     """Return the bytes of all files below `path`, 0 when there is none; files may vanish meanwhile."""
-    return sum(tree_sizes(path))
+    return sum(file_size(Path(folder, name)) for folder, _, files in os.walk(path) for name in files)
 
 
 def remove_tree(path: Path) -> None:

@@ -7,21 +7,6 @@ from typing import NamedTuple
 
 from scroll_tactile_store.records import payload_digest
 
-__all__ = [
-    "COMMIT",
-    "FRAME_BYTES",
-    "HEADER",
-    "IDENTITY_BYTES",
-    "LARGEST_PAYLOAD",
-    "MARK",
-    "NO_CHECKSUM",
-    "VERSION",
-    "Frame",
-    "LogPlace",
-    "pack_frame",
-    "read_frame",
-]
-
 # As PNG's: not text, and changed by whatever changes the ends of lines.
 MAGIC, VERSION = b"\x89ARLOG", 1
 MARK = MAGIC + bytes([VERSION]) + b"\n"

@@ -17,30 +17,6 @@ from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
 from scroll_tactile_store.log import Log, refuse
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
 
-__all__ = [
-    "CHECKPOINTS",
-    "CURRENT_FILE",
-    "DAMAGED",
-    "HOLDER_FILE",
-    "LOCK_FILE",
-    "LOG",
-    "PARTIAL",
-    "Current",
-    "NamedCheckpoint",
-    "checkpoint_path",
-    "holds_store",
-    "is_number",
-    "log_numbers",
-    "log_path",
-    "numbers",
-    "other_format",
-    "read_current",
-    "remove_unnamed",
-    "require_safe",
-    "unsafe_entries",
-    "write_current",
-]
-
 FORMAT_VERSION = 3
 OLDER = {
     1: ("0.15 or before", "0.15"),
@@ -136,8 +112,8 @@ class Current:
                 None if known[name] is None else NamedCheckpoint.from_json(known[name])
                 for name in ("newest", "compaction")
             )
-            if compaction is not None and newest is None:
-                raise ValueError("it names a compaction checkpoint and no newest one")
+            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
+                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
             return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, _count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error

@@ -27,8 +27,6 @@ from scroll_tactile_store.log import create_log
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-__all__ = ["WriterLock", "lock_to_write"]
-
 LARGEST_NOTE = 4096  # bytes
 
 WITHOUT_LOCKS = frozenset({errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP})

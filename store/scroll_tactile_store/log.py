@@ -33,8 +33,6 @@ from scroll_tactile_store.framing import (
 )
 from scroll_tactile_store.records import payload_digest
 
-__all__ = ["Damaged", "Log", "create_log", "refuse"]
-
 logger = logging.getLogger(__name__)
 
 # Is called with what is damaged and the frames before it in its batch, which verify. It raises, or the scan goes on

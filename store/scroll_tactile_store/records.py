@@ -13,25 +13,6 @@ import numpy as np
 
 from scroll_tactile_store.exceptions import RecordError
 
-__all__ = [
-    "JSON",
-    "LARGEST_JSON",
-    "LARGEST_NUMBER",
-    "Arrays",
-    "Attributes",
-    "Checkpoint",
-    "Head",
-    "Record",
-    "check_key",
-    "check_text",
-    "check_time",
-    "from_json",
-    "json_digest",
-    "payload_digest",
-    "plain_json",
-    "to_json",
-]
-
 JSON: TypeAlias = "bool | int | float | str | Sequence[JSON] | Mapping[str, JSON] | None"
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 Attributes: TypeAlias = Mapping[str, JSON] | None

@@ -29,8 +29,6 @@ from scroll_tactile_store.records import to_json
 from scroll_tactile_store.rows import ROW, head_without_arrays, read_back
 from scroll_tactile_store.survey import HEADLESS, FoundCheckpoint, Progress, Survey, require_store
 
-__all__ = ["Repair", "repair_store"]
-
 
 @dataclass(frozen=True)
 class Repair:

@@ -15,21 +15,6 @@ from scroll_tactile_store.framing import Frame, LogPlace
 from scroll_tactile_store.log import Log, refuse
 from scroll_tactile_store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json, payload_digest, to_json
 
-__all__ = [
-    "HEAD_BYTES",
-    "ROW",
-    "JournalRow",
-    "Rows",
-    "decode_head",
-    "decode_row",
-    "encode_row",
-    "head_without_arrays",
-    "key_prefix",
-    "read_back",
-    "read_head",
-    "row_sequence",
-]
-
 ROW = 2  # the kind of a frame that holds a record
 
 # sequence, time, bytes of the arrays' payload, whether that follows; lengths of key, kind, label and attributes.
@@ -156,12 +141,15 @@ class Rows:
         self.sizes.append(size)
         self.keys.append(key_prefix(key))
 
-    def catch_up(self, log: Log) -> None:
-        """Take in what was committed since. Raises DamageError, which names the repair."""
+    def catch_up(self, log: Log, last: int = 0) -> None:
+        """Take in what was committed since; `last`: a row that the log has had. Raises DamageError."""
         for frames in log.scan(refuse):
             for frame in frames:
                 if frame.kind == ROW:
                     self._take(log, frame)
+        if self.last < last:
+            what = f"{log.path} ends with row {self.last}, and had row {last}: its end is damaged or was cut off"
+            refuse(DamageError(what, path=log.path), [])
 
     def _take(self, log: Log, frame: Frame) -> None:
         data = log.read(frame.offset, frame.size, first=HEAD_BYTES + 8)

@@ -73,8 +73,6 @@ from scroll_tactile_store.records import (
 from scroll_tactile_store.rows import ROW, Rows, decode_row, encode_row, head_without_arrays, read_back, read_head
 from scroll_tactile_store.survey import Progress
 
-__all__ = ["Store", "StoreState"]
-
 logger = logging.getLogger(__name__)
 
 LAST_SEQUENCE = 2**62  # far beyond what anybody appends
@@ -153,7 +151,7 @@ class Store:
             elif is_file(path):
                 self._folder = undo.enter_context(unpacked(path))
             with reported(path, "opening the store"):
-                self._use(*self._found())
+                self._take_current()
             undo.callback(lambda: self._log.close(trim=mode == "write"))
             if mode == "write":
                 self._remove_unnamed()
@@ -176,61 +174,51 @@ class Store:
 
     # What `CURRENT` names.
 
-    def _use(self, current: Current, log: Log, rows: Rows) -> None:
-        self._current, self._log, self._rows = current, log, rows
-        self.identity: Mapping[str, JSON] = _identity(log)
-
-    def _found(self) -> tuple[Current, Log, Rows]:
-        """Return what `CURRENT` says now, and the log that it names, read from the newest checkpoint's place on."""
+    def _take_current(self) -> None:
+        """Use the log that `CURRENT` names now, read from the newest checkpoint's place on."""
         for _ in range(ATTEMPTS):
             current = read_current(self._folder / CURRENT_FILE)
             path = log_path(self._folder, current.log)
             try:
                 log = Log(path, write=self.mode == "write")
+                break
             except FileNotFoundError as error:
                 # A writer removes a log after another has taken its place.
                 if read_current(self._folder / CURRENT_FILE) == current:
+                    what = f"{path}, which {CURRENT_FILE} names, is not there: put it back from a copy, or repair the"
                     raise DamageError(
-                        f"{path}, which {self._folder / CURRENT_FILE} names, is not there: put it back from a copy, or "
-                        "repair the store (repair_store), which resumes from what verifies",
-                        path=path,
+                        f"{what} store (repair_store), which resumes from what verifies", path=path
                     ) from error
-                continue
-            try:
-                return current, log, self._read(current, log)
-            except BaseException:
-                log.close()
-                raise
-        raise StoreError(f"{self.path} is compacted again and again: open it later")
+        else:
+            raise StoreError(f"{self.path} is compacted again and again: open it later")
+        try:
+            rows, identity = self._read(current, log), from_json(log.header.decode())
+        except BaseException as error:
+            log.close()
+            if isinstance(error, ValueError):
+                what = f"the identity in {log.path} was never written so: {error}"
+                raise DamageError(what, path=log.path) from error
+            raise
+        self._current, self._log, self._rows = current, log, rows
+        self.identity: Mapping[str, JSON] = identity
 
     def _read(self, current: Current, log: Log) -> Rows:
         if log.identity != current.log_identity:
             raise DamageError(f"{log.path} is the log of another store, or of another time", path=log.path)
-        _identity(log)
-        named, rows = current.newest, Rows(log.place)
-        if named is not None:
+        rows = Rows(log.place)
+        if (named := current.newest) is not None:
             if not log.has_place(named.place):
                 what = f"{log.path} holds no batch that ends where checkpoint {named.number} says"
                 raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
             log.place = named.place
             rows = Rows(named.place, named.last_sequence)
         rows.whole |= log.place == log.first
-        self._catch_up(current, log, rows)
+        rows.catch_up(log, current.last)
         if self.mode == "write":
             log.prepare()
             # `CURRENT` may name this log in the system's memory alone: a power cut would take what follows.
             sync_folder(self._folder)
         return rows
-
-    @staticmethod
-    def _catch_up(current: Current, log: Log, rows: Rows) -> None:
-        """Take in what was committed since."""
-        rows.catch_up(log)
-        if rows.last < current.last:
-            what = (
-                f"{log.path} ends with row {rows.last}, and had row {current.last}: its end is damaged or was cut off"
-            )
-            raise DamageError(f"{what}: repair the store (repair_store)", path=log.path)
 
     @contextmanager
     def _using(self, doing: str) -> Iterator[None]:
@@ -257,8 +245,8 @@ class Store:
             return self._current
 
     def _renew(self) -> None:
-        before, found = self._log, self._found()
-        self._use(*found)
+        before = self._log
+        self._take_current()
         before.close()
 
     def _look(self) -> None:
@@ -266,7 +254,7 @@ class Store:
         current = read_current(self._folder / CURRENT_FILE)
         if (current.log, current.log_identity) == (self._current.log, self._current.log_identity):
             if self._log.has_place(self._log.place):
-                self._catch_up(current, self._log, self._rows)
+                self._rows.catch_up(self._log, current.last)
                 self._current = current
                 return
             logger.info("%s: its writer took a batch back", self._log.path)
@@ -283,11 +271,6 @@ class Store:
                 self._look()
             newest = self._current.newest
             return StoreState(self._rows.last, None if newest is None else newest.number, self._current.compacted)
-
-    @property
-    def is_packed(self) -> bool:
-        """Whether it is a packed store, which is only read."""
-        return self._folder != self.path
 
     @property
     def last(self) -> int:
@@ -332,9 +315,7 @@ class Store:
             if self._batching and self._failed:
                 raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
             if (sequence := self._rows.last + 1) > LAST_SEQUENCE:
-                raise DamageError(
-                    f"{self.path} has a row, or a checkpoint, of number {sequence - 1}", path=self._log.path
-                )
+                raise DamageError(f"{self._log.path} has a row of number {sequence - 1}", path=self._log.path)
             data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
             try:
                 frame = self._log.stage(ROW, data)
@@ -422,12 +403,9 @@ class Store:
         self._check_open()
         with self._using("reading a row"):
             last = self._rows.last
-            if isinstance(sequence, bool) or not isinstance(sequence, int) or not 1 <= sequence <= last:
+            if type(sequence) is not int or not 1 <= sequence <= last:
                 raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
-            index = self._index(sequence - 1, sequence)
-            if index == len(self._rows) or self._rows.sequences[index] != sequence:
-                raise self._given_up(sequence)  # a repair left it out
-            return cast(Record, self._row(index, arrays=True))
+            return cast(Record, self._row(sequence, arrays=True))
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -450,7 +428,7 @@ class Store:
             sequences = self._rows.with_key(key)
         for sequence in sequences:
             with self._using("reading a row"):
-                head = self._row(self._index(sequence - 1, sequence), arrays=False)
+                head = self._row(sequence, arrays=False)
             if head.key == key:
                 yield head
 
@@ -461,10 +439,9 @@ class Store:
         def rows(after: int) -> Iterator[Head]:
             while after < last:
                 with self._using(f"reading rows behind {after}"):
-                    if (index := self._index(after, last)) == len(self._rows):
+                    if (after := self._next_row(after, last)) > last:
                         return  # those that are left gave up their arrays, and a repair left them out
-                    head = self._row(index, arrays=arrays)
-                after = head.sequence
+                    head = self._row(after, arrays=arrays)
                 yield head
 
         return rows(after)
@@ -495,8 +472,8 @@ class Store:
         rows.cut(place)
         return rows
 
-    def _index(self, after: int, last: int) -> int:
-        """Return the index of the first row behind `after`. Raises DamageError where one up to `last` is missing."""
+    def _next_row(self, after: int, last: int) -> int:
+        """Return the first row behind `after`, or one behind `last`. Raises DamageError where one is missing."""
         index = self._find(after)
         found = self._rows.sequences[index] if index < len(self._rows) else last + 1
         # Of compacted ones a repair may have left some out.
@@ -504,12 +481,14 @@ class Store:
         if first <= through:
             missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
             raise self._damage(f"{missing} from", through)
-        return index
+        return found
 
-    def _row(self, index: int, *, arrays: bool) -> Head:
+    def _row(self, sequence: int, *, arrays: bool) -> Head:
         """Return a row, verified; arrays: as a record. Raises DamageError, and CompactedError for compacted arrays."""
-        rows = self._rows
-        sequence, offset, size = rows.sequences[index], rows.offsets[index], rows.sizes[index]
+        if self._next_row(sequence - 1, sequence) != sequence:
+            raise self._given_up(sequence)  # a repair left it out
+        index = self._rows.find(sequence - 1)
+        offset, size = self._rows.offsets[index], self._rows.sizes[index]
         try:
             if not arrays:
                 head, payload = read_head(self._log, offset, size), None
@@ -786,7 +765,7 @@ class Store:
         rows = self._rows
         for index, sequence in enumerate(rows.sequences):
             if sequence <= last_sequence:
-                yield head_without_arrays(self._row(index, arrays=False))
+                yield head_without_arrays(self._row(sequence, arrays=False))
                 continue
             try:
                 yield self._log.read(rows.offsets[index], rows.sizes[index])
@@ -844,11 +823,3 @@ class Store:
             # Logged already, and it says less than what went wrong inside.
             if error is None:
                 raise
-
-
-def _identity(log: Log) -> dict[str, JSON]:
-    """Return what the store of a log is for."""
-    try:
-        return from_json(log.header.decode())
-    except ValueError as error:
-        raise DamageError(f"the identity in {log.path} was never written so: {error}", path=log.path) from error

@@ -35,8 +35,6 @@ from scroll_tactile_store.log import BEGIN, Log
 from scroll_tactile_store.records import JSON, Head, from_json
 from scroll_tactile_store.rows import ROW, decode_row, read_head, row_sequence
 
-__all__ = ["FoundCheckpoint", "Problem", "Progress", "Survey", "check_store", "require_store"]
-
 # Called with what is being done, how many of it are done, and how many there are.
 Progress = Callable[[str, int, int], object]
 REPORT_EVERY = 256  # batches

@@ -17,15 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scroll_tactile_store import check_store
+from scroll_tactile_store import Record, check_store
 from touches import PAD, SETTINGS, SMALL, SmallSample, stream
 
 import scroll_tactile.memory.state
 from faults.model import Operation, Pairs, State, Touch
 from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
+from scroll_tactile.memory.touch_rows import annotated
 from scroll_tactile.persistence.merge import MergeRules
 from scroll_tactile.statistics.annotations import Annotation
+from scroll_tactile.statistics.fields import encode
 
 FORCE = Quantity(name="force", unit="N", low=0, high=1, resolution=0.01)
 VALUED = 5  # the seed of the touches that have a value
@@ -106,8 +108,9 @@ def fed(pairs: Pairs, embedding: str = "own", **more: Any) -> TactileLearner:
 def _count_once_more(learner: TactileLearner, material: str, touch: Touch) -> None:
     stream, memory = learner.stream(KIT.stream(touch)), learner.memory
     annotation = Annotation.of(learner.quantities, *KIT.noted(touch))
-    learned = learner._predictor.extractor.learned(stream)
-    memory.add(material, stream.key, *learned, memory.sequence, None, None, annotation)
+    columns, codes = learner._predictor.extractor.learned(stream)
+    attributes = {"columns": columns} | annotated(annotation)
+    memory.add(Record(memory.sequence, "observe", material, stream.key, 0.0, attributes, 0, arrays={}), codes)
 
 
 def perform(learner: TactileLearner, operation: Operation, home: Path) -> Any:
@@ -176,8 +179,8 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
         pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.annotation)).encode())
-    arrays, materials = ({}, None) if memory.kept is None else memory.kept.to_arrays()
-    kept = hashlib.sha256(repr((materials, [touch.annotation for *_, touch in memory.kept or ()])).encode())
+    arrays, told = ({}, None) if memory.kept is None else encode(memory.kept.to_fields())
+    kept = hashlib.sha256(repr(told).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())
     return {"digest": learner.digest(), "pool": pool.hexdigest(), "kept": kept.hexdigest()}

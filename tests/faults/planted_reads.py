@@ -165,9 +165,9 @@ def _retracted_rows_too(_: Any, heads: Any) -> Any:
     return [head for head in heads if head.kind in (OBSERVE, MERGE, MEMBER)]
 
 
-@bug("a shared touch is counted twice", merge, "_already_there")
+@bug("a shared touch is counted twice", merge.Merge, "_there")
 def _nothing_there(*_: Any) -> Any:
-    return {}, []
+    return set(), []
 
 
 @bug("a packed memory is counted twice", merge, "sums_without")
@@ -175,7 +175,7 @@ def _nothing_left_out(sums: Any, source: Any, newest: Any, memory: Any, left_out
     return sums(source, newest, memory, set())
 
 
-@bug("a description is lost in a merge", merge, "_descriptions")
+@bug("a description is lost in a merge", merge.Merge, "_chosen_descriptions")
 def _all_but_the_first(described: Any, *given: Any) -> Any:
     return dict(list(described(*given).items())[1:])
 

@@ -11,7 +11,7 @@ import numpy as np
 from touches import SmallSample
 
 import scroll_tactile.memory.state
-import scroll_tactile.persistence.open_memory
+import scroll_tactile.persistence.ledger
 from faults import learners, simulation_disk
 from faults.learners import KIT
 from faults.model import LISTED, State
@@ -62,7 +62,7 @@ def prepare() -> None:
     KIT.embeddings = {name: Tiny(name) for name in ("own", "other")}
     KIT.settings = {"sensor": PAD, "exemplars": 1, "kept_touches": 3, "embedding": KIT.embeddings["own"]}
     scroll_tactile.memory.state.TouchSample = SmallSample  # type: ignore[misc]
-    scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY = CHECKPOINT_EVERY
+    scroll_tactile.persistence.ledger.CHECKPOINT_EVERY = CHECKPOINT_EVERY
     worked, known = FeatureExtractor.codes, dict[Any, Any]()
 
     def codes(self: FeatureExtractor, image: Any) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 
 from scroll_tactile_store import StoreError
 
-import scroll_tactile.persistence.open_memory
+import scroll_tactile.persistence.ledger
 from faults.common import progress
 from faults.learners import opened, perform, seen, settle, unsound_copies
 from faults.model import Operation, State
@@ -22,7 +22,7 @@ SUCCESS = "success"
 
 def checkpoints_every(rows: int) -> None:
     """From here on, a memory in this process writes a checkpoint behind its back every so many rows."""
-    scroll_tactile.persistence.open_memory.CHECKPOINT_EVERY = rows
+    scroll_tactile.persistence.ledger.CHECKPOINT_EVERY = rows
 
 
 def copied(path: Path, to: Path) -> None:

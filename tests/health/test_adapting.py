@@ -19,9 +19,9 @@ from scroll_tactile import Adaptation, Kernels, Scene, Sensor, TactileLearner, e
 from scroll_tactile.clients.learning.fleet import learn
 from scroll_tactile.clients.report import memory_page
 from scroll_tactile.health.channel_numbers import channel_numbers, from_text
+from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, validate
-from scroll_tactile.validation.gate import check_memory
 
 PAD = Sensor(name="pad", channels=8, rate=50.0, low=0.0, high=1000.0, unit="counts", duration=1.0)
 SCENE = Scene(sensor=PAD, seed=3)
@@ -425,7 +425,7 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
             learner.adapt(five(lambda stream: stream.readings))  # though it would be left as it is
         with pytest.raises(ReadOnlyError):
             learner.retract(done)
-    with pytest.raises(errors.InputError, match="without a path"):
+    with pytest.raises(errors.UnknownMaterialError):
         TactileLearner(sensor=PAD).adapt(pairs)
     with TactileLearner.open(tmp_path / "new", sensor=PAD, **HOW) as learner:
         for name in NAMES:

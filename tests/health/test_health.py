@@ -220,18 +220,16 @@ def test_another_robots_touches_are_a_stream_of_their_own(memory: Path, tmp_path
 
 
 def test_what_cannot_be_told_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(errors.InputError, match="without a path"):
-        TactileLearner(sensor=PAD).health()
-    assert not TactileLearner(sensor=PAD).has_health
-    with TactileLearner.open(tmp_path / "memory", sensor=PAD) as learner:
-        assert learner.has_health and learner.health() == Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
-        for wrong in ({"bound": 0}, {"bound": "1"}, {"after": -1}, {"until": True}):
-            with pytest.raises(errors.InputError):
-                learner.health(**wrong)
-        with pytest.raises(errors.InputError, match="three readings"):
-            learner.sense(touch(NAMES[0], 0).readings[:2])
-        with pytest.raises(errors.InputError, match="source"):
-            learner.health(source=5)  # type: ignore[arg-type]
+    for made in (TactileLearner(sensor=PAD), TactileLearner.open(tmp_path / "memory", sensor=PAD)):
+        with made as learner:
+            assert learner.has_health and learner.health() == Health(None, None, (), "", 1.0, 0.01, 0, None, (), ())
+            for wrong in ({"bound": 0}, {"bound": "1"}, {"after": -1}, {"until": True}):
+                with pytest.raises(errors.InputError):
+                    learner.health(**wrong)
+            with pytest.raises(errors.InputError, match="three readings"):
+                learner.sense(touch(NAMES[0], 0).readings[:2])
+            with pytest.raises(errors.InputError, match="source"):
+                learner.health(source=5)  # type: ignore[arg-type]
     wide = Sensor(name="wide", channels=300, rate=50.0, low=0.0, high=1.0, unit="V", duration=1.0)
     for name, sensor, what in (("camera", sensors.GELSIGHT, "has pixels"), ("wide", wide, "has 300")):
         made = TactileLearner.open(tmp_path / name, sensor=sensor, embedding=Kernels(dimension=64))

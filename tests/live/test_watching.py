@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scroll_tactile_store import StoreError
 
-from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner, errors
+from scroll_tactile import Health, Kernels, Scene, Sensor, TactileLearner
 from scroll_tactile.live.answers import LiveTouch
 from scroll_tactile.live.session import HealthNotes
 from scroll_tactile.results import Prediction
@@ -109,8 +109,6 @@ def test_a_damaged_row_is_warned_of_once_and_ends_no_session(memory: Path, monke
             notes.take(ended(SCENE.touch(NAMES[0], 93), None, known=False, rest=rest()))
         assert warned == ["the health of the sensor cannot be told: row 7 is damaged"]
         assert rows().touches == before + 2
-    with pytest.raises(errors.InputError, match="without a path"):
-        HealthNotes(TactileLearner(sensor=PAD), None, pytest.fail)
 
 
 def test_a_session_calls_back(memory: Path) -> None:
@@ -134,5 +132,3 @@ def test_a_session_calls_back(memory: Path) -> None:
                 session.push(SCENE.touch(NAMES[0], 80).readings)
                 session.end()
             assert told == [learner.health()]  # once a session, also what was seen before it
-    with pytest.raises(errors.InputError, match="without a path"):
-        TactileLearner(sensor=PAD).live(changed=told.append)

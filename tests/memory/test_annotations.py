@@ -123,7 +123,8 @@ def test_where_there_are_none_a_memory_is_the_one_that_it_was(tmp_path):
 def test_an_axis_that_every_touch_has_keeps_no_second_moments_of_its_own(tmp_path):
     def own():
         with Store.open(tmp_path / "m", mode="read") as store:
-            return [name for name in store.latest().arrays if name.startswith(("axis-0-second", "axis-0-places"))]
+            moments = tuple(f"targets-axes-0-statistics-{what}" for what in ("second", "codes"))
+            return [name for name in store.latest().arrays if name.startswith(moments)]
 
     with opened(tmp_path / "m") as learner:
         feel(learner, [(pair, {}, {"slip": pair[0]}) for pair in OBSERVED])

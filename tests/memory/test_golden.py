@@ -21,9 +21,9 @@ from scroll_tactile_store import Store, VersionError, check_store, repair_store
 from scroll_tactile_store.layout import read_current, write_current
 
 from scroll_tactile import Kernels, Quantity, Sensor, TactileLearner
+from scroll_tactile.memory.gate import check_memory
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
-from scroll_tactile.validation.gate import check_memory
 
 GOLDEN = Path(__file__).parents[1] / "data" / "format-3.zip"
 EXPECTED = GOLDEN.with_suffix(".json")
@@ -150,7 +150,7 @@ def test_every_kind_of_row_and_checkpoint_is_in_it(golden):
         assert {head.kind for head in held.heads()} == kinds
         assert 0 < held.compacted < held.latest().last_sequence < held.last
         assert {"sample", "kept", "exemplars", "descriptions", "tuned", "targets"} <= set(held.latest().attributes)
-        assert len(held.compaction().arrays["exemplar-readings"])
+        assert len(held.compaction().arrays["exemplars-held-readings"])
 
 
 @pytest.mark.parametrize("how", [opened, TactileLearner.open])

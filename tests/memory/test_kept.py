@@ -10,10 +10,11 @@ from touches import OBSERVED, PAD, Windowed, fed, filled, held, kept_of, require
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.state import KeptTouches
+from scroll_tactile.memory.state import KeptFields, KeptTouches
 from scroll_tactile.recipe import default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT
 from scroll_tactile.signals.levels import levels_of
+from scroll_tactile.statistics.fields import decode, encode
 
 FEW = 5
 SPARE = [("d", (40 + i, 60)) for i in range(3)]
@@ -44,12 +45,13 @@ def test_they_are_a_function_of_the_set_and_come_back_from_their_arrays(touches,
     first = kept(touches)
     shuffled = [*touches, *touches[:3]]
     rng.shuffle(shuffled)
-    arrays, materials = first.to_arrays()
+    arrays, told = encode(first.to_fields())
+    materials = told["materials"]
     for other in (kept(shuffled), KeptTouches(PAD, capacity)):
         if not len(other):
-            other.fill(arrays, materials)
-        again, names = other.to_arrays()
-        assert names == materials
+            other.fill(decode(KeptFields, arrays, told, {}))
+        again, names = encode(other.to_fields())
+        assert names == told
         assert {name: array.tobytes() for name, array in again.items()} == {
             name: array.tobytes() for name, array in arrays.items()
         }
@@ -76,7 +78,7 @@ def test_a_compacted_one_that_kept_others_is_refused_and_as_it_is_taken_in(tmp_p
         many = other.settings.kept_touches
         other.close()
         before = held(ours)
-        with pytest.raises(MismatchError, match=rf"compacted and keeps {many} touches.*keeps {FEW}"):
+        with pytest.raises(MismatchError, match=rf"compacted and keeps kept_touches {many}; .* keeps {FEW}"):
             ours.merge(tmp_path / "other")
         assert held(ours) == before
 

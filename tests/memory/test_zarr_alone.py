@@ -34,16 +34,18 @@ def test_all_arrays_are_numbers_and_nothing_else_is_needed(made):
 def test_the_statistics_are_the_learners(made):
     learner, group, _ = made
     statistics, told = learner.memory.statistics, group.attrs["attributes"]
-    assert dict(zip(told["materials"], group["observations"][...].tolist(), strict=True)) == learner.materials
+    names = told["statistics"]["materials"]
+    assert dict(zip(names, group["statistics-observations"][...].tolist(), strict=True)) == learner.materials
     for scale in statistics.scales:
-        counts = dict(zip(told["materials"], group[f"rows-{scale}"][...].tolist(), strict=True))
+        counts = dict(zip(names, group[f"statistics-rows-{scale}"][...].tolist(), strict=True))
         assert counts == dict(zip("abc", statistics.counts(scale, list("abc")).tolist(), strict=True))
-        assert group[f"sums-{scale}"].dtype == np.int64
-        assert group[f"sums-{scale}"][...].tolist() == statistics.sums(scale, told["materials"]).tolist()
-        if f"second-{scale}" in group:
-            packed = group[f"second-{scale}"][...]
+        sums = group[f"statistics-sums-{scale}"]
+        assert sums.dtype == np.int64
+        assert sums[...].tolist() == statistics.sums(scale, names).tolist()
+        if f"statistics-second-{scale}" in group:
+            packed = group[f"statistics-second-{scale}"][...]
         else:
-            rows = group[f"values-{scale}"][...][group[f"places-{scale}"][...]].astype(np.int64)
+            rows = group[f"statistics-codes-{scale}"][...].astype(np.int64)
             packed = (rows @ rows.T)[np.tril_indices(len(rows))]
         assert packed.tolist() == statistics.second(scale).packed().tolist()
 
@@ -51,7 +53,7 @@ def test_the_statistics_are_the_learners(made):
 def test_the_sample_is_the_learners(made):
     learner, group, _ = made
     own = list(learner.memory.sample)
-    assert group.attrs["attributes"]["sample"] == [material for material, *_ in own]
+    assert group.attrs["attributes"]["sample"]["materials"] == [material for material, *_ in own]
     assert keys(group, "sample-keys") == [key for _, key, _ in own]
     pairs = group["sample-pairs"][...]
     assert pairs.tolist() == np.concatenate([touch.pairs for *_, touch in own]).tolist()
@@ -73,9 +75,9 @@ def test_the_kept_touches_are_the_learners(made):
 
 def test_the_exemplars_are_readings_in_the_sensors_unit(made):
     _, _, group = made
-    readings = group["exemplar-readings"]
+    readings = group["exemplars-held-readings"]
     assert readings.dtype == np.float32
-    touches = np.split(readings[...], np.cumsum(group["exemplar-lengths"][...])[:-1])
+    touches = np.split(readings[...], np.cumsum(group["exemplars-held-lengths"][...])[:-1])
     materials = group.attrs["attributes"]["exemplars"]["materials"]
     compacted = [(name, np.clip(stream(touch), 0, 1).astype(np.float32)) for name, touch in OBSERVED[:-KEPT]]
     assert len(touches) == len(compacted)

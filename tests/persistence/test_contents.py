@@ -11,7 +11,7 @@ from touches import SETTINGS, fed, filled, held, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.clients.learning.metrics import observe_all
-from scroll_tactile.errors import AnnotationError
+from scroll_tactile.errors import AnnotationError, ObservationError
 from scroll_tactile.quantities import Quantity
 
 OBSERVED = [("abc"[i % 3], (i, 60)) for i in range(12)]  # a content each
@@ -43,20 +43,23 @@ class TestOneContent:
         assert learner.names_of(stream((0, 60))) == ["a", "b"]
         assert learner.observe("b", stream((0, 60))).repeated and learner.observe("a", stream((0, 60))).repeated
 
-    def test_a_snapshot_of_a_closed_memory_says_that_it_does_not_know_what_is_there(self, tmp_path):
-        filled(tmp_path / "m", OBSERVED, exemplars=0)[0].close()
-        learner = TactileLearner.open(tmp_path / "m")
+    @pytest.mark.parametrize("copied", [copy.deepcopy, lambda learner: pickle.loads(pickle.dumps(learner))])
+    def test_a_snapshot_has_what_is_there_compacted(self, learner, copied):
+        before = held(learner)
+        other = copied(copied(learner))
+        assert held(other) == before and other.observe(*given(OBSERVED[0])).repeated
+        assert {row.state for row in other.observations()} == {"compacted"}
+        later = other.observe("a", stream((77, 60)))
+        with pytest.raises(ObservationError, match="rows 1 to 12 were compacted"):
+            other.retract(1)
+        other.retract(later)
+        assert held(other) == before == held(learner)
+
+    def test_of_a_closed_folder_there_is_no_snapshot(self, tmp_path):
+        learner, _ = filled(tmp_path / "m", OBSERVED, exemplars=0)
         learner.close()
-        for other in (pickle.loads(pickle.dumps(learner)), copy.deepcopy(copy.deepcopy(learner))):
-            assert other.digest() == learner.digest()
-            for call in ((other.names_of,), (other.observe, "a")):
-                with pytest.raises(StoreClosedError, match="snapshot of a memory that was closed"):
-                    call[0](*call[1:], stream((0, 60)))
-            assert other.digest() == learner.digest()
-        with TactileLearner.open(tmp_path / "m") as again:  # as the error says
-            assert again.observe(*given(OBSERVED[0])).repeated
-            other = copy.deepcopy(again)
-        assert other.observe(*given(OBSERVED[0])).repeated
+        with pytest.raises(StoreClosedError):
+            copy.deepcopy(learner)
 
     def test_a_repeated_receipt_equals_the_first(self, learner):
         readings = stream((90, 60))  # some are outside the range
@@ -152,20 +155,20 @@ def test_a_touch_that_a_pass_or_a_merge_brings_twice_is_one(tmp_path):
         assert held(learner) == held(fed(OBSERVED[:1]))
 
 
-class TestInMemory:
-    def test_one_that_is_cut_short_leaves_no_trace(self, monkeypatch):
-        learner = fed(OBSERVED)
-        before = held(learner)
+@pytest.mark.parametrize(("at", "cut"), [("_changed", OBSERVED), ("store.append", OBSERVED[:-1])])
+def test_one_that_is_cut_short_is_whole_or_not_there(learner, monkeypatch, at, cut):
+    learner.retract(12)
 
-        def cut(*_):
-            raise KeyboardInterrupt
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
 
-        monkeypatch.setattr(learner._ledger, "_changed", cut)
+    with monkeypatch.context() as patched:
+        patched.setattr(f"{__name__}.HERE", learner._ledger, raising=False)
+        patched.setattr(f"{__name__}.HERE.{at}", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            learner.observe("a", stream((90, 60)))
-        monkeypatch.undo()
-        assert held(learner) == before
-        assert not learner.observe("a", stream((90, 60))).repeated
+            learner.observe(*given(OBSERVED[-1]))
+    assert held(learner) == held(fed(cut))
+    assert learner.observe(*given(OBSERVED[-1])).repeated == (cut is OBSERVED)
 
 
 def given(pair):

@@ -22,7 +22,7 @@ from touches import OBSERVED, SETTINGS, fed, filled, held, require_same, stream
 
 from scroll_tactile import TactileLearner
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.validation.gate import MemoryStore, check_memory
+from scroll_tactile.memory.gate import MemoryStore, check_memory
 
 
 def packed(folder, observed, name="p", described=(), pack=None, **settings):
@@ -261,7 +261,14 @@ def in_its_place(make):
     return replace
 
 
-NAMES = ["../outside", "checkpoints/../../outside", "/tmp/outside", "C:\\outside", "checkpoints\\00000001\\zarr.json"]
+NAMES = [
+    "../outside",
+    "checkpoints/00000001/../zarr.json",
+    "checkpoints/../../outside",
+    "/tmp/outside",
+    "C:\\outside",
+    "checkpoints\\00000001\\zarr.json",
+]
 NAMES += ["current", "Log-00000001", "log-00000001/", "lock", "log-٠٠٠٠٠٠٠١", "x" * 60_000]
 NAMES += ["checkpoints/00000001/a/c/" + "0/" * 70 + "0", "CURRENT", "log-00000001"]
 SHELL = b"#!/bin/sh\n"

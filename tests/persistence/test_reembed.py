@@ -72,7 +72,7 @@ def test_it_is_what_the_other_embedding_would_have_made(path, other):
 def test_a_run_that_was_cut_short_goes_on(path, name, stopped, monkeypatch):
     other = OTHER[name]()
     monkeypatch.setattr(reembed, "ROWS_TOGETHER", 4)
-    monkeypatch.setattr(reembed, "CHECKPOINT_EVERY", 5)
+    monkeypatch.setattr("scroll_tactile.persistence.ledger.CHECKPOINT_EVERY", 5)
     learner, _ = eventful(path)
     steps = []
 

@@ -11,7 +11,7 @@ from touches import OBSERVED, PAD, SMALL, OwnKernels, fed, held, stream, without
 
 from examples.paper.transfer.maps import Maps
 from scroll_tactile import Joined, TactileLearner
-from scroll_tactile.persistence import open_memory
+from scroll_tactile.persistence import ledger
 
 MADE = {
     "kernels": {"embedding": SMALL},
@@ -67,7 +67,7 @@ def test_a_reader_follows_every_change(made, tmp_path, monkeypatch):
     with TactileLearner.open(tmp_path / "m", **made) as writer:
         receipts = observe(writer, OBSERVED[:4])
         with TactileLearner.open(tmp_path / "m", mode="read", **made) as reader:
-            monkeypatch.setattr(reader._ledger, "_load", None)  # row by row, and not from the beginning
+            monkeypatch.setattr(reader._ledger, "_empty", None)  # row by row, and not from the beginning
             for at, (name, touch) in enumerate(OBSERVED[4:], start=4):
                 writer.observe(name, stream(touch))
                 assert reader.refresh()
@@ -80,9 +80,9 @@ def test_a_reader_follows_every_change(made, tmp_path, monkeypatch):
             assert held(reader)[:-1] == fresh(made, without(1))[:-1]
             assert reader.descriptions == {"a": {"wool": 1.0}}
             writer.forget("a")
-            reader._ledger.changed = set()
+            version = reader._ledger.version
             reader.refresh()
-            assert reader._ledger.changed == {"a"}
+            assert reader._ledger.changed_since(version) == {"a"}
             assert held(reader) == fresh(made, [pair for pair in without(1) if pair[0] != "a"])
 
 
@@ -137,7 +137,7 @@ def test_a_memory_that_was_killed_is_inspected_without_its_embedding(made, tmp_p
 
 @pytest.mark.parametrize("made", ["kernels", "maps, no exemplars"], indirect=True)
 def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(open_memory, "CHECKPOINT_EVERY", 5)
+    monkeypatch.setattr(ledger, "CHECKPOINT_EVERY", 5)
     killed = TactileLearner.open(tmp_path / "m", **made)
     observe(killed, OBSERVED)
     killed._ledger.store.close()
@@ -145,4 +145,4 @@ def test_a_checkpoint_is_written_each_so_many_rows(made, tmp_path, monkeypatch):
         assert learner.memory.saved == 10
         assert held(learner) == fresh(made, OBSERVED)
     with Store.open(tmp_path / "m", mode="read") as store:
-        assert not any(name.startswith("exemplar-readings") for name in store.latest().arrays)
+        assert not any(name.startswith("exemplars-held") for name in store.latest().arrays)

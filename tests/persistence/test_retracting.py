@@ -43,12 +43,6 @@ class TestRetract:
                 learner.retract(receipts[0])
             require_same(learner, OBSERVED)
 
-    def test_without_a_journal_nothing_can_be_retracted(self):
-        learner = fed(OBSERVED)
-        for call in (lambda: learner.retract(1), lambda: learner.forget("a"), learner.compact):
-            with pytest.raises(InputError, match="a memory without a path keeps no journal"):
-                call()
-
     def test_a_reader_cannot(self, path):
         learner, receipts = filled(path)
         learner.close()
@@ -166,15 +160,13 @@ class TestMerge:
                 ours.merge(theirs)
             require_same(ours, OBSERVED, embedding=own)
 
-    def test_itself_nothing_and_one_without_a_path_are_refused(self, path, tmp_path):
+    def test_itself_and_nothing_are_refused(self, path, tmp_path):
         ours, _ = filled(path)
         with ours:
             with pytest.raises(MismatchError, match="into itself"):
                 ours.merge(path)
             with pytest.raises(StoreError, match="holds no store"):
                 ours.merge(tmp_path / "none")
-            with pytest.raises(InputError, match="without a path"):
-                ours.merge(fed(OBSERVED))
             require_same(ours, OBSERVED)
 
     def test_cut_off_in_the_middle_it_never_began(self, path, tmp_path):

@@ -55,6 +55,7 @@ class TestSource:
         learner = TactileLearner(**SETTINGS)
         learner.observe("a", stream((0, 60)), source="x.npy")
         assert learner.digest() == fed([("a", (0, 60))]).digest()
+        assert sources(learner) == [(1, "a", "kept", "x.npy")] and learner.forget(source="x.npy") == 1
 
 
 class TestRelabel:
@@ -85,8 +86,6 @@ class TestRelabel:
             learner.compact()
             with pytest.raises(ObservationError, match="were compacted, and their features given up"):
                 learner.relabel(1, "b")
-        with pytest.raises(InputError, match="without a path"):
-            fed(OBSERVED).relabel(1, "b")
 
     @pytest.mark.parametrize("failing", [1, 2])
     def test_it_is_one_change(self, path, monkeypatch, failing):

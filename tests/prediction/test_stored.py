@@ -84,12 +84,13 @@ def test_what_was_asked_for_nothing_keeps_nothing_and_loses_nothing(path, tmp_pa
     assert stored(path) == before
 
 
-def test_it_is_kept_again_though_a_checkpoint_was_written_meanwhile(path):
+def test_it_is_kept_again_though_a_checkpoint_was_written_meanwhile(path, monkeypatch):
     before = stored(path)
     with opened(path, "write") as learner:
         learner.predict(stream("a", 50))
         learner.observe("a", stream("a", 60))
-        learner._ledger.checkpoint_in_background(1)
+        monkeypatch.setattr("scroll_tactile.persistence.ledger.CHECKPOINT_EVERY", 1)
+        learner._ledger.checkpoint_if_due()
     assert stored(path).keys() == before.keys()
 
 

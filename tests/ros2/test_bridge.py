@@ -55,8 +55,6 @@ def test_answers_are_those_of_a_live_session():
 
 
 def test_a_watched_sensor_is_noted_at_rest_and_in_known_touches_that_nobody_learns(tmp_path):
-    with pytest.raises(errors.InputError, match="without a path"):
-        bridge(watch=True)
     with TactileLearner.open(tmp_path / "m", sensor=PAD, embedding=SMALL) as own:
         random = np.random.default_rng(1)
         for material in "abc" * 12:

@@ -1,14 +1,13 @@
-"""Codes: the grid on which features become integers, and their rows as a store keeps them."""
+"""Codes: the grid on which features become integers."""
 
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays
 
-from scroll_tactile.statistics.grid import BITS, rows_of, table_of, to_codes
+from scroll_tactile.statistics.grid import BITS, to_codes
 
 
 @given(st.lists(st.floats(-1, 1), min_size=1), st.sampled_from([1.0, 2.0, 0.5, 3.0, 100.0]))
@@ -38,18 +37,3 @@ def test_features_are_left_as_they_were():
     features.setflags(write=False)
     to_codes(features, 1.0)
     assert features.tolist() == [0.3, 0.7]
-
-
-CODES = st.integers(-(2**BITS), 2**BITS)
-FEW = st.sampled_from([-(2**BITS), -1, 0, 3, 2**BITS])
-
-
-@settings(deadline=None)
-@given(arrays(np.int32, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=CODES | FEW))
-def test_the_rows_come_back_and_each_value_is_there_once(rows):
-    values, places = table_of(rows)
-    assert values.tolist() == sorted(set(rows.ravel().tolist()))
-    assert (values.dtype, places.dtype, places.shape) == (np.int32, np.int32, rows.shape[::-1])
-    again = rows_of(values, places)
-    assert (again.tobytes(), again.shape, again.dtype) == (rows.tobytes(), rows.shape, np.int32)
-    assert again.flags.c_contiguous

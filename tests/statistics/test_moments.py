@@ -1,7 +1,5 @@
 """The second moment and the scatter within classes, against integers and fractions that cannot round."""
 
-import copy
-import time
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
@@ -94,11 +92,7 @@ def test_no_more_rows_than_features_are_kept_and_any_order_of_them_is_the_same(d
         return
     assert kept.tobytes() == added(batch, dimension=8).codes().tobytes()
     assert sorted(kept.tolist()) == sorted(batch.tolist())
-    read = []
-    late = SecondMoment.of_codes(lambda: read.append(1) or kept, len(kept), 8)
-    late.add(batch[:0])
-    assert not read
-    for one in (moment, late):
+    for one in (moment, SecondMoment.of_codes(kept.copy(), 8)):
         one.remove(batch[:gone])
         assert one.codes().tobytes() == added(batch[gone:], dimension=8).codes().tobytes()
         assert one.packed().tolist() == truth(batch[gone:])
@@ -127,22 +121,6 @@ def test_rows_that_were_never_added_leave_the_sums_that_are_left():
     assert moment.rows == 2
     assert moment.codes() is None
     assert moment.packed().tolist() == [x - y for x, y in zip(truth(codes(3, 8, 1)), truth(other), strict=True)]
-
-
-def test_an_addition_is_undone_before_and_after_the_rows_are_given_up():
-    moment, batch = SecondMoment(8), codes(20, 8)
-    for first, last in ((0, 3), (3, 8), (8, 12), (12, 20)):
-        before = None if first > 8 else moment.codes()
-        undo = moment.undo()
-        for _ in range(2):
-            moment.add(batch[first:last])
-            moment.packed()
-            undo()
-            assert moment.rows == first
-            assert (moment.codes() is None) == (before is None)
-            assert moment.packed().tolist() == truth(batch[:first])
-        moment.add(batch[first:last])
-    assert moment.packed().tolist() == truth(batch)
 
 
 def test_a_full_moment_refuses_before_anything_is_added():
@@ -247,28 +225,6 @@ def test_the_scatter_of_more_classes_than_one_block():
     compare([codes(int(size), 3, seed) for seed, size in enumerate(rng.integers(1, 5, size=1100))])
     # At the bound, where the limbs are largest.
     compare([codes(2, 2, seed, EDGE - 3, EDGE) for seed in range(2100)])
-
-
-@pytest.mark.parametrize("kept", ["rows", "triangle"])
-def test_what_is_read_late_is_read_once_for_all_copies_of_whatever_thread(kept):
-    """What reads it has one place in one file: two threads that read at once gave each other's bytes."""
-    batch, inside, most = codes(4, 4), [], []
-
-    def read():
-        inside.append(0)
-        most.append(len(inside))
-        time.sleep(0.01)
-        inside.pop()
-        return batch.copy() if kept == "rows" else np.array(truth(batch))
-
-    moment = SecondMoment.of_codes(read, 4, 4) if kept == "rows" else SecondMoment.of(read, 4, 4)
-    copies = [moment.copy(), moment.copy(), copy.deepcopy(moment)]
-    moment.add(codes(1, 4, 7))
-    moment.remove(batch[:1])
-    with ThreadPoolExecutor() as pool:
-        found = list(pool.map(lambda one: one.packed().tolist(), [*copies, moment]))
-    assert most == [1]
-    assert found == [*[truth(batch)] * 3, truth(np.concatenate([batch[1:], codes(1, 4, 7)]))]
 
 
 @pytest.mark.parametrize("rows", [3, 600])

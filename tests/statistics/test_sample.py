@@ -87,7 +87,7 @@ def test_it_is_filled_again_from_streams_of_which_only_those_that_stay_are_made(
 @given(streams, stream)
 def test_what_a_store_keeps_is_all_of_it(before, after):
     sample = sample_of(before, CAPACITY)
-    again = TouchSample.from_arrays(*sample.to_arrays())
+    again = TouchSample.of(sample.to_fields(DIMENSION))
     for part in (sample, again):
         part.add(*after, touch_of(*after))
     assert content(again) == content(sample) == content(sample_of([*before, after], CAPACITY))

@@ -6,11 +6,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from scroll_tactile.errors import CapacityError, InputError, MismatchError, UnknownMaterialError
+from scroll_tactile.statistics.fields import decode, encode
 from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.moments import MOST_ROWS, SecondMoment
-from scroll_tactile.statistics.statistics import Statistics
+from scroll_tactile.statistics.statistics import Statistics, StatisticsFields
 
 DIMENSION, SCALES = 3, (5, 20)
+SIZES = {"d": DIMENSION, "triangle": 6}
 
 
 def touch(seed):
@@ -28,6 +30,15 @@ def of(touches):
     for one in touches:
         statistics.add(*touch(one))
     return statistics
+
+
+def restored(statistics):
+    """What a store gives back of them."""
+    arrays, told = encode(statistics.to_fields())
+    kept = decode(StatisticsFields, {name: array.copy() for name, array in arrays.items()}, told, SIZES)
+    for field in ("rows", "sums", "codes", "second"):
+        setattr(kept, field, {int(scale): array for scale, array in getattr(kept, field).items()})
+    return Statistics.of(DIMENSION, SCALES, kept)
 
 
 def same(left, right):
@@ -92,16 +103,20 @@ def test_what_was_removed_leaves_no_trace_even_when_more_is_observed(a, b):
 @few
 @given(touches)
 def test_what_a_store_keeps_is_all_of_it(observed):
-    arrays, names = of(observed).to_arrays()
-    assert names == sorted(of(observed).materials)
-    again = Statistics.from_arrays(DIMENSION, SCALES, {name: array.copy() for name, array in arrays.items()}, names)
-    same(again, of(observed))
+    kept = of(observed).to_fields()
+    assert kept.materials == sorted(of(observed).materials)
+    arrays, _ = encode(kept)
     before = {name: array.tobytes() for name, array in arrays.items()}
+    again = restored(of(observed))
+    same(again, of(observed))
     for one in (1, 2, 3, 4, 5):
         again.add(*touch(one))
     same(again, of([*observed, 1, 2, 3, 4, 5]))
     assert {name: array.tobytes() for name, array in arrays.items()} == before
-    assert of(observed).to_arrays()[0].keys() == arrays.keys()
+    rows = {scale: of(observed).second(scale).rows for scale in SCALES}
+    assert {name for name in arrays if name.startswith("codes")} == {
+        f"codes-{scale}" for scale in SCALES if 0 < rows[scale] <= DIMENSION
+    }
 
 
 @pytest.mark.parametrize(
@@ -172,8 +187,7 @@ def test_touches_of_other_lengths_are_distinguished():
     joint = shorter + longer
     assert joint.longest == 50
     assert (joint - longer).longest == 40
-    arrays, names = joint.to_arrays()
-    assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).longest == 50
+    assert restored(joint).longest == 50
     joint.remove("wool", codes, 50)
     same(joint, shorter)
     assert joint.longest == 40
@@ -197,7 +211,7 @@ def filled(rows, scale=20):
     """Statistics that seem to hold so many rows of zeros at a scale already."""
     statistics = of([])
     statistics.add("wool", {5: np.zeros((1, 3), np.int32), scale: np.zeros((1, 3), np.int32)})
-    statistics._rows[scale][0] = rows
+    statistics._own["wool"].rows[scale] = rows
     statistics._seconds[scale] = SecondMoment.of(np.zeros(6, np.int64), rows, DIMENSION)
     return statistics
 
@@ -240,25 +254,19 @@ def test_the_fifth_percentile_is_the_length_that_nineteen_of_twenty_touches_have
     assert a.fifth_percentile_length == least(first)
     assert (a + b).fifth_percentile_length == least(first + second)
     assert ((a + b) - b).fifth_percentile_length == least(first)
-    arrays, names = a.to_arrays()
-    assert Statistics.from_arrays(DIMENSION, SCALES, arrays, names).fifth_percentile_length == least(first)
+    assert restored(a).fifth_percentile_length == least(first)
     for i, length in enumerate(first[:5]):
         a.remove("ab"[i % 2], {5: np.zeros((1, DIMENSION), np.int32)}, length)
     assert a.fifth_percentile_length == least(first[5:])
 
 
-def test_sums_that_need_more_than_32_bits_are_exact_and_can_be_undone():
+def test_sums_that_need_more_than_32_bits_are_exact_and_can_be_taken_out():
     statistics, codes = of([1, 2]), {5: np.full((3000, DIMENSION), 2**BITS, dtype=np.int32)}
     codes[5][:, 0] *= -1
     before = statistics.digest()
-    undo = statistics.undo("z", 0)
     statistics.add("z", codes)
     assert statistics.sums(5, ["z"]).tolist() == [[-3000 << BITS, 3000 << BITS, 3000 << BITS]]
-    arrays, names = statistics.to_arrays()
-    same(Statistics.from_arrays(DIMENSION, SCALES, arrays, names), statistics)
+    same(restored(statistics), statistics)
     same(statistics + of([3]), of([3]) + statistics)
-    undo()
-    assert statistics.digest() == before
-    statistics.add("z", codes)
     statistics.remove("z", codes)
     assert statistics.digest() == before

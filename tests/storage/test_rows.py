@@ -57,7 +57,7 @@ def scans(path, keys, monkeypatch):
     """Whether the log is read for where rows are, which are all found."""
     catch_up, begun = Rows.catch_up, []
     with monkeypatch.context() as patch:
-        patch.setattr(Rows, "catch_up", lambda rows, log: [begun.append(rows.first), catch_up(rows, log)][1])
+        patch.setattr(Rows, "catch_up", lambda rows, *of: [begun.append(rows.first), catch_up(rows, *of)][1])
         require_all(path, keys)
     return 0 in begun
 

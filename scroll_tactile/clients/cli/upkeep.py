@@ -53,10 +53,10 @@ def reembed(
 
     Interrupted, start it again to go on.
     """
+    from scroll_tactile.memory.gate import finish_interrupted
     from scroll_tactile.memory.identity import Identity
     from scroll_tactile.prediction.predictor import reembed_memory
     from scroll_tactile.recipe import default_embedding
-    from scroll_tactile.validation.gate import finish_interrupted
 
     finish_interrupted(folder)
     with Store.open(folder, mode="read") as store:
@@ -258,8 +258,8 @@ def list_observations(
     it, and source.
     """
     from scroll_tactile.clients.learning.plain_export import date_of
+    from scroll_tactile.memory.gate import MemoryStore
     from scroll_tactile.persistence.observations import observations
-    from scroll_tactile.validation.gate import MemoryStore
 
     with MemoryStore.open(folder, mode="read") as store:
         found = observations(store)

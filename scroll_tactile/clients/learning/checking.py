@@ -134,7 +134,7 @@ def _check(folder: Path) -> None:
     # Before the bound: what is imported is no part of the memory.
     import zarr  # noqa: F401
 
-    from scroll_tactile.validation.gate import check_memory
+    from scroll_tactile.memory.gate import check_memory
 
     _limit(folder)
     try:

@@ -15,7 +15,7 @@ from scroll_tactile.clients.learning.metrics import Answers, calibration_error, 
 from scroll_tactile.clients.learning.sources import Refused, SourceOptions, SourceTouch, source_touches
 from scroll_tactile.errors import EmbeddingError, InputError, printable
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.persistence.contents import refusal
+from scroll_tactile.persistence.observations import refusal
 from scroll_tactile.results import Estimate, Prediction
 from scroll_tactile.signals.ranges import all_clipped, range_problem
 

@@ -347,7 +347,7 @@ class MemoryFacts:
 
     @cached_property
     def journal(self) -> list[Observation]:
-        """All observations in order; none of a memory without a path."""
+        """All observations in order."""
         return self.learner.observations()
 
     @cached_property

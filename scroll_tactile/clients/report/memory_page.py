@@ -210,8 +210,7 @@ def _pairs(facts: MemoryFacts) -> list[tuple[str, str, float]]:
 
 def _when(facts: MemoryFacts) -> str:
     if not facts.journal:
-        why = "this memory has no path, so that nobody noted when."
-        return facts.lacks("Touches over time", why if facts.learner.path is None else "its journal names no touches.")
+        return facts.lacks("Touches over time", "its journal names no touches.")
     timed = [row for row in facts.journal if math.isfinite(row.time)]
     times = [row.time for row in timed] or [0.0]
     begin, end = min(times), max(times)

@@ -15,7 +15,7 @@ from scroll_tactile.errors import FieldError, InputError
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.answers import LiveState, LiveTouch
 from scroll_tactile.live.session import HealthNotes
-from scroll_tactile.persistence.contents import refusal
+from scroll_tactile.persistence.observations import refusal
 from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Estimate, Prediction, Receipt

@@ -1,0 +1,83 @@
+"""A memory without a path has the journal of one with a path, in RAM: it does the same, and holds the same bytes."""
+
+import pytest
+from touches import OBSERVED, SETTINGS, SMALL, OwnKernels, fed, filled, held, stream, without
+
+from examples.paper.transfer.maps import Maps
+from scroll_tactile import TactileLearner
+from scroll_tactile.errors import InputError, ObservationError
+
+MADE = {
+    "readings alone": {"embedding": SMALL},
+    "readings alone, of a user's own": {"embedding": OwnKernels(seed=0, dimension=64)},
+    "codes alone": {"embedding": Maps(layout=(2,)), "exemplars": 0, "kept_touches": 0},
+    "both": {"embedding": Maps(layout=(2,))},
+}
+
+
+@pytest.mark.parametrize("made", MADE.values(), ids=MADE)
+def test_what_changes_it_leaves_what_observing_gives(made, tmp_path):
+    learner = fed(OBSERVED[:8], **made)
+    learner.retract(3)
+    assert held(learner) == held(fed([pair for pair in without(2) if pair in OBSERVED[:8]], **made))
+    filled(tmp_path / "m", OBSERVED[6:], **made)[0].close()
+    assert (merged := learner.merge(tmp_path / "m")).observations == 4 and merged.shared == 2
+    assert held(learner) == held(fed(without(2), **made))
+    learner.relabel(2, "a")
+    assert learner.forget("c") == 3
+    expected = [(name if touch != OBSERVED[1][1] else "a", touch) for name, touch in without(2) if name != "c"]
+    assert held(learner) == held(fed(expected, **made))
+    learner.compact(keep=2)
+    with pytest.raises(ObservationError, match="were compacted"):
+        learner.retract(1)
+    last = [row for row in learner.observations() if row.state == "kept"][-1]
+    learner.retract(last.sequence)
+    expected.remove(
+        (last.material, next(touch for _, touch in expected if learner.stream(stream(touch)).key == last.key))
+    )
+    assert held(learner) == held(fed(expected, **made))
+    learner.compact()
+    assert held(learner) == held(fed(expected, **made))
+
+
+def test_it_is_packed_and_merged_as_one_with_a_path(tmp_path):
+    learner = fed(OBSERVED[:6], {"a": {"wool": 1.0}})
+    learner.retract(3)
+    learner.pack(tmp_path / "p")
+    for brought in (learner, tmp_path / "p"):
+        with TactileLearner.open(tmp_path / f"m{brought is learner}", **SETTINGS) as other:
+            assert other.merge(brought).observations == 5
+            assert held(other) == held(learner)
+    ours = fed(OBSERVED[4:])
+    ours.merge(learner)
+    learner.merge(ours)
+    assert ours.digest() == learner.digest() == fed(without(1)).digest()
+    assert learner.merge(learner).shared == 11
+
+
+def test_a_merge_that_is_cut_short_never_began(tmp_path):
+    learner, other = fed(OBSERVED[:4]), fed(OBSERVED[4:])
+    with pytest.raises(KeyboardInterrupt):
+        learner.merge(other, progress=lambda what, done, of: done < 3 or interrupt())
+    assert held(learner) == held(fed(OBSERVED[:4])) and len(learner.observations()) == 4
+
+
+def test_an_f_star_outlives_a_change_that_was_cut_short(monkeypatch):
+    learner = fed(OBSERVED[:6])
+    digest = learner.fine_tune(epochs=1).digest
+    with monkeypatch.context() as patched:
+        patched.setattr(learner._ledger, "_changed", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            learner.retract(receipt := learner.observations()[0].sequence)
+    assert learner.tuned_digest() is None and receipt == 1  # the row was there
+    assert learner.fine_tune(epochs=1).digest != digest
+
+
+def test_what_takes_a_folder_is_refused(tmp_path):
+    for call in (lambda learner: learner.backup(tmp_path / "b"), lambda learner: learner.reembed()):
+        with pytest.raises(InputError, match="without a path"):
+            call(fed(OBSERVED[:1]))
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt

@@ -93,9 +93,10 @@ class Checkout:
         with TemporaryDirectory() as folder:
             file = Path(folder) / "touches.npz"
             _write(file, sensor, train, tests)
-            # -P: beside the checkout's own path nothing of this folder's is to be imported.
+            # -P: beside the checkout's own paths nothing of this folder's is to be imported; its store is its own, too.
             command = [sys.executable, "-P", __file__, str(file)]
-            environment = {**os.environ, "PYTHONPATH": str(self.path)}
+            paths = os.pathsep.join(map(str, [self.path, self.path / "store"]))
+            environment = {**os.environ, "PYTHONPATH": paths}
             with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
                 assert process.stdout is not None
                 try:

@@ -160,17 +160,14 @@ class Store:
     def __repr__(self) -> str:
         return f"<Store {str(self.path)!r}, {'closed' if self._closed else self.mode}>"
 
-    def _check_open(self, after: int = 0, *, write: bool = False) -> None:
+    def _check_open(self, *, write: bool = False) -> None:
         if os.getpid() != self._process:
-            raise StoreClosedError(
-                f"{self.path} was opened by process {self._process}, of which this is a fork: open it here again"
-            )
+            who = f"process {self._process}, of which this is a fork"
+            raise StoreClosedError(f"{self.path} was opened by {who}: open it here again")
         if self._closed:
             raise StoreClosedError(f"the store in {self.path} is closed")
         if write and self.mode != "write":
             raise ReadOnlyError(f'{self.path} was opened with mode="read"')
-        if after < 0:
-            raise RecordError(f"after must not be negative, not {after}")
 
     # What `CURRENT` names.
 
@@ -261,10 +258,7 @@ class Store:
         self._renew()
 
     def state(self, *, look: bool = True) -> StoreState:
-        """Return what the store holds at this moment, which from now on is what a reader reads.
-
-        look: whether a reader looks for what was committed since. Raises DamageError, and another StoreError.
-        """
+        """Return what the store holds now, which from now on is what a reader reads; look: whether it looks anew."""
         self._check_open()
         with self._using("looking for what was committed"):
             if look and self.mode == "read":
@@ -388,10 +382,7 @@ class Store:
         `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those that a
         repair named as lost. Raises DamageError at the first that is damaged or missing.
         """
-        self._check_open(after)
-        for what, text in (("the kind", kind), ("the label", label)):
-            if text is not None:
-                check_text(what, text)
+        self._check_open()
         found = self._rows_behind(after, arrays=False)
         return (head for head in found if kind in (None, head.kind) and label in (None, head.label))
 
@@ -414,7 +405,7 @@ class Store:
         `after` with which to continue behind it. Raises CompactedError where the first are compacted: `compaction` has
         their place, and its `last_sequence` is the `after` to continue with.
         """
-        self._check_open(after)
+        self._check_open()
         if after < self._settled().compacted:
             raise self._given_up(after + 1)
         return cast(Iterator[Record], self._rows_behind(after, arrays=True))
@@ -556,7 +547,7 @@ class Store:
             raise CompactedError(f"{self.path} was compacted again since it was read: read it anew") from error
 
     def _is_named(self, named: NamedCheckpoint) -> bool:
-        """Whether a checkpoint still counts: a writer replaces them and removes them; a reader then looks again."""
+        """Whether a checkpoint still counts; a reader, whose writer replaces and removes them, looks again."""
         self.state()
         return named in self._settled().checkpoints
 
@@ -566,7 +557,7 @@ class Store:
         known = (reader.number, reader.last_sequence, reader.sha256, dict(reader.identity))
         if known != (named.number, named.last_sequence, named.sha256, self.identity):
             raise DamageError(
-                f"{path} is another checkpoint, or another store's, than the one that is named", path=path
+                f"{path} is another checkpoint than the one that is named, or of another store", path=path
             )
         return Checkpoint(named.number, named.last_sequence, reader.attributes, reader.arrays())
 
@@ -602,10 +593,8 @@ class Store:
         first, last = self._settled().compacted, self._rows.last
         if type(last_sequence) is not int or not first <= last_sequence <= last:
             # Recovery could not resume among the compacted rows, which have given up their arrays.
-            raise RecordError(
-                f"last_sequence must be a sequence from {first}, the last that was compacted, to {last}, the last that "
-                f"there is, not {last_sequence!r}"
-            )
+            what = f"last_sequence must be from {first}, the last that was compacted, to {last}, the last that there is"
+            raise RecordError(f"{what}, not {last_sequence!r}")
         if reserved := [name for name in arrays if name.startswith(INDEX)]:
             raise RecordError(f"no array may be called {reserved[0]!r}: {INDEX!r} begins the names of the store's own")
         return CheckpointDraft(check_arrays(arrays), last_sequence, to_json("attributes", attributes))
@@ -667,18 +656,16 @@ class Store:
             self._failure = error
 
     def _wait(self) -> None:
-        """Return when no background commit runs or waits."""
         if self._submitted is not None:
             wait_for([self._submitted])
 
     def _raise_failure(self) -> None:
-        """Raise the failure of an earlier background commit, once, as a StoreError."""
         with self._queue:
             failure, self._failure = self._failure, None
-        if isinstance(failure, StoreError):
-            raise failure
-        if failure is not None:
+        if failure is not None and not isinstance(failure, StoreError):
             raise StoreError(f"a background commit failed: {failure!r}") from failure
+        if failure is not None:
+            raise failure
 
     def _idle(self) -> None:
         self._wait()

@@ -3,16 +3,14 @@
 import errno
 import os
 import shutil
-import struct
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest, writing
 from scroll_tactile_store import DamageError, RecordError, StoreClosedError, StoreError
-from scroll_tactile_store.framing import COMMIT, FRAME_BYTES, LARGEST_PAYLOAD, LogPlace, pack_frame
+from scroll_tactile_store.framing import FRAME_BYTES
 from scroll_tactile_store.log import AHEAD, LARGEST_STAGED, PART, Log, create_log, refuse
-from scroll_tactile_store.records import payload_digest
 
 
 @pytest.fixture(scope="module")
@@ -311,39 +309,10 @@ def test_what_a_frame_cannot_be_is_refused_and_the_batch_goes_on(tmp_path, kind)
         append(log, [b""])
 
 
-# Forged: whoever makes frames makes right checksums.
-
-
-def forged(whole, *frames, at=None):
-    """A log that ends with these frames: (number, batch, kind, size that it says, payload)."""
-    data = whole.read_bytes()[:at]
-    with Log(whole) as log:
-        identity = log.identity
-        for _ in log.scan(refuse):
-            pass
-        before = log.place.previous
-    for number, batch, kind, size, content in frames:
-        raw, _ = pack_frame(identity, LogPlace(0, number, batch, before), kind, content)
-        head = bytearray(raw[:FRAME_BYTES])
-        head[36:40] = struct.pack("<I", size)
-        head[72:] = payload_digest(bytes(head[:72]))
-        data += bytes(head) + content
-        before = bytes(head[72:])
-    return data
-
-
-@pytest.mark.parametrize("size", [11, LARGEST_PAYLOAD, LARGEST_PAYLOAD + 1, 2**32 - 1])
-def test_a_forged_size_is_no_frame(whole, tmp_path, size):
-    path = tmp_path / "log"
-    path.write_bytes(forged(whole, (14, 14, KIND, size, b"0123456789"), END))
-    assert batches_and_damage(path) == (BATCHES, None)
-    with path.open("r+b") as file:
-        file.truncate(2**33)  # and all of it holes
+def test_a_log_of_holes_is_refused(copy):
+    os.truncate(copy, 2**33)
     with pytest.raises(DamageError, match="are on the disk"):
-        Log(path)
-
-
-END = (15, 14, COMMIT, 0, b"")
+        Log(copy)
 
 
 # Full disks, short writes, errors of the disk.

@@ -316,13 +316,6 @@ def spoil_row(path: Path, sequence: int = 0, *, head: bool = False) -> None:
             file.write(bytes([byte]))
 
 
-def row_of(path: Path, sequence: int = 1) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """A row's attributes and arrays, the caller's to change."""
-    with Store.open(path, mode="read") as store:
-        record = store.record(sequence)
-        return dict(record.attributes), dict(record.arrays)
-
-
 def checkpoint_of(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The attributes and arrays of the newest checkpoint, the caller's to change."""
     with Store.open(path, mode="read") as store:
@@ -337,9 +330,3 @@ def put_checkpoint(path: Path, attributes: Any, arrays: Mapping[str, np.ndarray]
             store.compact(arrays, last_sequence=store.last, attributes=attributes)
         else:
             store.commit(arrays, last_sequence=store.last, attributes=attributes)
-
-
-def copied(source: Path, target: Path) -> Path:
-    """A copy of a memory's folder."""
-    shutil.copytree(source, target)
-    return target

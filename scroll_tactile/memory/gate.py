@@ -28,6 +28,7 @@ from scroll_tactile.memory.descriptions import checked
 from scroll_tactile.memory.identity import AbsentEmbedding, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
+    ADAPT,
     CODES,
     DECLARE,
     DESCRIBE,
@@ -48,6 +49,7 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.recipe import Recipe, RecipeRequest
 from scroll_tactile.settings import Settings, require_name
+from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.stream import Stream, fewest_readings
 from scroll_tactile.signals.windows import WindowPlan
 from scroll_tactile.statistics.fields import KEY_BYTES, Must, expect
@@ -111,6 +113,8 @@ class MemoryStore(Store):
                 self._require_size(told.columns, told.nbytes)
             elif head.kind == RETRACT:
                 self._require_spans(told.sequences, head.sequence)
+            elif head.kind == ADAPT and told.retracts is None:
+                Correction.from_text(told.correction, self.recipe.sensor)
             elif head.kind == DECLARE:
                 declared_by(head)
             elif head.kind == DESCRIBE and told.constituents is not None:

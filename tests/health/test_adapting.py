@@ -439,7 +439,7 @@ def test_what_cannot_be_adapted_is_refused_and_changes_nothing(path: Path, tmp_p
         learner.adapt(pairs)
 
 
-@pytest.mark.parametrize("attributes", [{}, {"correction": "AAAA"}, {"retracts": 51}])
+@pytest.mark.parametrize("attributes", [{}, {"correction": "AAAA"}])
 def test_a_forged_row_is_refused(path: Path, attributes: dict[str, Any]) -> None:
     put_row(path, kind="adapt", label="", key=b"", attributes=attributes)
     with pytest.raises(StoreError, match="row 51"):
@@ -448,11 +448,10 @@ def test_a_forged_row_is_refused(path: Path, attributes: dict[str, Any]) -> None
 
 
 def test_a_forged_checkpoint_is_refused(path: Path) -> None:
-    text = Correction.none(8).to_text()
     with TactileLearner.open(path) as learner:
         learner.compact()
     attributes, arrays = checkpoint_of(path)
-    for wrong in (3, [[1, "AAAA"]], [[51, text]]):
+    for wrong in (3, [[1, "AAAA"]]):
         put_checkpoint(path, {**attributes, "corrections": wrong}, arrays, compaction=True)
         with pytest.raises(StoreError, match=r"checkpoint .* is not what is written there"):
             TactileLearner.open(path)

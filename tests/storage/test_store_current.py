@@ -4,7 +4,6 @@ import json
 import shutil
 
 import pytest
-from folder_attacks import CURRENTS, newest_is
 from forging import frames_of, get_current, log_of, set_current, write_log
 from scroll_tactile_store import DamageError, NotAStoreError, Store, VersionError, check_store, repair_store
 from scroll_tactile_store.layout import log_path
@@ -53,9 +52,43 @@ def test_what_is_lost_with_it_is_nothing(either, which, harm):
         commit(opened.compact, LAST + 1)
 
 
-@pytest.mark.parametrize("forge", CURRENTS.values(), ids=CURRENTS)
-def test_what_it_never_said_is_named_and_repaired(plain, forge):
-    forge(plain)
+def newest_is(path, **changes):
+    """What `CURRENT` says of the newest checkpoint, with changes."""
+    return dict(get_current(path)["newest"]) | changes
+
+
+def placed(path, **changes):
+    """The newest checkpoint at another place in the log."""
+    place = dict(zip(("offset", "number", "previous"), newest_is(path)["place"], strict=True)) | changes
+    return {"newest": newest_is(path, place=list(place.values()))}
+
+
+CURRENTS = {
+    "no log": lambda path: {"log": None},
+    "a log in words": lambda path: {"log": ["../../log", get_current(path)["log"][1]]},
+    "a log that is not there": lambda path: {"log": [7, get_current(path)["log"][1]]},
+    "a log of the last number": lambda path: {"log": [2**63 - 1, get_current(path)["log"][1]]},
+    "a log of another identity": lambda path: {"log": [get_current(path)["log"][0], "00" * 8]},
+    "a format below 0": lambda path: {"format": -1},
+    "a text for a checkpoint": lambda path: {"newest": "x"},
+    "a checkpoint without a place": lambda path: {"newest": newest_is(path, place=None)},
+    "a last row in words": lambda path: {"newest": newest_is(path, last_sequence="15")},
+    "a number above any": lambda path: {"newest": newest_is(path, number=2**64)},
+    "a sha256 in capitals": lambda path: {"newest": newest_is(path, sha256="AB" * 32)},
+    "a compaction checkpoint without a newest": lambda path: {"newest": None, "compaction": newest_is(path)},
+    "a compaction checkpoint newer than the newest": lambda path: {
+        "compaction": newest_is(path, last_sequence=get_current(path)["newest"]["last_sequence"] + 1)
+    },
+    "a place in no frame": lambda path: placed(path, offset=newest_is(path)["place"][0] + 1),
+    "a place beyond the end": lambda path: placed(path, offset=2**40),
+    "a place of another number": lambda path: placed(path, number=3),
+    "a place of another checksum": lambda path: placed(path, previous="00" * 16),
+}
+
+
+@pytest.mark.parametrize("changes", CURRENTS.values(), ids=CURRENTS)
+def test_what_it_never_said_is_named_and_repaired(plain, changes):
+    set_current(plain, **changes(plain))
     with pytest.raises(DamageError, match=r"repair the store|another store"):
         Store.open(plain)
     assert damage(plain)

@@ -52,7 +52,6 @@ __all__ = ["LogitsReader", "Predictor", "embed_again", "nothing_known", "reembed
 
 logger = logging.getLogger(__name__)
 
-
 GROWTH = 8  # a fit begins when the memory has changed by one in so many touches
 LEAST = 2  # touches by which it has changed at least
 FEW = 16  # touches: in a memory with no more, a call waits for the fit
@@ -104,7 +103,7 @@ class Predictor:
     @classmethod
     def new(cls, recipe: Recipe) -> Self:
         """Of an empty memory without a path. Raises InputError for an embedding that does not read the sensor."""
-        return cls._of(recipe, _extractor(recipe), RamStore(recipe), configuration_of(recipe.embedding) is not None)
+        return cls._of(recipe, _extractor(recipe), RamStore(recipe))
 
     @classmethod
     def open(
@@ -123,33 +122,29 @@ class Predictor:
     def of_snapshot(cls, state: Mapping[str, Any]) -> Self:
         """Of the memory that `snapshot` described, in memory only."""
         recipe: Recipe = state["recipe"]
-        configured = configuration_of(recipe.embedding) is not None
-        return cls._of(recipe, _extractor(recipe, state["check"]), state["store"], configured)
+        return cls._of(recipe, _extractor(recipe, state["check"]), state["store"])
 
     @classmethod
-    def _of(cls, recipe: Recipe, extractor: FeatureExtractor, store: AnyStore, configured: bool) -> Self:
-        """Of the memory in a store. configured: whether the embedding can be made again by what the memory knows."""
+    def _of(cls, recipe: Recipe, extractor: FeatureExtractor, store: AnyStore, known: bool | None = None) -> Self:
+        """Of the memory in a store. known: whether the memory says how its embedding is made; None: it is asked."""
 
         def encode(readings: npt.NDArray[np.float32]) -> Codes:
             return extractor.learned(Stream(recipe.sensor, readings))[1]
 
         exact = capabilities_of(recipe.embedding).exact
-        return cls(recipe, extractor, Ledger(Memory(recipe, encode if exact else None), store, exact and configured))
+        bare = exact and (configuration_of(recipe.embedding) is not None if known is None else known)
+        return cls(recipe, extractor, Ledger(Memory(recipe, encode if exact else None), store, bare))
 
     def snapshot(self) -> dict[str, Any]:
         """All that the memory knows at this moment, to be pickled; its touches are compacted there."""
         with self.ledger.lock:
             store, memory = self.ledger.store, self.ledger.memory
             kept = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
-            heads = sound_rows(store.heads, logger.warning)
-            held = RamStore.compacted_to(self.recipe, heads, memory.sequence, kept)
+            held = RamStore.compacted_to(self.recipe, sound_rows(store.heads, logger.warning), memory.sequence, kept)
             return {"store": held, "recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:
-        """The predictor of an axis of labels, made when it is first asked for.
-
-        Raises AnnotationError where no touch has a label on it.
-        """
+        """The predictor of an axis, made when first asked for. Raises AnnotationError where no touch has a label."""
         with self.ledger.lock:
             axes = self.ledger.memory.targets.axes
             if axis not in axes:
@@ -166,10 +161,7 @@ class Predictor:
         return self.ledger.memory_of(self.axis)
 
     def stream(self, readings: Readings) -> Stream:
-        """The validated stream of some readings, read through the correction of the memory, if its skin changed.
-
-        Raises as `FeatureExtractor.stream`.
-        """
+        """The validated stream of readings, through the correction of a changed skin; raises as the extractor's."""
         stream, correction = self.extractor.stream(readings), self.ledger.correction
         return stream if correction is None else correction.applied(stream)
 
@@ -318,10 +310,7 @@ class Predictor:
             self._job = self._worker.submit(draft.fit), _Fit(model, self._version, memory.retractions)
 
     def _restored(self) -> _Fit | None:
-        """The model by the weighing of the checkpoint that the memory was read from; None where it has none that fits.
-
-        It was fitted to these touches or to fewer: a retraction drops it.
-        """
+        """The model by the weighing of the checkpoint that the memory was read from, if it has one that fits."""
         if (text := self.ledger.memory.weighings.pop(self.axis, None)) is None:
             return None
         memory = self.memory
@@ -414,8 +403,7 @@ def embed_again(
             before = carried.put_in_place()
             for each in (predictor, *predictor._axes.values()):
                 each.replaced = True
-            kept = {"exemplars": None, "kept_touches": None}  # those of the new one
-            settings = predictor.recipe.settings.model_copy(update=kept)
+            settings = predictor.recipe.settings.model_copy(update={"exemplars": None, "kept_touches": None})
             return before, Predictor.open(store.path, RecipeRequest(None, carried.recipe.embedding, settings))
     finally:
         carried.close()
@@ -425,8 +413,7 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     """The re-embedding of the memory in a store. embedding: None for its own, made again."""
     made = Identity.read(store)
     chosen = made.own_embedding(store.path) if embedding is None else embedding
-    # As many kept touches as the memory was made with, also none; if that was the default, the default of the new
-    # recipe.
+    # As many kept touches as the memory was made with, also none; for the default the new recipe's default.
     default = made.kept_touches == default_kept_touches(made.sensor, views=bool(made.views))
     kept = Settings(exemplars=made.exemplars, kept_touches=None if default else made.kept_touches)
     recipe = Recipe.of(made.sensor, chosen, kept)

@@ -144,11 +144,11 @@ class TestWithoutAPath:
         while cut:
             learner = without_a_path([("a", stream((0, 30)))])
             learner.describe("a", {"wool": 1.0})
-            before = state(learner)
+            *before, _ = state(learner)  # each description is a row
             cut = interrupted(lambda made=learner: made.describe("a", {"silk": 1.0}), at)
             assert learner.descriptions in ({"a": {"wool": 1.0}}, {"a": {"silk": 1.0}})
             learner.describe("a", {"wool": 1.0})
-            assert state(learner) == before
+            assert list(state(learner)[:-1]) == before
             at += 1
         assert at > 10
 

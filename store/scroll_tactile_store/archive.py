@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import errno
 import os
 import re
 import shutil
@@ -10,7 +12,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from uuid import uuid4
 
 from scroll_tactile_store.encoding import NAME
@@ -43,15 +45,27 @@ def unpacked(path: Path) -> Iterator[Path]:
     Raises NotAStoreError for what is no zip of a store, and DamageError for one that is damaged, or holds anything but
     the files of a store, each once and as long as it is listed.
     """
-    with TemporaryDirectory(prefix=f"{path.name[:100]}.", ignore_cleanup_errors=True) as made:
-        folder = Path(made)
+    maker = os.getpid()
+    with reported(path, "making a temporary folder to unpack a store into"):
+        folder = Path(mkdtemp(prefix="scroll-tactile."))
+
+    def remove() -> None:
+        if os.getpid() == maker:  # a fork that ends does not take it from its parent
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    try:
         with reported(path, "unpacking a store"), regular_file(path, LARGEST) as (file, _):
             size = dense_size(file.fileno(), path)
             if not is_archive(file.read(ARCHIVE_BYTES)):
                 raise NotAStoreError(f"{path} is a file, and no packed store: {AGAIN}")
             try:
                 packed = zipfile.ZipFile(file)
-            except NO_ZIP as error:
+            except (*NO_ZIP, OSError) as error:
+                if (
+                    isinstance(error, OSError) and error.errno != errno.EINVAL
+                ):  # a place that is before the file's begin
+                    raise
                 raise NotAStoreError(f"{path} is a file, and no packed store ({error}): {AGAIN}") from error
             try:
                 _unpack(packed, folder, path, size)
@@ -60,8 +74,11 @@ def unpacked(path: Path) -> Iterator[Path]:
         try:
             yield folder
         except StoreError as error:
-            error.args = (str(error).replace(made, str(path)),)
+            error.args = (str(error).replace(str(folder), str(path)),)
             raise
+    finally:
+        remove()
+        atexit.unregister(remove)
 
 
 def _damage(path: Path, what: str) -> DamageError:

@@ -102,6 +102,8 @@ def write_checkpoint(folder: Path, number: int, draft: CheckpointDraft, identity
                 try:
                     CheckpointReader(partial)
                 except DamageError as error:
+                    if isinstance(error.__cause__, OSError):
+                        raise
                     raise RecordError(f"checkpoint {number} has more attributes than can be read: {error}") from error
     except BaseException:
         remove_tree(final)

@@ -74,7 +74,9 @@ def file_size(path: Path) -> int:
 
 
 def tree_size(path: Path) -> int:
-    """Return the bytes of all files below `path`, 0 when there is none; files may vanish meanwhile."""
+    """Return the bytes of a file, or of all files below a folder, 0 when there is none; files may vanish meanwhile."""
+    if path.is_file():
+        return file_size(path)
     return sum(file_size(Path(folder, name)) for folder, _, files in os.walk(path) for name in files)
 
 

@@ -221,8 +221,7 @@ class Store:
     def _using(self, doing: str) -> Iterator[None]:
         """In the block nobody else uses the log, which is the one that counts."""
         with self._guard, reported(self.path, doing):
-            if self._closed:
-                raise StoreClosedError(f"the store in {self.path} is closed")
+            self._check_open()
             if self._unsettled:
                 self._settle()
             yield
@@ -251,7 +250,13 @@ class Store:
         current = read_current(self._folder / CURRENT_FILE)
         if (current.log, current.log_identity) == (self._current.log, self._current.log_identity):
             if self._log.has_place(self._log.place):
-                self._rows.catch_up(self._log, current.last)
+                before = self._log.place
+                try:
+                    self._rows.catch_up(self._log, current.last)
+                except BaseException:
+                    self._log.place = before
+                    self._rows.cut(before)
+                    raise
                 self._current = current
                 return
             logger.info("%s: its writer took a batch back", self._log.path)
@@ -261,7 +266,7 @@ class Store:
         """Return what the store holds now, which from now on is what a reader reads; look: whether it looks anew."""
         self._check_open()
         with self._using("looking for what was committed"):
-            if look and self.mode == "read":
+            if look and self.mode == "read" and self._folder == self.path:  # one that was unpacked stays as it is
                 self._look()
             newest = self._current.newest
             return StoreState(self._rows.last, None if newest is None else newest.number, self._current.compacted)
@@ -316,6 +321,8 @@ class Store:
                 self._rows.append(sequence, frame.offset, frame.size, key)
                 if not self._batching:
                     self._make_durable()
+            except RecordError:  # nothing of it was staged
+                raise
             except BaseException:
                 self._failed = True
                 self._undo()
@@ -355,8 +362,8 @@ class Store:
 
     def _undo(self) -> None:
         """Take back what is not durable; what was committed before an interruption stays, and is known."""
-        self._log.rollback()
         self._rows.cut(self._log.place)
+        self._log.rollback()
 
     def _refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
@@ -582,9 +589,8 @@ class Store:
         """
         draft = self._draft(arrays, last_sequence, attributes)
         self._raise_failure()
-        with self._queue:
+        with self._queue, suppress(RuntimeError):  # it starts no job any more
             self._waiting = draft
-        with suppress(RuntimeError):  # it starts no job any more
             self._submitted = self._worker.submit(self._commit_newest)
 
     def _draft(self, arrays: Arrays, last_sequence: int, attributes: Attributes) -> CheckpointDraft:
@@ -620,6 +626,7 @@ class Store:
         with reported(self.path, "committing"):
             try:
                 with self._naming:
+                    current = replace(current, last=max(current.last, self._current.last))
                     write_current(self._folder, current)
             except BaseException:
                 # It may be another than before, or only in the system's memory.
@@ -710,6 +717,8 @@ class Store:
         self._idle()
         with self._committing:
             with self._using("putting another log in place"):
+                if last_sequence < self._current.compacted:  # another thread compacted meanwhile
+                    raise RecordError(f"{self.path} was compacted up to {self._current.compacted} meanwhile")
                 current = self._compacted(drafts)
                 try:
                     write_current(self._folder, current)
@@ -790,7 +799,7 @@ class Store:
             return
         self._refuse_in_batch("closing the store")
         self._worker.shutdown()
-        with self._guard:
+        with self._committing, self._guard:  # what another thread commits would be named under the next writer's lock
             if self._closed:
                 return
             self._closed = True

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -192,7 +193,7 @@ class TactileLearner:
     def descriptions(self) -> dict[str, Description]:
         """Material → its description, in alphabetical order, whether it was observed or not."""
         described = self._ledger.read(lambda memory, _: sorted(memory.descriptions.items()))
-        return {name: dict(description) for name, description in described}
+        return {name: deepcopy(description) for name, description in described}
 
     @property
     def quantities(self) -> dict[str, Quantity]:

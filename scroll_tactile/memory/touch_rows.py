@@ -56,7 +56,6 @@ __all__ = [
     "pack_codes",
     "pack_readings",
     "place_of",
-    "quantities_of",
     "refusing",
     "require_row",
     "retracted_by",
@@ -218,11 +217,6 @@ def declared_by(row: Head) -> Quantity:
     """The quantity that a row declares. Raises InputError for what is none."""
     fields: dict[str, Any] = {name: row.attributes.get(name) for name in ("unit", "low", "high", "resolution")}
     return Quantity(name=row.label, **fields)
-
-
-def quantities_of(attributes: Mapping[str, Any]) -> dict[str, Quantity]:
-    """The quantities that a checkpoint's attributes declare. Raises InputError for what is none."""
-    return {name: Quantity(name=name, **fields) for name, fields in attributes.get("quantities", {}).items()}
 
 
 def annotated(annotation: Annotation) -> dict[str, Any]:

@@ -122,9 +122,13 @@ class Ledger:
     def memory(self) -> Memory:
         """The memory. If a change was cut short it is read again."""
         if not self._whole:
-            self._memory, self._whole = load(self._empty, self.store), True
-            self.lost += 1
-            self._changed(None)
+            with self.lock:  # or a thread that is changing it would be taken for one that was cut short
+                if not self._whole:
+                    read = load(self._empty, self.store)
+                    read.retractions += self._memory.retractions + 1  # what was fitted to it may hold what is gone
+                    self.lost += 1
+                    self._changed(None)
+                    self._memory, self._whole = read, True
         return self._memory
 
     def memory_of(self, axis: str) -> Memory:
@@ -173,7 +177,8 @@ class Ledger:
     def require_open(self) -> AnyStore:
         """The store. Raises StoreClosedError after `close`."""
         if self._closed:
-            raise StoreClosedError(f"the memory {self.path or 'in memory'} is closed: open its path again")
+            where = "in RAM is closed: copy it before" if self.path is None else f"{self.path} is closed: open it again"
+            raise StoreClosedError(f"the memory {where}")
         return self.store
 
     def require_folder(self, doing: str) -> Store:
@@ -266,6 +271,7 @@ class Ledger:
         """As `TactileLearner.batch`."""
         with self.lock:
             self.require_open()
+            self.require_write_mode()
             if self._batching:
                 yield
                 return
@@ -518,6 +524,8 @@ class Ledger:
         """Write a checkpoint in a thread, where many rows came since the last."""
         rows = max(CHECKPOINT_EVERY, self._memory.statistics.material_count // MATERIALS_PER_ROW)
         if not self.saves or self._batching or self._memory.sequence - self._saved < rows:
+            return
+        if not self._whole or self._memory.stale:  # half a change, or samples with what is gone: the journal has it all
             return
         arrays, attributes = self._memory.to_arrays()
         try:

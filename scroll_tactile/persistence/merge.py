@@ -32,6 +32,7 @@ from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.persistence.replaying import note
 from scroll_tactile.quantities import Quantity, require_declarable
+from scroll_tactile.statistics.annotations import MOST_AXES
 
 __all__ = ["Choice", "Merge", "MergeRules"]
 
@@ -97,6 +98,12 @@ class Merge:
                 "exemplars: touch it again, or merge into a memory made with exemplars=0"
             )
         self.descriptions = self._chosen_descriptions(said.descriptions)
+        theirs_too = {axis for head in self._rows for axis, _ in annotation_of(head.attributes).labels}
+        if len(axes := {*memory.targets.axes, *said.targets.axes, *theirs_too}) > MOST_AXES:
+            raise MismatchError(
+                f"expected labels on at most {MOST_AXES} axes in both memories together; came {len(axes)}: forget the "
+                "touches with labels on some in one of them first"
+            )
 
     @property
     def added(self) -> int:

@@ -100,7 +100,7 @@ def sums_without(source: AnyStore, heads: Sequence[Head], memory: Memory, left_o
     if len(observed) != sum(head.kind not in (DECLARE, DESCRIBE, SENSE, ADAPT) for head in heads):
         return None
     found = source.latest()
-    if found is None or found.last_sequence != heads[-1].sequence:
+    if found is None or not heads or found.last_sequence != heads[-1].sequence:
         return None
     sums = memory.empty_like().fill(found, source.path)
     if not left_out:

@@ -96,9 +96,9 @@ class RamStore:
         try:
             yield
         except BaseException:
-            self._rows = {sequence: row for sequence, row in self._rows.items() if sequence <= before}
-            self._with_key = {key: [own for own in rows if own <= before] for key, rows in self._with_key.items()}
-            self.last = before
+            rows = {sequence: row for sequence, row in self._rows.items() if sequence <= before}
+            keys = {key: [own for own in rows if own <= before] for key, rows in self._with_key.items()}
+            self.__dict__.update(_rows=rows, _with_key=keys, last=before)  # at once
             raise
 
     def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
@@ -152,13 +152,11 @@ class RamStore:
         newest: tuple[Arrays, Any] | None = None,
     ) -> None:
         """Have a checkpoint stand for the rows up to one, which give up their arrays."""
-        self.commit(arrays, last_sequence=last_sequence, attributes=attributes)
-        self._compaction = self._newest
-        for sequence, row in self._rows.items():
-            if sequence <= last_sequence:
-                self._rows[sequence] = replace(row, arrays={})
-        if newest is not None:
-            self.commit(newest[0], last_sequence=self.last, attributes=newest[1])
+        number = (self.newest or 0) + 1
+        kept = Checkpoint(number, last_sequence, attributes or {}, arrays)
+        last = kept if newest is None else Checkpoint(number + 1, self.last, newest[1], newest[0])
+        rows = {n: replace(row, arrays={}) if n <= last_sequence else row for n, row in self._rows.items()}
+        self.__dict__.update(_rows=rows, _compaction=kept, _newest=last)  # at once: ctrl-C leaves all of it or nothing
 
     def size(self) -> dict[str, int]:
         """The bytes of its arrays."""

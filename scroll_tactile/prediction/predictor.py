@@ -290,10 +290,10 @@ class Predictor:
         if self.ledger.version == self._version:
             return
         changed = self.ledger.changed_since(self._version, self.axis)
-        self._version = self.ledger.version
         for fit in (self._fit, self._job and self._job[1]):
             if fit is not None:
                 fit.changed = None if fit.changed is None or changed is None else fit.changed | changed
+        self._version = self.ledger.version  # last: cut short before, they are noted again
 
     def _begin_fit(self) -> None:
         """Begin a fit if enough touches came or went. A lack of memory or threads raises nothing here."""

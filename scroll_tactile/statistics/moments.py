@@ -107,9 +107,10 @@ class SecondMoment:
 
     def _take(self, packed: IntArray | None, codes: Codes | None) -> None:
         """Keep this triangle, and these rows, all that it is of; None for rows that are not there any more."""
-        self._all = codes is not None
-        self._codes = np.empty((0, self.dimension), dtype=np.int32) if codes is None else codes
-        self._packed, self._kept, self._formed = packed, len(self._codes), 0 if packed is None else len(self._codes)
+        rows = np.empty((0, self.dimension), dtype=np.int32) if codes is None else codes
+        kept, formed = len(rows), 0 if packed is None else len(rows)
+        # At once: whoever only reads forms products, too, and ctrl-C there must not lose the rows.
+        self.__dict__.update(_all=codes is not None, _codes=rows, _packed=packed, _kept=kept, _formed=formed)
 
     def packed(self) -> IntArray:
         """The lower triangle of A as it is now, row after row, shape (d·(d+1)/2,): not to be changed."""

@@ -97,7 +97,7 @@ class Store:
 
     Open it with `Store.open`. One Store may write a folder at a time, any number may read it. The methods may be called
     from any thread, but not in a forked child. A reader sees the store as it was when it was opened, or last asked for
-    its `state`.
+    its `state` or for a checkpoint.
     """
 
     @classmethod

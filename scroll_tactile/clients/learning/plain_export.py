@@ -37,7 +37,7 @@ def export_plain(
     - `observations.csv`: sequence, material, key (hash of the stream), time, and what became of it: kept, compacted
       (learned from, features given up), retracted; its source, where it has one; and a column for each quantity, such
       as "force [N] 0..10 step 0.01", and axis, such as "slip [label]". A time out of the calendar's
-      years 1 to 9999 is written as seconds since 1970. Only where the memory has a path.
+      years 1 to 9999 is written as seconds since 1970.
     - `statistics.npz`: `materials`; for each scale (a width of windows; 1048576 the whole touch and 1048577 its shape,
       see `signals.image`) of its rows, of which a touch adds one at each stage that the scale judges at (of a camera
       one a frame), `counts-<scale>` int64 (C,), `sums-<scale>` int64 (C, d) and `second-<scale>` Σ x xᵀ, int64 (d, d),
@@ -72,10 +72,9 @@ def export_plain(
 def _write(learner: TactileLearner, target: Path, progress: Callable[[str, int, int], object]) -> None:
     with learner._ledger.lock:  # whatever is observed meanwhile, both are of one state
         held, journal = copy.deepcopy(learner), learner.observations()
-    if learner.path is not None:
-        progress("observations", 0, 1)
-        header, rows = _observed(held.quantities, journal)
-        _rows(target / "observations.csv", header, rows)
+    progress("observations", 0, 1)
+    header, rows = _observed(held.quantities, journal)
+    _rows(target / "observations.csv", header, rows)
     if held.descriptions:
         header = ["material", "constituent", "present", "share"]
         _rows(target / "descriptions.csv", header, _described(held.descriptions))

@@ -137,7 +137,8 @@ class Store:
         # Of the log and what is known of it; of `CURRENT` while it is written; of checkpoints, of which one is written
         # at a time; and of the one that waits to be.
         self._guard, self._naming = threading.RLock(), threading.Lock()
-        self._committing, self._queue = threading.Lock(), threading.Lock()
+        self._committing = threading.Lock()
+        self._queue = threading.RLock()  # an executor may run what is handed over in the thread that hands it over
         self._closed = self._batching = self._failed = self._unsettled = False
         self._lock: WriterLock | None = None
         self._worker = ThreadPoolExecutor(1, f"store commit {path.name}")

@@ -102,6 +102,10 @@ class MemoryStore(Store):
 
     def sound_head(self, head: Head) -> Head:
         """This row, whose kind, name, key and attributes are those of a memory."""
+        self._fields(head)
+        return head
+
+    def _fields(self, head: Head) -> RowFields:
         with refusing(self.path, f"row {head.sequence}", head.sequence):
             if head.kind not in KINDS:
                 raise MismatchError(f"is of kind {head.kind!r}, which this version does not know")
@@ -119,7 +123,7 @@ class MemoryStore(Store):
                 declared_by(head)
             elif head.kind == DESCRIBE and told.constituents is not None:
                 checked(head.label, told.constituents)
-        return head
+        return told
 
     def _require_size(self, columns: int | None, nbytes: int | None) -> None:
         sensor = self.recipe.sensor
@@ -138,19 +142,19 @@ class MemoryStore(Store):
             before, rows = last, rows + last - first + 1
         if sequence >= self._own:
             return
-        most = self.size()["journal"] // SMALLEST_ROW
+        most = self._log.size() // SMALLEST_ROW
         expect(0 < rows <= most, "sequences", f"1 to {most} rows, which the journal can hold", rows)
 
     def sound_record(self, record: Record) -> Record:
         """This row, of which the arrays, too, are those of a memory."""
-        self.sound_head(record)
+        told = self._fields(record)
         if record.kind == OBSERVE:
             with refusing(self.path, f"row {record.sequence}", record.sequence):
-                self._require_arrays(record)
+                self._require_arrays(record, told)
         return record
 
-    def _require_arrays(self, record: Record) -> None:
-        arrays, told = record.arrays, RowFields.model_validate(record.attributes)
+    def _require_arrays(self, record: Record, told: RowFields) -> None:
+        arrays = record.arrays
         if unknown := [name for name in arrays if not name.startswith((CODES, "readings-"))]:
             raise MismatchError(f"has arrays {unknown[:5]}, which this version does not know")
         packed = only_readings(arrays)

@@ -124,12 +124,15 @@ class Ledger:
         if not self._whole:
             with self.lock:  # or a thread that is changing it would be taken for one that was cut short
                 if not self._whole:
-                    read = load(self._empty, self.store)
-                    read.retractions += self._memory.retractions + 1  # what was fitted to it may hold what is gone
                     self.lost += 1
-                    self._changed(None)
-                    self._memory, self._whole = read, True
+                    self._read_again()
         return self._memory
+
+    def _read_again(self) -> None:
+        read = load(self._empty, self.store)
+        read.retractions += self._memory.retractions + 1  # what was fitted to it may hold what is gone
+        self._changed(None)
+        self._memory, self._whole = read, True
 
     def memory_of(self, axis: str) -> Memory:
         """What was learned by the labels on an axis, in place of materials; of the axis "" the memory itself."""
@@ -270,7 +273,6 @@ class Ledger:
     def batch(self) -> Iterator[None]:
         """As `TactileLearner.batch`."""
         with self.lock:
-            self.require_open()
             self.require_write_mode()
             if self._batching:
                 yield
@@ -516,8 +518,7 @@ class Ledger:
                     return True
             except CompactedError:  # just now, and a retraction needs what is gone
                 pass
-            self._memory, self._whole = load(self._empty, store), True
-            self._changed(None)
+            self._read_again()
             return True
 
     def checkpoint_if_due(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -48,8 +49,7 @@ class RamStore:
 
     def copy(self) -> Self:
         """One that changes independently; what lies in the rows is shared."""
-        made = type(self)(self._recipe)
-        made.__dict__.update(self.__dict__)
+        made = copy(self)
         made._rows, made._with_key = dict(self._rows), {key: list(own) for key, own in self._with_key.items()}
         return made
 

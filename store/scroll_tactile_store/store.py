@@ -221,8 +221,9 @@ class Store:
     @contextmanager
     def _using(self, doing: str) -> Iterator[None]:
         """In the block nobody else uses the log, which is the one that counts."""
+        self._check_open()  # before the lock, which in a fork nobody gives back
         with self._guard, reported(self.path, doing):
-            self._check_open()
+            self._check_open()  # another thread may have closed it meanwhile
             if self._unsettled:
                 self._settle()
             yield
@@ -265,7 +266,6 @@ class Store:
 
     def state(self, *, look: bool = True) -> StoreState:
         """Return what the store holds now, which from now on is what a reader reads; look: whether it looks anew."""
-        self._check_open()
         with self._using("looking for what was committed"):
             if look and self.mode == "read" and self._folder == self.path:  # one that was unpacked stays as it is
                 self._look()
@@ -390,7 +390,6 @@ class Store:
         `kind`, `label`: only those of this kind, or label. Compacted records keep their heads, but for those that a
         repair named as lost. Raises DamageError at the first that is damaged or missing.
         """
-        self._check_open()
         found = self._rows_behind(after, arrays=False)
         return (head for head in found if kind in (None, head.kind) and label in (None, head.label))
 
@@ -399,7 +398,6 @@ class Store:
 
         Raises RecordError where there is none, CompactedError where compaction gave up its arrays, DamageError.
         """
-        self._check_open()
         with self._using("reading a row"):
             last = self._rows.last
             if type(sequence) is not int or not 1 <= sequence <= last:
@@ -413,14 +411,12 @@ class Store:
         `after` with which to continue behind it. Raises CompactedError where the first are compacted: `compaction` has
         their place, and its `last_sequence` is the `after` to continue with.
         """
-        self._check_open()
         if after < self._settled().compacted:
             raise self._given_up(after + 1)
         return cast(Iterator[Record], self._rows_behind(after, arrays=True))
 
     def with_key(self, key: bytes) -> Iterator[Head]:
         """Yield the records with this key without their arrays. Raises DamageError."""
-        self._check_open()
         check_key(key)
         with self._using("looking for a key"):
             self._find(0)
@@ -527,7 +523,6 @@ class Store:
         A logged warning names the file and the array of each checkpoint that it passes over. Raises VersionError for a
         checkpoint of another format.
         """
-        self._check_open()
         passed = set[int]()
         while left := [named for named in self._settled().checkpoints if named.number not in passed]:
             try:
@@ -544,7 +539,6 @@ class Store:
         Raises DamageError where it does not verify, VersionError for another format, and CompactedError for a reader of
         a store that was compacted again since its last `state`.
         """
-        self._check_open()
         if (named := self._settled().compaction) is None:
             return None
         try:
@@ -786,7 +780,6 @@ class Store:
 
     def size(self) -> dict[str, int]:
         """Return the bytes on the disk: {"journal": …, "checkpoints": …}."""
-        self._check_open()
         with self._using("measuring the store"):
             return {"journal": self._log.size(), "checkpoints": tree_size(self._folder / CHECKPOINTS)}
 

@@ -50,11 +50,12 @@ def main() -> NoReturn:
     finally:
         if ours:
             signal.signal(signal.SIGINT, _leave)  # nothing of ours is left to be ended in order
-    try:
-        sys.stdout.flush()
-    except (OSError, ValueError):  # reported where it was printed
-        _to_nowhere(1)
-        code = code or 1
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # reported where it was printed
+            _to_nowhere(number)
+            code = code or 1
     sys.exit(code)
 
 

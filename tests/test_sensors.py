@@ -117,13 +117,13 @@ def test_a_sensor_that_misses_values_says_so_in_json():
     for sensor in (skin, missing):
         assert Sensor.model_validate_json(sensor.model_dump_json()) == sensor
     assert missing != skin
-    with pytest.raises(ValidationError, match="'refused' or 'missing'"):
+    with pytest.raises(InputError, match="'refused' or 'missing'"):
         Sensor(**FIELDS, non_finite="ignored")
 
 
 def test_a_camera_has_one_range():
     fields = {"name": "eye", "channels": 12, "rate": 5.0, "high": 1.0, "unit": "1", "duration": 1.0, "camera": True}
-    with pytest.raises(ValidationError, match="a camera has one low for all its pixels"):
+    with pytest.raises(InputError, match="a camera has one low for all its pixels"):
         Sensor(**fields, layout=(2, 2, 3), low=(0.0,) * 12)
 
 

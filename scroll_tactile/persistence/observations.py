@@ -29,7 +29,7 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
-from scroll_tactile.signals.ranges import CURE
+from scroll_tactile.signals.facts import CURE
 from scroll_tactile.statistics.annotations import Annotation
 
 __all__ = [

@@ -22,6 +22,12 @@ from scroll_tactile.recordings.recording import Episode, Gap, Recording, Report,
 __all__ = ["describe", "find", "iterate", "read"]
 
 _DEEPEST = 64  # folders within each other in which recordings are looked for
+_FAST, _BATCH, _LATE = (
+    0.002,
+    5,
+    0.95,
+)  # messages come in batches where the median step is below so many seconds, and the
+# latest twentieth of all steps are so many times as long: the pauses between batches are no gaps
 
 _Address = str | PathLike[str]
 _Times = npt.NDArray[np.float64]
@@ -254,8 +260,15 @@ def _recording(block: Block, source: Source, clock: str | None, columns: str | N
     readings, times, episodes, report = assemble(block, clock, source)
     report = replace(report, cut_off=source.cut_off, notes=tuple(source.notes))
     within = source.address, source.topic, source.field()
-    recording = Recording(*within, readings, times, episodes, report, block.annotations)
+    recording = Recording(*within, readings, times, episodes, report, block.annotations, _names(source, readings))
     return recording if columns is None else only_columns(recording, columns)
+
+
+def _names(source: Source, readings: npt.NDArray[Any]) -> tuple[str, ...]:
+    """The names of a table's columns, as its field lists them; none where there are none, or numbers for them."""
+    names = tuple(name.strip() for name in source.field().split(","))
+    own = not source.topics and readings.ndim == 2 and 1 < len(names) == len(set(names)) == readings.shape[1]
+    return names if own and not all(name.isdigit() for name in names) else ()
 
 
 def _clock(block: Block, requested: str | None) -> str | None:
@@ -322,9 +335,25 @@ def assemble(
         counters = {name: counts[order] for name, counts in counters.items()}
     episodes = _spans(clocks["log"], source.marks) if source.marks else _numbered(block.episodes, source.names)
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
-    times = np.full(len(readings), np.nan) if clock is None else clocks[clock]
+    times = np.full(len(readings), np.nan) if clock is None else unwrapped(clocks[clock])
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
     return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
+
+
+def unwrapped(times: _Times) -> _Times:
+    """Times of a counter of 16 or 32 bits, of s, ms, µs or ns, that goes on from 0 when it is full: as if it had more.
+
+    >>> unwrapped(np.array([65.534, 65.535, 0.0, 0.001])).round(3).tolist()
+    [65.534, 65.535, 65.536, 65.537]
+    """
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0)
+    if len(back) and (steps > 0).any():
+        middle = float(np.median(steps[steps > 0]))
+        for period in (2.0**bits / unit for bits in (16, 32) for unit in (1, 1e3, 1e6, 1e9)):
+            if (abs(steps[back] + period - middle) <= _BATCH * middle).all() and times.max() < period:
+                return times + period * np.concatenate([[0], np.cumsum(steps < 0)])
+    return times
 
 
 def _numbered(numbers: npt.NDArray[np.int64] | None, names: dict[int, str]) -> tuple[Episode, ...]:
@@ -357,21 +386,29 @@ def _report(
     inside[borders - 1] = False
     missing, repeated = _lost(counters, borders)
     report = Report(len(times), clock, lost=missing, unset=unset)
-    steps = np.diff(times)
-    if not (np.isfinite(steps) & inside).any():
-        return replace(report, repeated=repeated)
-    steps[~inside] = np.nan
+    steps = np.where(inside, np.diff(times), np.nan)
     forward = steps[steps > 0]
+    if not np.isfinite(steps).any():
+        return replace(report, repeated=repeated)
+    again = int(np.count_nonzero(steps == 0))
     middle = float(np.median(forward)) if len(forward) else 0.0
-    longest = longest_step(middle)
+    late = float(np.nanquantile(steps, _LATE))
+    batches = middle < _FAST and late > _BATCH * middle
+    longest = longest_step(late if batches else middle)
     regular = forward[forward <= min(longest, 2 * middle)]
+    counted = forward[(forward >= middle / 2) & (forward <= 1.5 * middle)]
+    if batches or again > len(forward):  # from the first batch, or the first new stamp, to the last
+        begins = np.flatnonzero((steps > (_BATCH * middle if batches else 0)) & (steps <= longest))
+        counted = steps[begins[0] + 1 : begins[-1] + 1] if len(begins) > 1 else steps
+        counted = counted[(counted >= 0) & (counted <= longest)]
+    seconds = float(counted.sum())
     return replace(
         report,
-        rate=1 / middle if middle > 0 else None,
+        rate=len(counted) / seconds if seconds > 0 else None,
         jitter=float(regular.std()) if len(regular) else None,
         gaps=tuple(Gap(int(i) + 1, float(steps[i])) for i in np.flatnonzero(steps > longest)),
-        repeated=repeated or int(np.count_nonzero(steps == 0)),
-        backward=int(np.count_nonzero(steps < 0)),
+        repeated=repeated or again,
+        back=tuple(Gap(int(i) + 1, -float(steps[i])) for i in np.flatnonzero(steps < 0)),
     )
 
 

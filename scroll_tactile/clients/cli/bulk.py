@@ -25,6 +25,7 @@ from scroll_tactile.clients.cli.terminal import (
     Sources,
     confusion_text,
     counted,
+    facts_as_json,
     no_memory,
     opened,
     opened_for_upkeep,
@@ -32,6 +33,7 @@ from scroll_tactile.clients.cli.terminal import (
     progress_bar,
     say,
     say_csv,
+    say_facts,
     say_json,
     say_refused,
     sensor_for,
@@ -120,6 +122,7 @@ def _learn(
     if as_json:
         learned = {"files": done.sources, "touches": done.observations, "learned": dict(sorted(done.learned.items()))}
         left = {"skipped": done.repeated, "refused": _refusals(done.refused), "deaths": done.deaths}
+        left |= {"facts": facts_as_json(done.facts)}
         say_json({**learned, **left, "observations": done.held, "seconds": done.seconds, "digest": done.digest})
     else:
         of = f" of {counted(len(done.learned), 'material')}" if done.learned else ""
@@ -166,7 +169,7 @@ def evaluate(
         done = evaluate_sources(learner, found, options, progress, of=of, with_learned=with_learned)
     refused = [*missing, *done.refused]
     if as_json:
-        say_json(_figures(done) | {"refused": _refusals(refused)})
+        say_json(_figures(done) | {"refused": _refusals(refused), "facts": facts_as_json(done.facts)})
     elif as_csv:
         say_csv(*ANSWER, of or "material", "right")
         for each in done.answered:
@@ -174,6 +177,7 @@ def evaluate(
     else:
         _report_evaluated(done, with_learned)
     if not as_json:
+        say_facts(done.facts)
         say_refused(refused)
     if refused:
         raise typer.Exit(1)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -17,12 +19,15 @@ from scroll_tactile.errors import AnnotationError, InputError, RecordingError, S
 from scroll_tactile.learner import TactileLearner
 from scroll_tactile.live.detector import contact_spans
 from scroll_tactile.quantities import Quantity
-from scroll_tactile.recordings import Interval, Recording, Touch, find, presets, read, touches
+from scroll_tactile.recordings import Interval, Recording, Touch, find, iterate, presets, read, resampled, touches
 from scroll_tactile.recordings.headings import Heading, Noted, noted_in
 from scroll_tactile.recordings.locations import file_system, is_remote
-from scroll_tactile.recordings.recording import require_columns
+from scroll_tactile.recordings.recording import in_order, require_columns
+from scroll_tactile.sensors import Sensor
 from scroll_tactile.settings import LONGEST_SOURCE, require_name
+from scroll_tactile.signals.facts import Fact
 from scroll_tactile.signals.stream import Stream
+from scroll_tactile.signals.windows import SHORTEST
 
 __all__ = [
     "Cut",
@@ -37,6 +42,7 @@ __all__ = [
 
 RECORDINGS = (".bag", ".db3", ".mcap", ".npy", ".csv", ".h5", ".hdf5", ".parquet")
 PACKED = (".part",)  # what is looked for in a remote folder: the names that packed memories have
+_LOOKED = 3  # sources are looked at for the names of columns
 WHOLE = ("metadata.yaml", "meta/info.json", ".zgroup", "zarr.json")  # in a folder that is one recording
 
 Cut = Literal["episodes", "intervals", "none", "contact"]
@@ -51,6 +57,9 @@ class SourceOptions:
     material: the name of all touches. by: what names each touch, as of `recordings.touches`. intervals: the table's.
     At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
     anything is learned, as the table's headings do (`recordings.declared_quantities`), beside those of `annotate`.
+    rate: what becomes of a recording that has another rate than the sensor by its times: "keep" takes its numbers as
+    they are, "resample" a reading each step of the sensor's; unless given it is refused from a fifth on.
+    names: the channels' columns, by which tables with names are read, and names_of who has them; see `by_names`.
 
     The value of a touch in a column that annotates it is the mean of the touch's readings that have a number there, its
     label the one text that they have: a touch with two is refused.
@@ -70,6 +79,9 @@ class SourceOptions:
     by: Literal["topic", "file", "folder", "task"] | None = None
     intervals: Sequence[Interval] | None = None
     quantities: Sequence[Quantity] = ()
+    rate: Literal["keep", "resample"] | None = None
+    names: Sequence[str] = ()
+    names_of: str = ""
 
     def __post_init__(self) -> None:
         if sum(given is not None for given in (self.material, self.by, self.intervals)) > 1:
@@ -83,6 +95,8 @@ class SourceOptions:
             presets.find(self.preset)
         if self.columns is not None:
             require_columns(self.columns)
+        if self.rate not in (None, "keep", "resample"):
+            raise InputError(f"expected rate='keep' or 'resample'; came {self.rate!r:.60}", argument="rate")
         if self.cut == "intervals" and self.intervals is None:
             raise InputError(
                 "cut='intervals' takes intervals=, a table with columns file, begin, end and material",
@@ -103,8 +117,24 @@ class SourceOptions:
         of_columns = (Heading.parsed(text).quantity for text in self.annotate)
         return [*self.quantities, *filter(None, of_columns)]
 
-    def touches_in(self, address: str, learner: TactileLearner) -> tuple[Recording, tuple[Touch, ...]]:
-        """A source and the touches in it; raises what `recordings.read` and `recordings.touches` raise."""
+    def by_names(self, sources: Sequence[str], sensor: Sensor) -> SourceOptions:
+        """The options with the names of the sensor's columns, or else of those of the first source that can be read."""
+        if self.columns is not None or self.names or sensor.camera:
+            return self
+        if sensor.columns:
+            return replace(self, names=sensor.columns, names_of=f"sensor {sensor.name!r}")
+        for address in [source for source in sources if not is_memory(source)][:_LOOKED]:
+            with suppress(InputError, OSError):
+                where = {name: getattr(self, name) for name in ("topic", "field", "clock", "preset", "labels")}
+                names = next(iterate(address, **where)).names
+                return replace(self, names=names, names_of=address) if len(names) == sensor.channels else self
+        return self
+
+    def recording(self, address: str, sensor: Sensor) -> tuple[Recording, list[Fact]]:
+        """A source as the sensor's recording, and what is odd about it.
+
+        Raises what `recordings.read` raises, and RecordingError for another rate and for other columns.
+        """
         recording = read(
             address,
             topic=self.topic,
@@ -112,16 +142,48 @@ class SourceOptions:
             clock=self.clock,
             columns=self.columns,
             preset=self.preset,
-            rate=learner.sensor.rate,  # where it has no clock
+            rate=sensor.rate,  # where it has no clock
             labels=self.labels,
             annotate=self.annotate,
         )
+        recording, facts = in_order(recording, self.names, self.names_of)
+        for fact in recording.facts(sensor):
+            if fact.kind == "rate" and self.rate is not None:
+                continue
+            if fact.then == "refused":
+                raise fact.error()
+            facts.append(fact)
+        if self.rate == "resample" and recording.report.clock not in (None, "rate"):
+            recording = resampled(recording, sensor.rate, recording.breaks(sensor))
+        return recording, facts
+
+    def touches_in(self, recording: Recording, learner: TactileLearner) -> tuple[Touch, ...]:
+        """The touches in a recording, each in one piece by its times; raises what `recordings.touches` raises."""
         if self.intervals is not None:
-            return recording, touches(recording, self.intervals)
-        if self.cut == "contact":
-            return recording, touches(recording, partial(_contacts, learner), self.by)
-        whole = self.cut == "none" or (self.cut is None and not recording.episodes)
-        return recording, touches(recording, "whole" if whole else "episodes", self.by)
+            found = touches(recording, self.intervals)
+        elif self.cut == "contact":
+            found = touches(recording, partial(_contacts, learner), self.by)
+        else:
+            whole = self.cut == "none" or (self.cut is None and not recording.episodes)
+            found = touches(recording, "whole" if whole else "episodes", self.by)
+        breaks = recording.breaks(learner.sensor)
+        return tuple(piece for touch in found for piece in _pieces(touch, breaks, learner.sensor)) if breaks else found
+
+
+def _pieces(touch: Touch, breaks: Sequence[int], sensor: Sensor) -> Iterator[Touch]:
+    """A touch, or those parts of it between breaks that are long enough. Raises InputError where none is."""
+    inside = [at for at in breaks if touch.begin < at < touch.end]
+    parts = list(pairwise([touch.begin, *inside, touch.end]))
+    long = [part for part in parts if not inside or part[1] - part[0] >= max(2, SHORTEST * sensor.rate)]
+    if not long:
+        raise InputError(
+            f"{touch.name} has {len(parts)} parts, by gaps in its times and steps back, none of {SHORTEST:g} s: give "
+            "another clock=",
+            argument="clock",
+        )
+    for begin, end in long:
+        own = slice(begin - touch.begin, end - touch.begin)
+        yield replace(touch, begin=begin, end=end, readings=touch.readings[own], times=touch.times[own])
 
 
 def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, int]]:
@@ -129,7 +191,7 @@ def _contacts(learner: TactileLearner, recording: Recording) -> list[tuple[int, 
     sensor, rest = learner.sensor, capabilities_of(learner.embedding).rest
     gaps = [gap.index for gap in recording.report.gaps]
     if recording.readings[:1].size != sensor.channels:
-        recording.stream(sensor)
+        recording.numbers(sensor)
     kind = np.float32 if sensor.camera else np.float64
     readings = recording.readings.reshape(len(recording), *sensor.shape).astype(kind, copy=False)
     spans = contact_spans(sensor, rest, readings, gaps)
@@ -153,14 +215,15 @@ class Refused:
     @classmethod
     def by(cls, error: Exception, source: str) -> Refused:
         """What an error refuses."""
-        return cls(source, str(error), getattr(error, "argument", None))
+        return cls(source, str(error).removeprefix(f"{source}: "), getattr(error, "argument", None))
 
 
 @dataclass(frozen=True)
 class SourceTouch:
     """A touch out of a source: where it comes from, what names it (None where nothing does), its stream, and its notes.
 
-    values, labels: as of `TactileLearner.observe`.
+    values, labels: as of `TactileLearner.observe`. facts: what is odd about it; with the first of a recording also what
+    is odd about that.
     """
 
     source: str
@@ -168,6 +231,7 @@ class SourceTouch:
     stream: Stream
     values: Mapping[str, float] = field(default_factory=dict)
     labels: Mapping[str, str] = field(default_factory=dict)
+    facts: Sequence[Fact] = ()
 
 
 def source_touches(
@@ -178,7 +242,8 @@ def source_touches(
     named: whether a touch that nothing names is refused.
     """
     try:
-        recording, found = options.touches_in(address, learner)
+        recording, facts = options.recording(address, learner.sensor)
+        found = options.touches_in(recording, learner)
     except (InputError, OSError) as error:
         yield Refused.by(error, address)
         return
@@ -192,7 +257,7 @@ def source_touches(
                     argument="material by intervals",
                 )
             part = replace(recording, readings=touch.readings, times=touch.times, episodes=())
-            stream = learner.stream(part.stream(learner.sensor))
+            stream = learner.stream(part.numbers(learner.sensor))
             noted = Noted(touch.values, touch.labels) + noted_in(recording.annotations, touch.begin, touch.end)
             name = None if material is None else require_name(material)
             yield SourceTouch(
@@ -201,7 +266,9 @@ def source_touches(
                 stream=stream,
                 values=_values(noted, learner.quantities),
                 labels=dict(noted.labels),
+                facts=(*facts, *learner._facts_of(stream, source=source)),
             )
+            facts = []
         except (InputError, SensorMismatchError) as error:
             yield Refused.by(error, source)
 

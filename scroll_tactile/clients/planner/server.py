@@ -17,7 +17,7 @@ from pydantic_core import from_json
 from scroll_tactile_store import StoreError
 
 from scroll_tactile import __version__
-from scroll_tactile.clients.report.facts import MemoryFacts, mistakes
+from scroll_tactile.clients.report.memory_facts import MemoryFacts, mistakes
 from scroll_tactile.errors import InputError, ObservationError, ScrollTactileError
 from scroll_tactile.health.diagnosis import advice, in_words
 from scroll_tactile.learner import TactileLearner

@@ -20,7 +20,7 @@ from scroll_tactile.recordings.paths import FieldPath
 from scroll_tactile.recordings.rosbag import picture
 from scroll_tactile.results import Estimate, Prediction, Receipt
 from scroll_tactile.settings import candidates_of
-from scroll_tactile.signals.ranges import all_clipped
+from scroll_tactile.signals.facts import all_clipped
 from scroll_tactile.signals.stream import Stream
 
 __all__ = ["Answer", "Bridge", "BridgeReport"]

@@ -337,7 +337,7 @@ def assemble(
     begins = [] if source.marks or source.continuous else [episode.begin for episode in episodes if episode.begin]
     times = np.full(len(readings), np.nan) if clock is None else unwrapped(clocks[clock])
     unset = int(np.count_nonzero(clocks["header"] == 0)) if "header" in clocks else 0
-    return readings, times, episodes, _report(times, clock, counters, np.array(begins, np.int64), unset)
+    return readings, times, episodes, reported(times, clock, counters, np.array(begins, np.int64), unset)
 
 
 def unwrapped(times: _Times) -> _Times:
@@ -375,13 +375,14 @@ def _spans(logged: npt.NDArray[np.float64], marks: list[tuple[float, str]]) -> t
     return tuple(Episode(begin, end, text) for begin, end, (_, text) in spans if text and end > begin)
 
 
-def _report(
-    times: npt.NDArray[np.float64],
+def reported(
+    times: _Times,
     clock: str | None,
-    counters: dict[str, npt.NDArray[np.int64]],
+    counters: Mapping[str, npt.NDArray[np.int64]],
     borders: npt.NDArray[np.int64],
     unset: int,
 ) -> Report:
+    """What times and counters say of readings. borders: the readings before which time begins anew."""
     inside = np.ones(max(len(times) - 1, 0), bool)
     inside[borders - 1] = False
     missing, repeated = _lost(counters, borders)
@@ -412,7 +413,7 @@ def _report(
     )
 
 
-def _lost(counters: dict[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
+def _lost(counters: Mapping[str, npt.NDArray[np.int64]], borders: npt.NDArray[np.int64]) -> tuple[int | None, int]:
     """Lost and repeated readings by the device's counter, or else by the recorder's, if it counts each topic alone."""
     single = {name: int(np.count_nonzero(np.diff(counts) == 1)) for name, counts in counters.items()}
     for name in ("message", "sequence"):

@@ -94,6 +94,26 @@ class Report:
         """How often time goes back inside an episode."""
         return len(self.back)
 
+    def facts(self, sensor: Sensor, source: str) -> list[Fact]:
+        """What is odd about it, as of a recording of `sensor`: its times, what is lost, what its reader noted."""
+        own = None if self.clock in (None, "rate") else self.rate
+        ticks = self.readings - self.repeated  # of a clock that has a stamp for many readings, such as whole seconds
+        loose = 1 / max(ticks - 1, 1) if 2 * self.repeated > self.readings else 0.0
+        off = 0.0 if own is None else round(abs(own / sensor.rate - 1) - loose, 6)
+        facts = judged("rate", off, source, rate=own, own=sensor.rate, sensor=sensor.name, step=1 / sensor.rate)
+        for kind, pauses, count in (
+            ("gap", self.gaps, "1 gap" if len(self.gaps) == 1 else f"{len(self.gaps)} gaps"),
+            ("back", self.back, "once" if self.backward == 1 else f"{self.backward} times"),
+        ):
+            longest = max(pauses, key=lambda pause: pause.seconds, default=Gap(0, 0.0))
+            words = {"count": count, **vars(longest)}
+            facts += judged(kind, longest.seconds * sensor.rate, source, **words)
+        for kind, counted in (("lost", self.lost or 0), ("repeated", self.repeated), ("unset", self.unset)):
+            share = counted / max(self.readings + counted * (kind == "lost"), 1)
+            facts += judged(kind, share, source, count=counted, share=100 * share)
+        facts += judged("cut off", int(self.cut_off), source)
+        return facts + [fact for note in self.notes for fact in judged("note", 1, source, text=note)]
+
     def __str__(self) -> str:
         rate = "no clock" if self.rate is None else f"{self.rate:.4g} Hz, jitter {1e3 * (self.jitter or 0):.2g} ms"
         parts = [f"{self.readings} readings", f"{rate} (clock: {self.clock})"]
@@ -143,45 +163,29 @@ class Recording:
         return f"Is it another sensor's recording, or another field?{some}"
 
     def facts(self, sensor: Sensor) -> list[Fact]:
-        """What is odd about it, as a recording of `sensor`: its times, what is lost, what its reader noted."""
-        report, words = self.report, dict[str, Any]()
-        own = None if report.clock in (None, "rate") else report.rate
-        ticks = len(self) - report.repeated  # of a clock that has a stamp for many readings, such as whole seconds
-        loose = 1 / max(ticks - 1, 1) if 2 * report.repeated > len(self) else 0.0
-        off = 0.0 if own is None else round(abs(own / sensor.rate - 1) - loose, 6)
-        facts = judged("rate", off, self.source, rate=own, own=sensor.rate, sensor=sensor.name, step=1 / sensor.rate)
-        for kind, pauses, count in (
-            ("gap", report.gaps, "1 gap" if len(report.gaps) == 1 else f"{len(report.gaps)} gaps"),
-            ("back", report.back, "once" if report.backward == 1 else f"{report.backward} times"),
-        ):
-            longest = max(pauses, key=lambda pause: pause.seconds, default=Gap(0, 0.0))
-            words = {"count": count, **vars(longest)}
-            facts += judged(kind, longest.seconds * sensor.rate, self.source, **words)
-        for kind, counted in (("lost", report.lost or 0), ("repeated", report.repeated), ("unset", report.unset)):
-            share = counted / max(len(self) + counted * (kind == "lost"), 1)
-            facts += judged(kind, share, self.source, count=counted, share=100 * share)
-        facts += judged("cut off", int(report.cut_off), self.source)
-        return facts + [fact for note in report.notes for fact in judged("note", 1, self.source, text=note)]
+        """What is odd about it, as a recording of `sensor`."""
+        return self.report.facts(sensor, self.source)
 
     def breaks(self, sensor: Sensor) -> list[int]:
         """The readings before which it is cut: behind a gap of more than ten readings, or a step back by as many."""
         rules = (("gap", self.report.gaps), ("back", self.report.back))
         return sorted(at.index for kind, of in rules for at in of if at.seconds * sensor.rate > RULES[kind].more)
 
-    def stream(self, sensor: Sensor, *, rate: Literal["keep"] | None = None) -> Stream:
+    def stream(self, sensor: Sensor, *, rate: Literal["keep", "resample"] | None = None) -> Stream:
         """All readings as one stream of `sensor`. Warns by a FactWarning of what is odd about it.
 
-        rate: "keep" takes the numbers as they are, whatever their times say.
+        rate: "keep" takes the numbers as they are, whatever their times say; "resample" one each step of the sensor's.
 
         Raises ChannelCountError where they come from another sensor, RecordingError where they have another rate, or a
-        gap of more than ten readings or a step back by as many, and whatever `validate` raises.
+        gap of more than ten readings or a step back by as many, and whatever `validate` and `resampled` raise.
         """
         for fact in self.facts(sensor):
-            if fact.then == "said":
-                warn_of(fact)
-            elif rate is None:
+            if (fact.kind == "rate" and rate is not None) or (fact.argument == "rate" and rate == "keep"):
+                continue
+            if fact.then != "said":
                 raise fact.error()
-        return self.numbers(sensor)
+            warn_of(fact)
+        return (self if rate != "resample" else resampled(self, sensor.rate, ())).numbers(sensor)
 
     def numbers(self, sensor: Sensor) -> Stream:
         """As `stream`, whatever is odd about it."""

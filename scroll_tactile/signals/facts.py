@@ -10,7 +10,8 @@ import math
 import re
 import unicodedata
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -31,11 +32,16 @@ __all__ = [
     "judged",
     "merged",
     "name_fact",
+    "told",
     "touch_facts",
     "warn_of",
 ]
 
 CURE = "make a new memory with a Sensor whose low and high are the least and the most that it sends, in its unit"
+_CUT = (
+    "it is cut at such of more than ten readings, and each part of 0.3 s or more is a touch of its own; rate='keep' "
+    "takes it in one"
+)
 _NAMED = 5  # channels in a sentence
 
 
@@ -68,16 +74,18 @@ RULES = {
     "gap": Rule(
         5,
         "{count} in its times, the longest {seconds:.4g} s before reading {index}",
-        "it is cut where one is longer than ten readings, and each part of 0.3 s or more is a touch of its own",
+        _CUT,
         10,
         "cut",
+        "rate",
     ),
     "back": Rule(
         0,
         "time goes back {count}, by {seconds:.4g} s before reading {index}",
-        "it is cut where that is more than ten readings, and each part of 0.3 s or more is a touch of its own",
+        _CUT,
         10,
         "cut",
+        "rate",
     ),
     "repeated": Rule(0.01, "{share:.3g} % of its readings have the time or the number of the one before"),
     "lost": Rule(0.001, "{count} readings were lost, as its counter says, {share:.3g} % of all"),
@@ -124,15 +132,17 @@ OF_TOUCHES = frozenset(("range", "corner", "constant", "frozen", "top", "still",
 class Fact:
     """Something odd, and what to do about it.
 
-    kind: of `RULES`. size: how much of it. source: of what; "" of readings without a name. text: a sentence, with the
-    cure. then: whether it is only "said", or the recording is "refused" or "cut". argument: as of the error it makes.
-    count: of how many sources it was said, of which `source` is the first. about: tells facts of a kind apart.
+    kind: of `RULES`. size: how much of it. source: of what; "" of readings without a name. text: a sentence, and the
+    cure to it, "" for none. then: whether it is only "said", or the recording is "refused" or "cut". argument: as of
+    the error it makes. count: of how many sources it was said, of which `source` is the first. about: tells facts of a
+    kind apart.
     """
 
     kind: str
     size: float
     source: str
     text: str
+    cure: str = ""
     then: Literal["said", "refused", "cut"] = "said"
     argument: str | None = None
     count: int = 1
@@ -140,11 +150,17 @@ class Fact:
 
     def __str__(self) -> str:
         others = f" and {self.count - 1} more" if self.count > 1 else ""
-        return f"{self.source}{others}: {self.text}" if self.source else self.text
+        return f"{self.source}{others}: {self.sentence}" if self.source else self.sentence
+
+    @property
+    def sentence(self) -> str:
+        """The text with the cure."""
+        return f"{self.text}: {self.cure}" if self.cure else self.text
 
     def to_json(self) -> dict[str, Any]:
         """It in JSON's types."""
-        return {name: getattr(self, name) for name in ("kind", "size", "source", "text", "count")}
+        found = {name: getattr(self, name) for name in ("kind", "size", "source", "count")}
+        return found | {"text": self.sentence}
 
     def error(self) -> RecordingError:
         """The error of a recording that it refuses."""
@@ -156,9 +172,9 @@ def judged(kind: str, size: float, source: str, *, about: str = "", **words: Any
     rule = RULES[kind]
     if not (size >= rule.said and size > 0):
         return []
-    text = rule.text.format(**words) + (f": {rule.cure.format(**words)}" if rule.cure else "")
+    text, cure = rule.text.format(**words), rule.cure.format(**words)
     then = rule.then if size >= rule.more else "said"
-    return [Fact(kind, float(size), source, text, then, rule.argument, about=about)]
+    return [Fact(kind, float(size), source, text, cure, then, rule.argument, about=about)]
 
 
 def merged(facts: Iterable[Fact]) -> list[Fact]:
@@ -178,6 +194,18 @@ def warn_of(fact: Fact, stacklevel: int = 2) -> None:
     """Warn of a fact, by a FactWarning; by a RangeWarning of one of the sensor's range."""
     category = RangeWarning if fact.kind in ("range", "corner") else FactWarning
     warnings.warn(category(str(fact), argument=fact.argument), stacklevel=stacklevel + 1)
+
+
+@contextmanager
+def told() -> Iterator[list[str]]:
+    """Gather what is warned of facts in the block, as sentences, in place of showing it."""
+    found: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", FactWarning)
+        try:
+            yield found
+        finally:
+            found += [str(each.message) for each in caught if issubclass(each.category, FactWarning)]
 
 
 def touch_facts(touch: Stream, source: str = "") -> list[Fact]:

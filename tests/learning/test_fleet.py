@@ -495,7 +495,7 @@ class TestRange:
         with pytest.warns(RangeWarning, match="100 % of the values lie outside the range of sensor 'pad'") as met:
             done = run(tmp_path / "m", [beyond], workers=3)  # a share of each source
         assert [str(each.message) for each in met] == list(map(str, done.facts))
-        assert [str(each.message) for each in first] == [each.text for each in done.facts]
+        assert [str(each.message) for each in first] == [each.sentence for each in done.facts]
         assert met[0].filename == run.__code__.co_filename
         assert [(each.source, each.why) for each in done.refused] == refused
         assert (done.observations, done.repeated, len(done.refused)) == (1, 1, 4)

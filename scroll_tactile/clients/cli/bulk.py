@@ -1,4 +1,4 @@
-"""`scroll-tactile learn`, `fleet`, `evaluate`, `demo` and `report`: many touches, of files and of the simulation."""
+"""`scroll-tactile sensor`, `learn`, `fleet`, `evaluate`, `demo` and `report`: many touches, of files or simulated."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from scroll_tactile.clients.cli.terminal import (
     SensorName,
     Sources,
     confusion_text,
+    console,
     counted,
     facts_as_json,
     no_memory,
@@ -49,11 +50,38 @@ if TYPE_CHECKING:
     from scroll_tactile.clients.learning.learning import Evaluation
     from scroll_tactile.clients.learning.sources import Refused
 
-__all__ = ["demo", "evaluate", "fleet", "learn", "report"]
+__all__ = ["demo", "evaluate", "fleet", "learn", "report", "sensor"]
 
 MOST_SHOWN = 20  # mistakes; JSON and CSV have all
 MOST_NAMES = 40  # of a table of confusions
 SECONDS = 20  # in which a scheduler answers
+MOST_GUESSED = 100  # recordings that a sensor is guessed from
+
+
+@with_options
+def sensor(sources: Sources, *, how: Reading) -> None:
+    """Guess a sensor from recordings of it, and print it as JSON: scroll-tactile sensor FILES > my.json.
+
+    How sure each field is comes on the standard error. The file is for --sensor of learn, fleet, observe and report.
+    """
+    from scroll_tactile.clients.learning.sources import Refused, find_sources
+    from scroll_tactile.recordings import read
+    from scroll_tactile.recordings.guessing import guessed_sensor
+
+    found, refused = find_sources(sources)
+    recordings = []
+    with progress_bar() as progress:
+        for number, source in enumerate(found[:MOST_GUESSED]):
+            progress(source, number, min(len(found), MOST_GUESSED))
+            try:
+                recordings.append(read(source, **vars(how)))
+            except InputError as error:
+                refused.append(Refused.by(error, source))
+    say_refused(refused)
+    guessed, said = guessed_sensor(recordings)
+    for line in said:
+        console(error=True).print(shown(line))
+    typer.echo(guessed.model_dump_json(indent=1, exclude_defaults=True))
 
 
 @with_options

@@ -20,6 +20,7 @@ from scroll_tactile.clients.cli.terminal import (
     AsCsv,
     AsJson,
     Axis,
+    ByTimes,
     Columns,
     MemoryFolder,
     Reading,
@@ -114,8 +115,8 @@ def observe(
     with opened(memory, sensor=chosen, new=True) as learner:
         touch = _one_touch(learner, str(file), options.by_names([], learner.sensor))
         say_facts([fact for fact in touch.facts if fact.kind not in OF_TOUCHES])  # of the others observe warns
-        noted = {"values": values, "labels": labels, "source": stored_source(str(file))}
-        receipt = learner.observe(material, touch.stream, **noted)
+        source = stored_source(str(file))
+        receipt = learner.observe(material, touch.stream, values=values, labels=labels, source=source)
         count = learner.materials[material]
     clipped = f", {receipt.clipped} values outside the sensor's range clipped" if receipt.clipped else ""
     done = f"{receipt.seconds:g} s kept as observation {receipt.sequence}{clipped}"
@@ -133,8 +134,9 @@ def _one_touch(learner: TactileLearner, file: str, options: SourceOptions) -> So
     if isinstance(found[0], Refused):
         raise InputError(found[0].why, argument=found[0].argument)
     if len(found) > 1:
-        why = next((str(fact) for fact in found[0].facts if fact.then == "cut"), file)
-        raise InputError(f"expected one touch; these are {len(found)}. {why}: `scroll-tactile learn` takes each")
+        why = next(str(fact) for fact in found[0].facts if fact.then == "cut")
+        text = f"expected one touch; these are {len(found)}, for `scroll-tactile learn`. {why}"
+        raise InputError(text, argument="rate")
     return found[0]
 
 
@@ -321,13 +323,16 @@ def _constituent(text: str) -> tuple[str, float | bool | tuple[float, str] | Non
     return name.strip(), (share, unit.strip()) if unit else share
 
 
-def compose(memory: MemoryFolder, file: StreamFile, columns: Columns = None, as_json: AsJson = False) -> None:
+def compose(
+    memory: MemoryFolder, file: StreamFile, columns: Columns = None, rate: ByTimes = None, as_json: AsJson = False
+) -> None:
     """Say what a touch in a file feels made of, of all that was described; the memory stays as it is."""
     from scroll_tactile.recordings import read
 
     recording = read(file, columns=columns)
     with opened(memory, mode="read") as learner:
-        made_of = learner.compose(recording.stream(learner.sensor))
+        by: Any = None if rate is None else rate.value
+        made_of = learner.compose(recording.stream(learner.sensor, rate=by))
     if as_json:
         kept = ("presence", "share", "evidence", "unlearned")
         found = [{"constituent": of.name, **{name: getattr(of, name) for name in kept}} for of in made_of.constituents]

@@ -64,6 +64,13 @@ SensorName = Annotated[
     str | None, Option(help="Whose readings they are, as for observe; or give --preset. For a new memory.")
 ]
 Columns = Annotated[str | None, Option(help="Of wider arrays and tables, by places from 0: 25:44, or 0,3,5:9.")]
+ByTimes = Annotated[
+    Rate | None,
+    Option(
+        help="Of recordings that have another rate than the sensor by their times: keep takes the numbers as they are, "
+        "resample a reading each step of the sensor's. Without it they are refused from a fifth on."
+    ),
+]
 Axis = Annotated[str | None, Option(help="An axis of labels, such as slip, to answer by in place of materials.")]
 Scene = Annotated[
     str | None, Option(help="The materials that can be here, separated by commas; all of them otherwise.")
@@ -94,13 +101,7 @@ class Reading:
 class Timed(Reading):
     """The same, as touches of a sensor with a rate of its own."""
 
-    rate: Annotated[
-        Rate | None,
-        Option(
-            help="Of recordings that have another rate than the sensor by their times: keep takes the numbers as they "
-            "are, resample a reading each step of the sensor's. Without it they are refused from a fifth on."
-        ),
-    ] = None
+    rate: ByTimes = None
 
     def options(self, **more: Any) -> SourceOptions:
         """How these recordings are read. Raises InputError for options that do not fit together."""
@@ -243,7 +244,7 @@ def say_facts(facts: Sequence[Fact | FactWarning]) -> None:
 
 def facts_as_json(facts: Sequence[Fact]) -> list[dict[str, Any]]:
     """What is odd about what was read, in JSON's types."""
-    return [fact.to_json() | {"text": in_options(fact.text, fact.argument)} for fact in facts]
+    return [fact.to_json() | {"text": in_options(fact.sentence, fact.argument)} for fact in facts]
 
 
 def shown(text: object) -> str:

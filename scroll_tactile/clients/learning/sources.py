@@ -58,7 +58,8 @@ class SourceOptions:
     At most one of the three names them; without any, episodes name themselves. quantities: that are declared before
     anything is learned, as the table's headings do (`recordings.declared_quantities`), beside those of `annotate`.
     rate: what becomes of a recording that has another rate than the sensor by its times: "keep" takes its numbers as
-    they are, "resample" a reading each step of the sensor's; unless given it is refused from a fifth on.
+    they are, whatever its times say, "resample" a reading each step of the sensor's; unless given it is refused where
+    they differ by a fifth or more.
     names: the channels' columns, by which tables with names are read, and names_of who has them; see `by_names`.
 
     The value of a touch in a column that annotates it is the mean of the touch's readings that have a number there, its
@@ -148,7 +149,7 @@ class SourceOptions:
         )
         recording, facts = in_order(recording, self.names, self.names_of)
         for fact in recording.facts(sensor):
-            if fact.kind == "rate" and self.rate is not None:
+            if (fact.kind == "rate" and self.rate is not None) or (fact.argument == "rate" and self.rate == "keep"):
                 continue
             if fact.then == "refused":
                 raise fact.error()
@@ -166,7 +167,7 @@ class SourceOptions:
         else:
             whole = self.cut == "none" or (self.cut is None and not recording.episodes)
             found = touches(recording, "whole" if whole else "episodes", self.by)
-        breaks = recording.breaks(learner.sensor)
+        breaks = [] if self.rate == "keep" else recording.breaks(learner.sensor)
         return tuple(piece for touch in found for piece in _pieces(touch, breaks, learner.sensor)) if breaks else found
 
 

@@ -99,9 +99,9 @@ def _range(recordings: Sequence[Recording], camera: bool, apart: bool) -> tuple[
 
 
 def _outwards(low: float, high: float) -> tuple[float, float]:
-    """Two ends rounded to two digits of what lies between them, away from it."""
+    """Two ends rounded away from what lies between them, by steps of a twentieth to a half of it."""
     span = (high - low) or abs(high) or 1.0
-    digits = 1 - math.floor(math.log10(span))
+    digits = -math.floor(math.log10(span / 2))
     step = 10.0**-digits
     ends = math.floor(low / step + 1e-9) * step, math.ceil(high / step - 1e-9) * step
     if not ends[0] < ends[1]:

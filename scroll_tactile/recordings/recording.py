@@ -135,7 +135,7 @@ class Recording:
     times: seconds by the clock in the report, float64 of shape (T,); NaN where there is no clock and no rate was given.
     episodes: begin, end and name of each, in order; a label's span is one, too. Empty where the file has none.
     annotations: by heading, the columns that say something of touches: numbers, float64, or texts, of shape (T,).
-    names: of the columns that are its channels; empty where they have none.
+    names: of the columns that are its channels; empty where they have none, or were taken by their places.
     """
 
     source: str
@@ -174,18 +174,20 @@ class Recording:
     def stream(self, sensor: Sensor, *, rate: Literal["keep", "resample"] | None = None) -> Stream:
         """All readings as one stream of `sensor`. Warns by a FactWarning of what is odd about it.
 
+        Channels that have names are taken by those of the sensor's columns, where it has some.
         rate: "keep" takes the numbers as they are, whatever their times say; "resample" one each step of the sensor's.
 
         Raises ChannelCountError where they come from another sensor, RecordingError where they have another rate, or a
         gap of more than ten readings or a step back by as many, and whatever `validate` and `resampled` raise.
         """
-        for fact in self.facts(sensor):
+        ordered, facts = in_order(self, sensor.columns or (), f"sensor {sensor.name!r}")
+        for fact in [*facts, *self.facts(sensor)]:
             if (fact.kind == "rate" and rate is not None) or (fact.argument == "rate" and rate == "keep"):
                 continue
             if fact.then != "said":
                 raise fact.error()
             warn_of(fact)
-        return (self if rate != "resample" else resampled(self, sensor.rate, ())).numbers(sensor)
+        return (ordered if rate != "resample" else resampled(ordered, sensor.rate, ())).numbers(sensor)
 
     def numbers(self, sensor: Sensor) -> Stream:
         """As `stream`, whatever is odd about it."""
@@ -334,5 +336,4 @@ def only_columns(recording: Recording, columns: str) -> Recording:
         chosen = places(columns, recording.readings.shape[1])
     except FieldError as error:
         raise FieldError(f"{recording.source}: {error}", argument=error.argument) from None
-    names = tuple(recording.names[i] for i in chosen) if recording.names else ()
-    return replace(recording, readings=recording.readings[:, chosen], names=names)
+    return replace(recording, readings=recording.readings[:, chosen], names=())  # by place, whatever they are called

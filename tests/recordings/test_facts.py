@@ -154,6 +154,10 @@ def test_a_recording_as_one_stream(tmp_path):
     assert len(resampled(recording, 100).stream(PAD)) == 299
     with pytest.warns(FactWarning, match="94 readings a second"):
         read(table(tmp_path / "t.csv", TOUCH, times=AT / 0.94)).stream(PAD)
+    named = PAD.model_copy(update={"columns": ("c", "a", "b")})
+    with pytest.warns(FactWarning, match="in another order than those of sensor 'pad'"):
+        stream = read(table(tmp_path / "t.csv", TOUCH)).stream(named)
+    assert stream == validate(TOUCH[:, [2, 0, 1]], named)
 
 
 class TestColumns:

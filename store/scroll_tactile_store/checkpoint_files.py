@@ -178,6 +178,11 @@ class CheckpointReader:
             array, _, inside = name.partition("/")
             self._files.setdefault(array, {})[inside] = sha256
 
+    @property
+    def names(self) -> list[str]:
+        """The names of its arrays, the store's own among them."""
+        return list(self._files)
+
     def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
         """Return those of these arrays that it has, or all of the caller's, verified and writable."""
         room, found = self._room, {}
@@ -189,15 +194,6 @@ class CheckpointReader:
                     found[name] = _read_zarr(content)
                 room -= size
         return found
-
-    def damage(self, log: bytes = b"") -> Iterator[DamageError]:
-        """Yield what is wrong with the caller's arrays, or, where a log's identity is given, with the index of that."""
-        for name in self._files:
-            if name == index_name(log) if log else not name.startswith(INDEX):
-                try:
-                    self.arrays([name])
-                except DamageError as damage:
-                    yield damage
 
     def _verified(self, name: str, room: int) -> tuple[dict[str, bytes], int]:
         """Return the files of an array, which are those that were written, and its bytes, at most `room`."""

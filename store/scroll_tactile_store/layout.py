@@ -6,13 +6,12 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
-from scroll_tactile_store.files import is_real_folder, new_file, read_regular, remove_tree, replacing
+from scroll_tactile_store.files import new_file, read_regular, remove_tree, replacing
 from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
 from scroll_tactile_store.log import Log, refuse
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
@@ -190,20 +189,18 @@ def is_number(stem: str) -> bool:
 
 def log_numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
     """Return the numbers of the logs in a store's folder, ascending; unfinished: of half written ones, too."""
-    names = (entry.name for entry in folder.iterdir() if entry.name.startswith(LOG))
-    return _numbers((name.removeprefix(LOG) for name in names), NEW if unfinished else "")
+    return sorted(set(_numbered(folder, LOG, NEW if unfinished else "").values()))
 
 
 def numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
     """Return the numbers of the checkpoints in a store's folder, as `log_numbers` those of logs."""
-    parent = folder / CHECKPOINTS
-    entries = parent.iterdir() if is_real_folder(parent) else ()
-    return _numbers((entry.name for entry in entries), PARTIAL if unfinished else "")
+    return sorted(set(_numbered(folder / CHECKPOINTS, "", PARTIAL if unfinished else "").values()))
 
 
-def _numbers(names: Iterable[str], suffix: str) -> list[int]:
-    stems = {name.removesuffix(suffix) for name in names}
-    return sorted({int(stem) for stem in stems if is_number(stem)})
+def _numbered(parent: Path, prefix: str, suffix: str) -> dict[Path, int]:
+    names = (path.name for path in parent.glob(f"{prefix}*"))
+    stems = {name: name.removeprefix(prefix).removesuffix(suffix) for name in names}
+    return {parent / name: int(stem) for name, stem in stems.items() if is_number(stem)}
 
 
 def holds_store(folder: Path) -> bool:
@@ -260,52 +257,45 @@ def _has_batches(path: Path) -> bool:
 
 
 def require_safe(folder: Path, *, written: bool = False) -> None:
-    """Raise DamageError for the first of `unsafe_entries`."""
-    with reported(folder, "looking at what is there"):
-        for error in unsafe_entries(folder, written=written) if folder.is_dir() else ():
-            raise error
-
-
-def unsafe_entries(folder: Path, *, written: bool = False) -> Iterator[DamageError]:
-    """Yield an error for each thing in a store's folder that is there under a name of ours, and is not of its kind.
+    """Raise DamageError for what is in a store's folder under a name of ours, and is not of its kind.
 
     A link would lead what is read, written or removed out of the folder; to read from a pipe or a device may never
-    end. written: also for a file that is written in place and has another name, which that would change, too. Raises
-    OSError.
+    end. written: also for a file that is written in place and has another name, which that would change, too.
     """
-    for parent in (folder, folder / CHECKPOINTS):
-        for path in parent.iterdir() if is_real_folder(parent.resolve() if parent == folder else parent) else ():
-            is_folder = path.name == CHECKPOINTS if parent == folder else is_number(path.name.removesuffix(PARTIAL))
-            is_file = parent == folder and (path.name.startswith(OURS) or path.name == LOCK_FILE)
+    with reported(folder, "looking at what is there"):
+        for path in (*folder.glob("*"), *folder.glob(f"{CHECKPOINTS}/*")):
+            is_ours = path.name.startswith(OURS) or path.name == LOCK_FILE
+            is_file = path.parent == folder and is_ours
+            is_folder = (
+                path.name == CHECKPOINTS if path.parent == folder else is_number(path.name.removesuffix(PARTIAL))
+            )
             try:
                 status = path.lstat()
             except FileNotFoundError:  # another process may have written it and moved it
                 continue
             if (is_folder and not stat.S_ISDIR(status.st_mode)) or (is_file and not stat.S_ISREG(status.st_mode)):
                 what = "a symbolic link" if stat.S_ISLNK(status.st_mode) else "no regular file or folder"
-                yield DamageError(
+                raise DamageError(
                     f"{path} is {what}, where a store has a file or folder of its own: nothing was read through it. "
                     "Put what belongs there in its place; in a folder that comes from elsewhere trust nothing",
                     path=path,
                 )
-            elif written and is_file and status.st_nlink > 1:
-                yield DamageError(
+            if written and is_file and status.st_nlink > 1:
+                raise DamageError(
                     f"{path} has another name somewhere (a hard link), and what is written here would change it there: "
                     'copy the folder (cp -r) and open the copy, or open this one with mode="read"',
                     path=path,
                 )
 
 
-def remove_unnamed(folder: Path, current: Current) -> None:
-    """Remove logs and checkpoints, finished or not, that `current` does not name; what cannot be removed stays.
-
-    What does not carry a name of ours is left alone.
-    """
+def unnamed(folder: Path, current: Current) -> list[Path]:
+    """Return the logs, checkpoints and drafts of these, which `current` does not name."""
     kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
-    found = [(log_path(folder, number), NEW) for number in log_numbers(folder, unfinished=True)]
-    found += [(checkpoint_path(folder, number), PARTIAL) for number in numbers(folder, unfinished=True)]
-    remove_tree(folder / (CURRENT_FILE + NEW))
-    for path, suffix in found:
-        if path not in kept:
-            remove_tree(path)
-        remove_tree(path.with_name(path.name + suffix))
+    found = {*_numbered(folder, LOG, NEW), *_numbered(folder / CHECKPOINTS, "", PARTIAL)} - kept
+    return [*found, *folder.glob(CURRENT_FILE + NEW)]
+
+
+def remove_unnamed(folder: Path, current: Current) -> None:
+    """Remove what is `unnamed`; what cannot be removed stays, and what does not carry a name of ours."""
+    for path in unnamed(folder, current):
+        remove_tree(path)

@@ -68,8 +68,8 @@ class Log:
     reading, or the one writer, goes on: behind the first frame, until something is scanned. One thread at a time may
     use it.
 
-    write: for whoever holds the writer's lock. identity: of a log whose first frame may be damaged, b"" where nobody
-    knows it; then `header_damage` names that damage, and a scan begins with the first frame that can be found.
+    write: for whoever holds the writer's lock. identity: of a log whose first frame may be damaged; then
+    `header_damage` names that damage, and a scan begins with the first frame that can be found.
 
     Raises VersionError for a newer format, DamageError for what is no log, StoreError, and OSError when it is opened.
     """
@@ -97,10 +97,7 @@ class Log:
             if identity is None:
                 raise
             self.header_damage = damage
-            found = identity or next((frame.identity for frame in self._frames_behind(0, MARK)), None)
-            if found is None:
-                raise
-            self.identity, self._mark = found, MARK + found
+            self.identity, self._mark = identity, MARK + identity
         self.first = self.place
 
     def _first_frame(self) -> Frame:
@@ -146,8 +143,8 @@ class Log:
     def scan(self, damaged: Damaged, durable: LogPlace | None = None) -> Iterator[list[Frame]]:
         """Yield the frames of each batch that was committed behind `place`, verified and in order; move that behind it.
 
-        A batch without its commit frame is not there yet. durable: a place that was noted elsewhere; where it is in the
-        log what is before it is no torn batch.
+        A batch without its commit frame is not there yet. durable: a place that was noted elsewhere; what is before it
+        is no torn batch.
         """
         if self.place == BEGIN:
             self._resume(BEGIN)
@@ -208,32 +205,30 @@ class Log:
     def _proof(self, torn: LogPlace, durable: LogPlace | None) -> str | None:
         """Return what no power cut can have left behind a torn frame, in words; None where there is nothing."""
         if durable is not None and torn.offset < durable.offset:
-            commit = pack_frame(self.identity, torn, COMMIT, b"")[1]  # as it was, where only that is damaged
-            if LogPlace.behind(commit) == durable or self.has_place(durable):
-                return "the place of the newest checkpoint"
+            return "the place of the newest checkpoint"
         known = self._proved  # or each of many damaged frames would be a search of all that is behind it
         if known is None or known.offset <= torn.offset or torn.can_be_torn_before(known):
-            behind = self._frames_behind(torn.offset, self._mark)
+            behind = self._frames_behind(torn.offset)
             self._proved = known = next((frame for frame in behind if not torn.can_be_torn_before(frame)), None)
         return None if known is None else f"frame {known.number} at byte {known.offset}"
 
     def _resume(self, torn: LogPlace) -> bool:
         """Go on behind a damaged frame, at the next that can be found, if any."""
         with reported(self.path, "looking for a frame behind damage"):
-            found = next(filter(torn.is_before, self._frames_behind(torn.offset, self._mark)), None)
+            found = next(filter(torn.is_before, self._frames_behind(torn.offset)), None)
         if found is not None:
             self.place = LogPlace(found.offset, found.number, found.batch, found.previous)
         return found is not None
 
-    def _frames_behind(self, offset: int, mark: bytes) -> Iterator[Frame]:
+    def _frames_behind(self, offset: int) -> Iterator[Frame]:
         """Yield the frames whose first bytes verify, found by what they begin with, wherever they are."""
         for start in range(offset, self.size(), PART):
             data = self._at(start, PART + FRAME_BYTES - 1)
-            found = data.find(mark)
+            found = data.find(self._mark)
             while 0 <= found < PART:
                 if (frame := read_frame(data[found : found + FRAME_BYTES], start + found)) is not None:
                     yield frame
-                found = data.find(mark, found + 1)
+                found = data.find(self._mark, found + 1)
 
     def has_place(self, place: LogPlace) -> bool:
         """Return whether a place is behind the first frame or a batch of this log."""

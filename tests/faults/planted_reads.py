@@ -11,7 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from scroll_tactile_store import backup, checkpoint_files, layout, log, repair, rows
+from scroll_tactile_store import backup, checkpoint_files, layout, log, rows, survey
 from scroll_tactile_store.records import Checkpoint
 from scroll_tactile_store.store import Store
 
@@ -180,6 +180,6 @@ def _all_but_the_first(described: Any, *given: Any) -> Any:
     return dict(list(described(*given).items())[1:])
 
 
-@bug("a repair keeps rows behind damage", repair._Plan, "of")
-def _all_kept(of: Any, cls: Any, survey: Any) -> Any:
-    return dataclasses.replace(of(cls, survey), kept=survey.last)
+@bug("a repair keeps rows behind damage", survey.Survey, "faulty")
+def _nothing_behind(faulty: Any, self: Any, first: int, last: int) -> Any:
+    return faulty(self, first, last) if first == 1 or last < self.last else []

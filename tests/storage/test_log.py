@@ -218,11 +218,11 @@ def test_what_a_writer_does_while_a_reader_looks_for_proof_is_no_damage(copy, mo
     with writing(copy) as writer, Log(copy) as log:
         frames = Log._frames_behind
 
-        def later(log, offset, mark):
+        def later(log, offset):
             if writer.place.number == 14:
                 append(writer, [b"1"])
                 append(writer, [b"2"])
-            return frames(log, offset, mark)
+            return frames(log, offset)
 
         monkeypatch.setattr(Log, "_frames_behind", later)
         assert rest(log) == [*BATCHES, [b"1"], [b"2"]]

@@ -101,11 +101,11 @@ class RamStore:
             self.__dict__.update(_rows=rows, _with_key=keys, last=before)  # at once
             raise
 
-    def heads(self, after: int = 0, *, kind: str | None = None, label: str | None = None) -> Iterator[Head]:
-        """The rows behind one, of a kind and a label."""
+    def heads(self, after: int = 0, *, kind: str | None = None) -> Iterator[Head]:
+        """The rows behind one, of a kind."""
         for sequence in range(after + 1, self.last + 1):
             row = self._rows.get(sequence)
-            if row is not None and kind in (None, row.kind) and label in (None, row.label):
+            if row is not None and kind in (None, row.kind):
                 yield row
 
     def with_key(self, key: bytes) -> Iterator[Head]:

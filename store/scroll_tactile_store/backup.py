@@ -72,7 +72,7 @@ def _copy_named(source: Path, draft: Path, current: Current) -> int:
     with Log(log_path(source, current.log)) as log:
         if current.newest is not None and log.has_place(current.newest.place):
             log.place = current.newest.place
-        rows = Rows(log.place, 0 if current.newest is None else current.newest.last_sequence)
+        rows = Rows(0 if current.newest is None else current.newest.last_sequence)
         rows.catch_up(log)
         with log_path(draft, current.log).open("xb") as copy:
             for offset in range(0, log.place.offset, PART):

@@ -15,7 +15,7 @@ from pathlib import Path
 from shutil import disk_usage
 from typing import Self
 
-from scroll_tactile_store.exceptions import FULL, DamageError, RecordError, StoreClosedError, VersionError, reported
+from scroll_tactile_store.exceptions import FULL, DamageError, StoreClosedError, VersionError, reported
 from scroll_tactile_store.files import dense_size, new_file, open_regular, replacing, sync_open
 from scroll_tactile_store.framing import (
     COMMIT,
@@ -304,8 +304,6 @@ class Log:
 
         After an error the whole batch is not there.
         """
-        if not COMMIT < kind < 2**32 or len(payload) > LARGEST_PAYLOAD:
-            raise RecordError(f"a frame of kind {kind} and {len(payload)} bytes cannot be kept")
         with reported(self.path, "appending to the log"):
             if self._next == self.place:
                 self._settle()  # a batch that could not be taken back
@@ -407,8 +405,6 @@ def create_log(path: Path, header: bytes, frames: Iterable[tuple[int, bytes]] = 
     header: of the caller, for good. A log that is there is replaced; readers keep it open as it was. Raises
     StoreFullError, ReadOnlyError or another StoreError.
     """
-    if len(header) > LARGEST_PAYLOAD:
-        raise RecordError(f"a log's first frame of {len(header)} bytes cannot be kept")
     draft = path.with_name(f"{path.name}.new")
     identity = os.urandom(IDENTITY_BYTES)
     with reported(path, "making a log"), replacing(path, draft):

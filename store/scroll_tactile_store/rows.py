@@ -118,13 +118,15 @@ def read_head(log: Log, offset: int, size: int) -> Head:
 class Rows:
     """Which rows a log holds, in order: of each its sequence, offset, size and the first bytes of its key.
 
-    first: the row before those that follow a place of the log, `begin`. whole: whether those before it are known, too.
+    first: the number that a checkpoint has reached, of which the log may have lost rows. table: of those known already,
+    as `table` gives it.
     """
 
-    def __init__(self, place: LogPlace, first: int = 0) -> None:
-        self.sequences, self.offsets, self.sizes, self.keys = array("Q"), array("Q"), array("Q"), array("Q")
-        self.columns = (self.sequences, self.offsets, self.sizes, self.keys)
-        self.first, self.begin, self.whole = first, place, first == 0
+    def __init__(self, first: int = 0, table: np.ndarray | None = None) -> None:
+        self.sequences, self.offsets, self.sizes, self.keys = self.columns = tuple(array("Q") for _ in range(4))
+        self.first = first
+        for column, values in zip(self.columns, () if table is None else table, strict=False):
+            column.frombytes(values.tobytes())
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -168,12 +170,6 @@ class Rows:
         for column in self.columns:
             del column[count:]
 
-    def prepend(self, earlier: Rows) -> None:
-        """Add the rows before the first place."""
-        for column, before in zip(self.columns, earlier.columns, strict=True):
-            column[:0] = before
-        self.whole = True
-
     def find(self, after: int) -> int:
         """Return the index of the first row behind `after`."""
         return bisect_right(self.sequences, after)
@@ -199,20 +195,10 @@ class Rows:
         count = self.find(last_sequence)
         return np.stack([np.frombuffer(column, np.uint64)[:count] for column in self.columns])
 
-    @classmethod
-    def of_table(cls, table: np.ndarray, until: LogPlace) -> Rows:
-        """Return the rows of a `table` that lie before a place. Raises ValueError where that is none."""
-        rows = cls(until)
-        if table.dtype != np.uint64 or table.ndim != 2 or len(table) != len(rows.columns):
-            raise ValueError(f"an index of rows is no array of {table.dtype.str} and shape {table.shape}")
-        for column, values in zip(rows.columns, table[:, table[1] < until.offset], strict=True):
-            column.frombytes(values.tobytes())
-        return rows
-
 
 def read_back(log: Log) -> Rows:
     """Return the rows of a log that was just written. Raises DamageError where it does not read back whole."""
-    rows = Rows(log.place)
+    rows = Rows()
     rows.catch_up(log)
     if log.place.offset != log.size():
         raise DamageError(

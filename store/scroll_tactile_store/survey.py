@@ -36,7 +36,7 @@ from scroll_tactile_store.rows import ROW, decode_row, read_head, row_sequence
 # Called with what is being done, how many of it are done, and how many there are.
 Progress = Callable[[str, int, int], object]
 REPORT_EVERY = 256  # batches
-ATTEMPTS = 4  # while a writer is at work
+ATTEMPTS = 16  # while a writer is at work
 
 
 @dataclass(frozen=True)

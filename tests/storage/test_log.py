@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from logs import BATCHES, HEADER, KIND, append, build, ends, payload, read, rest, writing
-from scroll_tactile_store import DamageError, RecordError, StoreClosedError, StoreError
+from scroll_tactile_store import DamageError, StoreClosedError, StoreError
 from scroll_tactile_store.framing import FRAME_BYTES
 from scroll_tactile_store.log import AHEAD, LARGEST_STAGED, PART, Log, create_log, refuse
 
@@ -295,13 +295,10 @@ def test_a_frame_is_read_by_its_place_and_verified(copy):
         assert (raised.value.offset, raised.value.frame) == (frames[2].offset, frames[2].number)
 
 
-@pytest.mark.parametrize("kind", [0, 1, 2**32])
-def test_what_a_frame_cannot_be_is_refused_and_the_batch_goes_on(tmp_path, kind):
+def test_a_commit_of_nothing_writes_nothing_and_a_closed_log_is_told_of(tmp_path):
     path = build(tmp_path / "log", [])
     with writing(path) as log:
         log.stage(KIND, b"1")
-        with pytest.raises(RecordError):
-            log.stage(kind, b"")
         log.commit()
         log.commit()  # of nothing
     assert read(path) == [[b"1"]]

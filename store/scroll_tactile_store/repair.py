@@ -96,7 +96,7 @@ def _repair(survey: Survey) -> Repair:
         if start is not None
     ]
     if start is not None and (is_orphan or survey.faulty(survey.compacted + 1, newest)):
-        stand_in, back = start, f"; what rows {newest + 1} to {kept} took back of them counts again"
+        stand_in, back = start, f"; what rows behind {newest} took back of them counts again"
         what = f"rows 1 to {newest} give up their arrays, checkpoint {start.number} stands for them: none of them can"
         lost.append(f"{what} be retracted any more{back if kept > newest else ''}")
     if kept < last:

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scroll_tactile_store.exceptions import DamageError
-from scroll_tactile_store.framing import Frame, LogPlace
+from scroll_tactile_store.exceptions import DamageError, RecordError
+from scroll_tactile_store.framing import LARGEST_PAYLOAD, Frame, LogPlace
 from scroll_tactile_store.log import Log, refuse
-from scroll_tactile_store.records import LARGEST_NUMBER, Head, check_key, check_text, from_json, payload_digest, to_json
+from scroll_tactile_store.records import LARGEST_NUMBER, Head, from_json, payload_digest, to_json
 
 ROW = 2  # the kind of a frame that holds a record
 
@@ -34,11 +34,22 @@ class JournalRow(NamedTuple):
 def encode_row(
     sequence: int, kind: str, label: str, key: bytes, time: float, attributes: str, payload: bytes | None, size: int
 ) -> bytes:
-    """Return the bytes of checked values: `attributes` as JSON, and of arrays that were given up their `size` alone."""
-    texts = (key, kind.encode(), label.encode(), attributes.encode())
-    kept = payload is not None
-    fields = FIELDS.pack(sequence, time, size, kept, *map(len, texts))
-    return b"".join((fields, payload_digest(fields, *texts), *texts, payload or b""))
+    """Return the bytes of a row: `attributes` as JSON, and of arrays that were given up their `size` alone.
+
+    Raises RecordError for values that cannot be kept.
+    """
+    try:
+        texts = (key, kind.encode(), label.encode(), attributes.encode())
+        if not math.isfinite(time):
+            raise ValueError("the time is no finite number of seconds since 1970")
+        fields = FIELDS.pack(sequence, time, size, payload is not None, *map(len, texts))
+        data = b"".join((fields, payload_digest(fields, *texts), *texts, payload or b""))
+        if len(data) > LARGEST_PAYLOAD:
+            raise ValueError(f"it has {len(data)} bytes, and at most {LARGEST_PAYLOAD} are kept")
+    except (AttributeError, TypeError, ValueError, struct.error) as error:
+        what = f"a row of kind {kind!r:.80}, label {label!r:.80}, key {key!r:.80} and time {time!r:.80}"
+        raise RecordError(f"{what} cannot be kept: {error}") from error
+    return data
 
 
 def head_without_arrays(head: Head) -> bytes:
@@ -84,22 +95,12 @@ def decode_head(data: bytes, whole: int) -> Head:
     if payload_digest(data[: FIELDS.size], data[HEAD_BYTES:end]) != data[FIELDS.size : HEAD_BYTES]:
         raise ValueError("a row's head is not as it was written")
     _, time, size, _, *lengths = FIELDS.unpack_from(data)
-    if size > LARGEST_NUMBER or not math.isfinite(time):
-        raise ValueError(f"a row has {size} bytes and the time {time}")
     parts, start = [], HEAD_BYTES
     for length in lengths:
         parts.append(data[start : start + length])
         start += length
     key, kind, label, attributes = parts
-    return Head(
-        row_sequence(data),
-        check_text("the kind", kind.decode()),
-        check_text("the label", label.decode()),
-        check_key(key),
-        time,
-        from_json(attributes.decode()),
-        size,
-    )
+    return Head(row_sequence(data), kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
 
 
 def decode_row(data: bytes) -> JournalRow:

@@ -38,7 +38,7 @@ from scroll_tactile_store.exceptions import (
     reported,
 )
 from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
-from scroll_tactile_store.framing import LARGEST_PAYLOAD, LogPlace
+from scroll_tactile_store.framing import LogPlace
 from scroll_tactile_store.layout import (
     CHECKPOINTS,
     CURRENT_FILE,
@@ -62,11 +62,7 @@ from scroll_tactile_store.records import (
     Checkpoint,
     Head,
     Record,
-    check_key,
-    check_text,
-    check_time,
     from_json,
-    plain_json,
     to_json,
 )
 from scroll_tactile_store.rows import ROW, Rows, decode_row, encode_row, head_without_arrays, read_back, read_head
@@ -303,19 +299,13 @@ class Store:
         ReadOnlyError or another StoreError; after any of them the store can be used on.
         """
         self._check_open(write=True)
-        check_text("the kind", kind)
-        check_text("the label", label)
-        check_key(key)
-        seconds = check_time(clock.time() if time is None else time)
-        known, text = plain_json("attributes", attributes)
-        payload = encode_payload(check_arrays(arrays))
+        seconds = clock.time() if time is None else time
+        text, payload = to_json("attributes", attributes), encode_payload(check_arrays(arrays))
         with self._using("appending a row"):
             if self._batching and self._failed:
                 raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
             sequence = self._rows.last + 1
             data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
-            if len(data) > LARGEST_PAYLOAD:
-                raise RecordError(f"a row of {len(data)} bytes cannot be kept; at most {LARGEST_PAYLOAD}")
             try:
                 frame = self._log.stage(ROW, data)
                 self._rows.append(sequence, frame.offset, frame.size, key)
@@ -325,7 +315,7 @@ class Store:
                 self._failed = True
                 self._undo()
                 raise
-        return Head(sequence, kind, label, key, seconds, known, len(payload))
+        return Head(sequence, kind, label, key, float(seconds), from_json(text), len(payload))
 
     @contextmanager
     def batch(self) -> Iterator[None]:
@@ -416,7 +406,6 @@ class Store:
 
     def with_key(self, key: bytes) -> Iterator[Head]:
         """Yield the records with this key without their arrays. Raises DamageError."""
-        check_key(key)
         with self._using("looking for a key"):
             sequences = self._rows.with_key(key)
         for sequence in sequences:

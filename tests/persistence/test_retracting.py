@@ -244,7 +244,7 @@ def test_what_damage_keeps_from_being_retracted_is_named(path, caplog):
     spoil_row(path, 5)
     repaired = repair_store(path)
     assert repaired.kept == 13
-    assert "what row 13 (1 retract) took back of them counts again" in repaired.lost[-1]
+    assert "what rows behind 12 took back of them counts again" in repaired.lost[-1]
     with TactileLearner.open(path, **SETTINGS) as again:
         require_same(again, OBSERVED, exemplars=False)
         assert again.exemplars == {}  # the repair gave up the rows that held their readings

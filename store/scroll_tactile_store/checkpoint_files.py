@@ -162,10 +162,7 @@ class CheckpointReader:
         with _reading(f"a checkpoint in {header}", header):
             known = _described(header)
             self._room = most_bytes(path)
-            self._files: dict[str, dict[str, str]] = {}  # by array and file
-            for name, sha256 in known["files"].items():
-                array, _, inside = name.partition("/")
-                self._files.setdefault(array, {})[inside] = sha256
+            self.files = dict[str, str](known["files"])  # the sha256 of each file, by its path
         self.number: int = known["number"]
         self.last_sequence: int = known["last_sequence"]
         self.sha256: str = known["sha256"]
@@ -175,12 +172,12 @@ class CheckpointReader:
     @property
     def names(self) -> list[str]:
         """The names of its arrays, the store's own among them."""
-        return list(self._files)
+        return list(dict.fromkeys(name.partition("/")[0] for name in self.files))
 
     def arrays(self, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
         """Return those of these arrays that it has, or all of the caller's, verified and writable."""
         room, found = self._room, {}
-        for name in self._files:
+        for name in self.names:
             if name in names if names is not None else not name.startswith(INDEX):
                 folder = self._path / name
                 with _reading(f"array {name!r} of checkpoint {self.number} in {folder}", folder):
@@ -191,22 +188,23 @@ class CheckpointReader:
 
     def _verified(self, name: str, room: int) -> tuple[dict[str, bytes], int]:
         """Return the files of an array, which are those that were written, and its bytes, at most `room`."""
-        content = {"zarr.json": self._verified_file(name, "zarr.json", LARGEST_DESCRIPTION)}
+        content = {"zarr.json": self._verified_file(f"{name}/zarr.json", LARGEST_DESCRIPTION)}
         chunk, chunks, compressed = _claimed(content["zarr.json"])
         if chunk * chunks > room:
             raise ValueError(f"it claims {chunk * chunks} bytes; the checkpoint's files can stand for {room} more")
-        if chunks != len(own := self._files[name].keys() - content.keys()):
+        own = [file for file in self.files if file.startswith(f"{name}/c")]
+        if chunks != len(own):
             raise ValueError(f"it has {len(own)} files for {chunks} chunks")
-        for inside in own:
-            data = content[inside] = self._verified_file(name, inside, chunk + chunk // 64 + 1024)
+        for file in own:
+            data = content[file.removeprefix(f"{name}/")] = self._verified_file(file, chunk + chunk // 64 + 1024)
             if (declared_size(data) if compressed else len(data)) != chunk:
-                raise ValueError(f"{inside} does not stand for {chunk} bytes")
+                raise ValueError(f"{file} does not stand for {chunk} bytes")
         return content, chunk * chunks
 
-    def _verified_file(self, name: str, inside: str, limit: int) -> bytes:
-        path = self._path / name / inside
+    def _verified_file(self, name: str, limit: int) -> bytes:
+        path = self._path / name
         data = read_regular(path, limit, within=self._path.parent.parent)
-        if hashlib.sha256(data).hexdigest() != self._files[name].get(inside):
+        if hashlib.sha256(data).hexdigest() != self.files.get(name):
             raise DamageError(f"{path} is not what was written: its sha256 differs", path=path)
         return data
 

@@ -18,9 +18,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 __all__ = [
     "FULL",
@@ -71,7 +69,7 @@ class DamageError(StoreError):
         self,
         message: str,
         *,
-        path: Path,
+        path: Path = Path(),
         sequence: int | None = None,
         offset: int | None = None,
         frame: int | None = None,
@@ -81,11 +79,6 @@ class DamageError(StoreError):
         self.sequence = sequence
         self.offset = offset
         self.frame = frame
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A worker's error reaches whoever waits for it."""
-        made_of: dict[str, Any] = {"sequence": self.sequence, "offset": self.offset, "frame": self.frame}
-        return partial(type(self), path=self.path, **made_of), self.args
 
 
 class CompactedError(StoreError):

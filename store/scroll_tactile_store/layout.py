@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,15 +11,12 @@ from typing import Any, Self
 
 from scroll_tactile_store.exceptions import DamageError, NotAStoreError, VersionError, reported
 from scroll_tactile_store.files import new_file, read_regular, remove_tree, replacing
-from scroll_tactile_store.framing import IDENTITY_BYTES, LogPlace
-from scroll_tactile_store.log import Log, refuse
+from scroll_tactile_store.framing import LogPlace
+from scroll_tactile_store.log import Log
 from scroll_tactile_store.records import LARGEST_NUMBER, from_json, json_digest
 
 FORMAT_VERSION = 3
-OLDER = {
-    1: ("0.15 or before", "0.15"),
-    2: ("0.16 to 0.18", "0.18"),
-}  # by which releases, and the last of them
+OLDER = {1: ("0.15 or before", "0.15"), 2: ("0.16 to 0.18", "0.18")}  # by which releases, and the last of them
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
@@ -31,8 +27,6 @@ OURS = (LOG, CURRENT_FILE, HOLDER_FILE)  # how the names of files begin
 
 LARGEST_CURRENT = 2**16  # bytes, of which it has some hundreds
 MOST_DIGITS = 18  # of a number in a name, so that there is room for those after it
-
-HEX = re.compile(r"[0-9a-f]*")
 
 
 @dataclass(frozen=True)
@@ -48,17 +42,14 @@ class NamedCheckpoint:
     sha256: str
     place: LogPlace
 
-    def to_json(self) -> dict[str, Any]:
-        """Return what is written."""
-        place = [self.place.offset, self.place.number, self.place.previous.hex()]
-        return {"number": self.number, "last_sequence": self.last_sequence, "sha256": self.sha256, "place": place}
-
     @classmethod
-    def from_json(cls, found: Any) -> Self:
-        """Return what `to_json` wrote; raise ValueError, TypeError or KeyError for anything else."""
-        offset, number, previous = found["place"]
-        place = LogPlace(_count(offset), _count(number), _count(number), _hex(previous, 16))
-        return cls(_count(found["number"]), _count(found["last_sequence"]), _hex(found["sha256"], 32).hex(), place)
+    def read(cls, known: Any) -> Self | None:
+        """Return what `CURRENT` says of one, if anything. Raises ValueError, TypeError or KeyError for what is none."""
+        if known is None:
+            return None
+        offset, number, previous = known["place"]
+        place = LogPlace(_count(offset), _count(number), _count(number), bytes.fromhex(previous))
+        return cls(_count(known["number"]), _count(known["last_sequence"]), str(known["sha256"]), place)
 
 
 @dataclass(frozen=True)
@@ -88,13 +79,13 @@ class Current:
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the file."""
-        known: dict[str, Any] = {
-            "format": FORMAT_VERSION,
-            "log": [self.log, self.log_identity.hex()],
-            "newest": None if self.newest is None else self.newest.to_json(),
-            "compaction": None if self.compaction is None else self.compaction.to_json(),
-            "last": self.last,
-        }
+        log = [self.log, self.log_identity.hex()]
+        known: dict[str, Any] = {"format": FORMAT_VERSION, "log": log, "newest": None, "compaction": None}
+        for name, named in (("newest", self.newest), ("compaction", self.compaction)):
+            if named is not None:
+                place = [named.place.offset, named.place.number, named.place.previous.hex()]
+                known[name] = vars(named) | {"place": place}
+        known["last"] = self.last
         return (json.dumps(known | {"sha256": json_digest(known)}) + "\n").encode("ascii")
 
     @classmethod
@@ -104,16 +95,11 @@ class Current:
             known: dict[str, Any] = dict(from_json(data.decode("ascii")))
             if known.pop("sha256", None) != json_digest(known):
                 raise ValueError("its sha256 differs")
-            if (version := _count(known["format"])) != FORMAT_VERSION:
-                raise VersionError(other_format(path, version))
+            if known["format"] != FORMAT_VERSION:
+                raise VersionError(other_format(path, known["format"]))
             number, identity = known["log"]
-            newest, compaction = (
-                None if known[name] is None else NamedCheckpoint.from_json(known[name])
-                for name in ("newest", "compaction")
-            )
-            if compaction is not None and (newest is None or newest.last_sequence < compaction.last_sequence):
-                raise ValueError("its compaction checkpoint is newer than its newest checkpoint")
-            return cls(_count(number), _hex(identity, IDENTITY_BYTES), newest, compaction, _count(known.get("last", 0)))
+            named = [NamedCheckpoint.read(known[name]) for name in ("newest", "compaction")]
+            return cls(_count(number), bytes.fromhex(identity), *named, last=_count(known.get("last", 0)))
         except (KeyError, TypeError, ValueError) as error:
             raise _not_as_written(path, error) from error
 
@@ -145,12 +131,6 @@ def _count(value: Any) -> int:
     if type(value) is not int or not 0 <= value <= LARGEST_NUMBER:
         raise ValueError(f"{str(value)[:80]!r} is no number")
     return value
-
-
-def _hex(text: Any, size: int) -> bytes:
-    if not isinstance(text, str) or len(text) != 2 * size or not HEX.fullmatch(text):
-        raise ValueError(f"{str(text)[:80]!r} is not {size} bytes in hexadecimal")
-    return bytes.fromhex(text)
 
 
 def read_current(path: Path) -> Current:
@@ -251,7 +231,7 @@ def _has_batches(path: Path) -> bool:
     """Whether more than its first frame was ever written to a log."""
     try:
         with Log(path) as log:
-            return any(True for _ in log.scan(refuse))
+            return log.size() > log.place.offset
     except DamageError:
         return True
 

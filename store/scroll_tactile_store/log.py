@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from shutil import disk_usage
 from typing import Self
 
 from scroll_tactile_store.exceptions import FULL, DamageError, StoreClosedError, VersionError, reported
@@ -46,10 +45,8 @@ PART = 2**18  # bytes of the file that are looked through at once
 ATTEMPTS = 3
 
 # Zeros are written ahead: to write over them changes nothing but bytes, and fdatasync has no file system's journal to
-# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.) Of a disk that is nearly
-# full the rest is for others.
+# wait for. (Room that was only reserved costs as many bytes on the disk, and thrice the time.)
 AHEAD = 2**20
-SPARE_ROOM = 16 * AHEAD
 LARGEST_STAGED = 2**22  # bytes that wait in memory for their commit
 TOGETHER = 4096  # frames of a batch in a log that replaces another
 NO_ROOM = FULL | {errno.EFBIG}
@@ -102,7 +99,7 @@ class Log:
 
     def _first_frame(self) -> Frame:
         self.size()
-        frame = read_frame(self._at(0, FRAME_BYTES), 0)
+        frame = read_frame(self.at(0, FRAME_BYTES), 0)
         if frame is None:
             raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
         if frame.version > VERSION:
@@ -119,7 +116,7 @@ class Log:
 
     # Reading.
 
-    def _at(self, offset: int, size: int) -> bytes:
+    def at(self, offset: int, size: int) -> bytes:
         """Return so many bytes of the file at an offset, fewer where it ends."""
         os.lseek(self._open(), offset, os.SEEK_SET)
         data = part = os.read(self._descriptor, size)
@@ -166,21 +163,20 @@ class Log:
 
     def _next_batch(self, durable: LogPlace | None) -> tuple[list[Frame], LogPlace | None, str | None]:
         """Return the next batch; or what verifies of it, the place where it ends, and what proves that it was whole."""
-        with reported(self.path, "reading the log"):
-            for attempt in range(ATTEMPTS):
-                frames, torn = self._batch()
-                if torn is None:
-                    return frames, None, None
-                proof = self._proof(torn, durable) if attempt else None
-                if attempt and proof is None:
-                    break
+        for attempt in range(ATTEMPTS):
+            frames, torn = self._batch()
+            if torn is None:
+                return frames, None, None
+            proof = self._proof(torn, durable) if attempt else None
+            if attempt and proof is None:
+                break
         return frames, torn, proof
 
     def _batch(self) -> tuple[list[Frame], LogPlace | None]:
         """Return the frames from the place on that verify, up to a commit frame, or the place where one does not."""
         place, size, frames = self.place, self.size(), list[Frame]()
         while True:
-            data = self._at(place.offset, USUAL)
+            data = self.at(place.offset, USUAL)
             frame = read_frame(data, place.offset)
             if frame is None or not self._is_ours(frame) or not place.holds(frame) or frame.end > size:
                 return frames, place
@@ -197,7 +193,7 @@ class Log:
         """Return the payload of a frame, verified; begin: what was read of it, and maybe of what is behind it."""
         payload = begin[: frame.size]
         if len(payload) < frame.size <= min(LARGEST_PAYLOAD, self.size()):
-            payload += self._at(frame.payload_offset + len(payload), frame.size - len(payload))
+            payload += self.at(frame.payload_offset + len(payload), frame.size - len(payload))
         if len(payload) != frame.size or payload_digest(payload) != frame.digest:
             raise self._damage(f"is damaged: the payload of frame {frame.number} is not as it was written", frame)
         return payload
@@ -214,8 +210,7 @@ class Log:
 
     def _resume(self, torn: LogPlace) -> bool:
         """Go on behind a damaged frame, at the next that can be found, if any."""
-        with reported(self.path, "looking for a frame behind damage"):
-            found = next(filter(torn.is_before, self._frames_behind(torn.offset)), None)
+        found = next(filter(torn.is_before, self._frames_behind(torn.offset)), None)
         if found is not None:
             self.place = LogPlace(found.offset, found.number, found.batch, found.previous)
         return found is not None
@@ -223,7 +218,7 @@ class Log:
     def _frames_behind(self, offset: int) -> Iterator[Frame]:
         """Yield the frames whose first bytes verify, found by what they begin with, wherever they are."""
         for start in range(offset, self.size(), PART):
-            data = self._at(start, PART + FRAME_BYTES - 1)
+            data = self.at(start, PART + FRAME_BYTES - 1)
             found = data.find(self._mark)
             while 0 <= found < PART:
                 if (frame := read_frame(data[found : found + FRAME_BYTES], start + found)) is not None:
@@ -244,14 +239,11 @@ class Log:
         first: so many of its first bytes, or all; only that the frame is there is verified.
         """
         wanted = size if first is None else min(first, size)
-        with reported(self.path, "reading a frame"):
-            data = self._raw(offset, FRAME_BYTES + wanted)
-            frame = read_frame(data, offset)
-            if frame is None or not self._is_ours(frame) or frame.size != size or len(data) < FRAME_BYTES + wanted:
-                raise self._damage(
-                    f"holds no frame with a payload of {size} bytes there", BEGIN._replace(offset=offset)
-                )
-            return self._payload(frame, data[FRAME_BYTES:]) if first is None else data[FRAME_BYTES:]
+        data = self._raw(offset, FRAME_BYTES + wanted)
+        frame = read_frame(data, offset)
+        if frame is None or not self._is_ours(frame) or frame.size != size or len(data) < FRAME_BYTES + wanted:
+            raise self._damage(f"holds no frame with a payload of {size} bytes there", BEGIN._replace(offset=offset))
+        return self._payload(frame, data[FRAME_BYTES:]) if first is None else data[FRAME_BYTES:]
 
     def _raw(self, offset: int, size: int) -> bytes:
         """Return bytes of the log, staged ones, too, fewer where it ends."""
@@ -259,31 +251,24 @@ class Log:
         if 0 <= begin < len(self._staged):
             return bytes(self._staged[begin : begin + size])
         room = self.size() - offset
-        return self._at(offset, min(size, room)) if offset >= 0 and room > 0 else b""
+        return self.at(offset, min(size, room)) if offset >= 0 and room > 0 else b""
 
     def frame_at(self, offset: int) -> Frame | None:
         """Return the frame at an offset, whose payload is not looked at; None where there is none of this log."""
-        with reported(self.path, "reading a frame"):
-            frame = read_frame(self._at(offset, FRAME_BYTES), offset)
-            return frame if frame is not None and self._is_ours(frame) else None
-
-    def bytes_at(self, offset: int, size: int) -> bytes:
-        """Return bytes of the file as they are, fewer where it ends."""
-        with reported(self.path, "copying the log"):
-            return self._at(offset, size)
+        frame = read_frame(self.at(offset, FRAME_BYTES), offset)
+        return frame if frame is not None and self._is_ours(frame) else None
 
     # Writing, by whoever holds the writer's lock.
 
     def prepare(self) -> None:
         """Make ready to append at `place`, behind all that was committed; cut off what a kill or a power cut left."""
-        with reported(self.path, "preparing the log"):
-            self._begin_batch()
-            self._allocated = self.size()
-            parts = (self._at(at, PART) for at in range(self.place.offset, self._allocated, PART))
-            self._settled = not any(part.count(0) < len(part) for part in parts)
-            self._settle()
-            # The last commit may be in the system's memory alone, if its writer was killed before its sync.
-            sync_open(self._descriptor)
+        self._begin_batch()
+        self._allocated = self.size()
+        parts = (self.at(at, PART) for at in range(self.place.offset, self._allocated, PART))
+        self._settled = not any(part.count(0) < len(part) for part in parts)
+        self._settle()
+        # The last commit may be in the system's memory alone, if its writer was killed before its sync.
+        sync_open(self._descriptor)
 
     def _begin_batch(self) -> None:
         """Nothing is staged, and what is written next belongs behind the last commit."""
@@ -304,17 +289,16 @@ class Log:
 
         After an error the whole batch is not there.
         """
-        with reported(self.path, "appending to the log"):
-            if self._next == self.place:
-                self._settle()  # a batch that could not be taken back
-            try:
-                frame = self._pack(kind, payload)
-                if len(self._staged) > LARGEST_STAGED:
-                    self._write()
-            except BaseException:
-                self.rollback()
-                raise
-            return frame
+        if self._next == self.place:
+            self._settle()  # a batch that could not be taken back
+        try:
+            frame = self._pack(kind, payload)
+            if len(self._staged) > LARGEST_STAGED:
+                self._write()
+        except BaseException:
+            self.rollback()
+            raise
+        return frame
 
     def _pack(self, kind: int, payload: bytes) -> Frame:
         data, frame = pack_frame(self.identity, self._next, kind, payload)
@@ -327,9 +311,7 @@ class Log:
         begin, end = self._written, self._written + len(self._staged)
         self._settled = False  # until it is committed
         ahead = end
-        # Asked of the open file, whose folder may have been moved; Windows takes a path alone.
-        where = self.path.parent if os.name == "nt" else self._open()
-        if end > self._allocated and disk_usage(where).free > SPARE_ROOM:
+        if end > self._allocated:
             ahead = -(-end // AHEAD) * AHEAD
         try:
             self._put(begin, self._staged + bytes(ahead - end) if ahead > end else self._staged)
@@ -357,15 +339,14 @@ class Log:
         """
         if self._next == self.place and not seal:
             return
-        with reported(self.path, "making a batch durable"):
-            try:
-                self._pack(COMMIT, b"")
-                self._write()
-                sync_open(self._descriptor, data_only=True)
-            except BaseException:
-                self.rollback()
-                raise
-            self.place, self._settled = self._next, True
+        try:
+            self._pack(COMMIT, b"")
+            self._write()
+            sync_open(self._descriptor, data_only=True)
+        except BaseException:
+            self.rollback()
+            raise
+        self.place, self._settled = self._next, True
 
     def rollback(self) -> None:
         """Forget the staged frames.

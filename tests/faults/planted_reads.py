@@ -23,7 +23,7 @@ from scroll_tactile.persistence import ledger, merge, packing, replaying
 
 @bug("a frame's payload is not verified", log.Log, "_payload")
 def _payload_as_it_is(_: Any, self: Any, frame: Any, begin: bytes) -> Any:
-    return self._at(frame.payload_offset, frame.size)
+    return self.at(frame.payload_offset, frame.size)
 
 
 @bug("CURRENT is not verified", layout.Current, "from_bytes")
@@ -86,7 +86,7 @@ def _other_log_not_noticed(_: Any, self: Any) -> None:
 def _any_index_is_of_this_log(arrays: Any, self: Any, names: Any = None) -> Any:
     found = arrays(self, names)
     if not found and names and next(iter(names)).startswith(checkpoint_files.INDEX):
-        own = [name for name in self._files if name.startswith(checkpoint_files.INDEX)]
+        own = [name for name in self.names if name.startswith(checkpoint_files.INDEX)]
         found = dict.fromkeys(names, *arrays(self, own).values()) if own else {}
     return found
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 from scroll_tactile_store.checkpoint_files import CheckpointReader
-from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, is_missing, reported
+from scroll_tactile_store.exceptions import DamageError, NotAStoreError, StoreError, reported
 from scroll_tactile_store.files import copy_regular, remove_tree, replacing, same_folder
 from scroll_tactile_store.layout import (
     CURRENT_FILE,
@@ -50,9 +50,7 @@ def _copy(source: Path, draft: Path) -> None:
         current, last, failure = read_current(source / CURRENT_FILE), 0, None
         try:
             last = _copy_named(source, draft, current)
-        except (OSError, StoreError) as error:
-            if not isinstance(error, DamageError) and not is_missing(error):
-                raise
+        except (DamageError, FileNotFoundError) as error:
             failure = error
         # A writer removes what it replaces only after `CURRENT` has ceased to name it.
         if read_current(source / CURRENT_FILE) == current:

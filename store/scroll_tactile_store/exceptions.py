@@ -32,7 +32,6 @@ __all__ = [
     "StoreError",
     "StoreFullError",
     "VersionError",
-    "is_missing",
     "reported",
 ]
 
@@ -99,11 +98,6 @@ class StoreClosedError(StoreError):
 
 class RecordError(StoreError, ValueError):
     """A label, key, time, attribute or array that the store cannot keep as it is."""
-
-
-def is_missing(error: BaseException) -> bool:
-    """Return whether an error is, or was raised for, a file that is not there."""
-    return isinstance(error, FileNotFoundError) or isinstance(error.__cause__, FileNotFoundError)
 
 
 @contextmanager

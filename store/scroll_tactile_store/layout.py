@@ -193,7 +193,7 @@ def holds_store(folder: Path) -> bool:
         if not folder.exists():
             return False
         if not folder.is_dir():
-            raise NotAStoreError(f"{folder} is a file; a store is a folder")
+            raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
         require_safe(folder)
         try:
             read_current(folder / CURRENT_FILE)

@@ -69,13 +69,13 @@ class WriterLock:
     def _refusal(self) -> str:
         try:
             holder = json.loads(read_regular(self._folder / HOLDER_FILE, LARGEST_NOTE))
-            pid, host, since = int(holder["pid"]), str(holder["host"]), str(holder["since"])
-            who = f"process {pid} on {host if host.isprintable() else ascii(host)} since {ascii(since)[1:-1]}"
+            who = f"process {holder['pid']} on {holder['host']} since {holder['since']}"
         except (OSError, ValueError, TypeError, KeyError, RecursionError, DamageError):
             # The holder writes the note just after it takes the lock and removes it just before it releases it.
             who = "a process that left no note of itself"
+        shown = who if who.isprintable() else ascii(who)
         return (
-            f"{self._folder} is being written by {who}: close the store there (the lock frees itself when "
+            f"{self._folder} is being written by {shown}: close the store there (the lock frees itself when "
             'that process ends), or open it here with mode="read"'
         )
 

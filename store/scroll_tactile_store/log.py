@@ -21,7 +21,6 @@ from scroll_tactile_store.framing import (
     FRAME_BYTES,
     HEADER,
     IDENTITY_BYTES,
-    LARGEST_PAYLOAD,
     MARK,
     NO_CHECKSUM,
     VERSION,
@@ -75,6 +74,7 @@ class Log:
         self.path, self.header = path, b""
         self.header_damage: DamageError | None = None
         self._proved: Frame | None = None
+        self._staged, self._written = bytearray(), 0
         self._descriptor = open_regular(path, os.O_RDWR if write else os.O_RDONLY)
         try:
             self._read_header(identity)
@@ -98,7 +98,6 @@ class Log:
         self.first = self.place
 
     def _first_frame(self) -> Frame:
-        self.size()
         frame = read_frame(self.at(0, FRAME_BYTES), 0)
         if frame is None:
             raise self._damage("does not begin as a log, or its first frame is not as it was written", BEGIN)
@@ -117,7 +116,12 @@ class Log:
     # Reading.
 
     def at(self, offset: int, size: int) -> bytes:
-        """Return so many bytes of the file at an offset, fewer where it ends."""
+        """Return so many bytes of the log at an offset, staged ones, too; fewer where it ends."""
+        begin = offset - self._written
+        if 0 <= begin < len(self._staged):
+            return bytes(self._staged[begin : begin + size])
+        if (size := min(size, self.size() - offset)) <= 0 or offset < 0:
+            return b""
         os.lseek(self._open(), offset, os.SEEK_SET)
         data = part = os.read(self._descriptor, size)
         while part and len(data) < size:
@@ -192,7 +196,7 @@ class Log:
     def _payload(self, frame: Frame, begin: bytes) -> bytes:
         """Return the payload of a frame, verified; begin: what was read of it, and maybe of what is behind it."""
         payload = begin[: frame.size]
-        if len(payload) < frame.size <= min(LARGEST_PAYLOAD, self.size()):
+        if len(payload) < frame.size:
             payload += self.at(frame.payload_offset + len(payload), frame.size - len(payload))
         if len(payload) != frame.size or payload_digest(payload) != frame.digest:
             raise self._damage(f"is damaged: the payload of frame {frame.number} is not as it was written", frame)
@@ -239,19 +243,11 @@ class Log:
         first: so many of its first bytes, or all; only that the frame is there is verified.
         """
         wanted = size if first is None else min(first, size)
-        data = self._raw(offset, FRAME_BYTES + wanted)
+        data = self.at(offset, FRAME_BYTES + wanted)
         frame = read_frame(data, offset)
         if frame is None or not self._is_ours(frame) or frame.size != size or len(data) < FRAME_BYTES + wanted:
             raise self._damage(f"holds no frame with a payload of {size} bytes there", BEGIN._replace(offset=offset))
         return self._payload(frame, data[FRAME_BYTES:]) if first is None else data[FRAME_BYTES:]
-
-    def _raw(self, offset: int, size: int) -> bytes:
-        """Return bytes of the log, staged ones, too, fewer where it ends."""
-        begin = offset - self._written
-        if 0 <= begin < len(self._staged):
-            return bytes(self._staged[begin : begin + size])
-        room = self.size() - offset
-        return self.at(offset, min(size, room)) if offset >= 0 and room > 0 else b""
 
     def frame_at(self, offset: int) -> Frame | None:
         """Return the frame at an offset, whose payload is not looked at; None where there is none of this log."""

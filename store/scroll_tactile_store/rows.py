@@ -6,7 +6,7 @@ import math
 import struct
 from array import array
 from bisect import bisect_left, bisect_right
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,17 +58,11 @@ def head_without_arrays(head: Head) -> bytes:
     return encode_row(head.sequence, head.kind, head.label, head.key, head.time, text, None, head.size)
 
 
-def _fields(data: bytes) -> tuple[Any, ...]:
-    if len(data) < HEAD_BYTES:
-        raise ValueError(f"a row has at least {HEAD_BYTES} bytes, not {len(data)}")
-    return FIELDS.unpack_from(data)
-
-
 def row_sequence(data: bytes) -> int:
     """Return the sequence of a row, of which these are the first HEAD_BYTES or more; raise ValueError for none."""
-    sequence: int = _fields(data)[0]
-    if not 1 <= sequence <= LARGEST_NUMBER:
-        raise ValueError(f"a row has the sequence {sequence}")
+    sequence = int.from_bytes(data[:8], "little")
+    if len(data) < HEAD_BYTES or not 1 <= sequence <= LARGEST_NUMBER:
+        raise ValueError(f"a row of {len(data)} bytes has the sequence {sequence}")
     return sequence
 
 
@@ -77,42 +71,35 @@ def key_prefix(key: bytes) -> int:
     return int.from_bytes(key[:8], "little")
 
 
-def _head_size(data: bytes, whole: int) -> int:
-    """Return the bytes of a row of `whole` bytes without its arrays; raise ValueError for no row."""
-    _, _, size, kept, *lengths = _fields(data)
-    end: int = HEAD_BYTES + sum(lengths)
-    if end + (size if kept else 0) != whole or kept > 1:
-        raise ValueError(f"a row of {whole} bytes says that it has {end} and {size}")
-    return end
-
-
 def decode_head(data: bytes, whole: int) -> Head:
     """Return the head of a row of `whole` bytes, of which `data` has the head, verified by its own digest.
 
     Raises ValueError for what `encode_row` never made.
     """
-    end = _head_size(data, whole)
-    if payload_digest(data[: FIELDS.size], data[HEAD_BYTES:end]) != data[FIELDS.size : HEAD_BYTES]:
-        raise ValueError("a row's head is not as it was written")
-    _, time, size, _, *lengths = FIELDS.unpack_from(data)
-    parts, start = [], HEAD_BYTES
+    sequence = row_sequence(data)
+    _, time, size, kept, *lengths = FIELDS.unpack_from(data)
+    parts, end = [], HEAD_BYTES
     for length in lengths:
-        parts.append(data[start : start + length])
-        start += length
+        parts.append(data[end : end + length])
+        end += length
+    if payload_digest(data[: FIELDS.size], *parts) != data[FIELDS.size : HEAD_BYTES] or end + kept * size != whole:
+        raise ValueError("a row's head is not as it was written")
     key, kind, label, attributes = parts
-    return Head(row_sequence(data), kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
+    return Head(sequence, kind.decode(), label.decode(), key, time, from_json(attributes.decode()), size)
 
 
 def decode_row(data: bytes) -> JournalRow:
     """Return the record; raise ValueError for what `encode_row` never made."""
     head = decode_head(data, len(data))
-    return JournalRow(head, data[_head_size(data, len(data)) :] if FIELDS.unpack_from(data)[3] else None)
+    _, _, size, kept, *_ = FIELDS.unpack_from(data)
+    return JournalRow(head, data[len(data) - size :] if kept else None)
 
 
 def read_head(log: Log, offset: int, size: int) -> Head:
     """Return the head of the row in the frame at an offset. Raises DamageError, and ValueError for no row."""
     data = log.read(offset, size, first=USUAL_HEAD)
-    needed = _head_size(data, size)
+    row_sequence(data)
+    needed = HEAD_BYTES + sum(FIELDS.unpack_from(data)[4:])
     return decode_head(data if needed <= len(data) else log.read(offset, size, first=needed), size)
 
 
@@ -163,7 +150,9 @@ class Rows:
         except ValueError as error:
             what = f"{log.path} has a frame that is no row (byte {frame.offset}): {error}"
             refuse(DamageError(what, path=log.path, offset=frame.offset), [])
-        self.append(sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, _fields(data)[4])])
+        self.append(
+            sequence, frame.offset, frame.size, data[HEAD_BYTES : HEAD_BYTES + min(8, FIELDS.unpack_from(data)[4])]
+        )
 
     def cut(self, place: LogPlace) -> None:
         """Forget the rows behind a place, behind which nothing is left."""

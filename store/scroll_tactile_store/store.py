@@ -34,7 +34,6 @@ from scroll_tactile_store.exceptions import (
     RecordError,
     StoreClosedError,
     StoreError,
-    is_missing,
     reported,
 )
 from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
@@ -116,12 +115,9 @@ class Store:
             raise RecordError(f"mode must be 'write' or 'read', not {mode!r}")
         folder = store_folder(path)
         kept = None if identity is None else to_json("identity", identity)
-        if is_file(folder):
-            if mode == "write":
-                raise NotAStoreError(f'{folder} is a file: a packed store is opened with mode="read", or merged')
-        elif not holds_store(folder) and (mode == "read" or kept is None):
-            hint = "" if mode == "read" else "; give an identity to make one"
-            raise NotAStoreError(f"{folder} holds no store{hint}")
+        is_packed = mode == "read" and is_file(folder)
+        if not is_packed and not holds_store(folder) and (mode == "read" or kept is None):
+            raise NotAStoreError(f"{folder} holds no store; to make one, open it to write and give an identity")
         return cls(folder, kept, mode)
 
     def __init__(self, path: Path, identity: str | None, mode: Literal["write", "read"]) -> None:
@@ -217,8 +213,7 @@ class Store:
                 table = reader.arrays([name])[name].astype(np.uint64)
                 return table[:, table[1] < named.place.offset]
         except (StoreError, LookupError) as error:
-            if not is_missing(error):  # as where a writer has replaced it
-                logger.warning("%s: rows are looked for in the log itself: %s", log.path, error)
+            logger.info("%s: rows are looked for in the log itself: %s", log.path, error)
         return None
 
     @contextmanager
@@ -391,7 +386,9 @@ class Store:
             last = self._rows.last
             if type(sequence) is not int or not 1 <= sequence <= last:
                 raise RecordError(f"{self.path} has records 1 to {last}, not {sequence!r}")
-            return cast(Record, self._row(sequence, arrays=True))
+            if (row := self._row_behind(sequence - 1, sequence, arrays=True)) is None:
+                raise self._given_up(sequence)  # a repair left it out
+            return cast(Record, row)
 
     def records(self, after: int = 0) -> Iterator[Record]:
         """Yield the records behind sequence `after`, verified and in order, up to the last at the start.
@@ -410,8 +407,8 @@ class Store:
             sequences = self._rows.with_key(key)
         for sequence in sequences:
             with self._using("reading a row"):
-                head = self._row(sequence, arrays=False)
-            if head.key == key:
+                head = self._row_behind(sequence - 1, sequence, arrays=False)
+            if head is not None and head.key == key:
                 yield head
 
     def _rows_behind(self, after: int, *, arrays: bool) -> Iterator[Head]:
@@ -421,35 +418,34 @@ class Store:
         def rows(after: int) -> Iterator[Head]:
             while after < last:
                 with self._using(f"reading rows behind {after}"):
-                    if (after := self._next_row(after, last)) > last:
-                        return  # those that are left gave up their arrays, and a repair left them out
-                    head = self._row(after, arrays=arrays)
+                    head = self._row_behind(after, last, arrays=arrays)
+                if head is None:
+                    return  # those that are left gave up their arrays, and a repair left them out
                 yield head
+                after = head.sequence
 
         return rows(after)
 
-    def _next_row(self, after: int, last: int) -> int:
-        """Return the first row behind `after`, or one behind `last`. Raises DamageError where one is missing."""
+    def _row_behind(self, after: int, last: int, *, arrays: bool) -> Head | None:
+        """Return the first row behind one and up to `last`, verified, None where there is none; arrays: as a record.
+
+        Raises DamageError, also where one is missing, and CompactedError for compacted arrays.
+        """
         index = self._rows.find(after)
-        found = self._rows.sequences[index] if index < len(self._rows) else last + 1
+        sequence = self._rows.sequences[index] if index < len(self._rows) else last + 1
         # Of compacted ones a repair may have left some out.
-        first, through = 1 + max(after, self._current.compacted), min(found - 1, last)
+        first, through = 1 + max(after, self._current.compacted), min(sequence - 1, last)
         if first <= through:
             missing = f"row {through} is missing" if first == through else f"rows {first} to {through} are missing"
             raise self._damage(f"{missing} from", through)
-        return found
-
-    def _row(self, sequence: int, *, arrays: bool) -> Head:
-        """Return a row, verified; arrays: as a record. Raises DamageError, and CompactedError for compacted arrays."""
-        if self._next_row(sequence - 1, sequence) != sequence:
-            raise self._given_up(sequence)  # a repair left it out
-        index = self._rows.find(sequence - 1)
+        if sequence > last:
+            return None
         offset, size = self._rows.offsets[index], self._rows.sizes[index]
         try:
-            if not arrays:
-                head, payload = read_head(self._log, offset, size), None
-            else:
+            if arrays:
                 head, payload = decode_row(self._log.read(offset, size))
+            else:
+                head, payload = read_head(self._log, offset, size), None
             if head.sequence != sequence:
                 raise ValueError(f"it has the number {head.sequence}")
             if not arrays:
@@ -679,7 +675,9 @@ class Store:
         rows = self._rows
         for index, sequence in enumerate(rows.sequences):
             if sequence <= last_sequence:
-                yield head_without_arrays(self._row(sequence, arrays=False))
+                head = self._row_behind(sequence - 1, sequence, arrays=False)
+                assert head is not None
+                yield head_without_arrays(head)
                 continue
             try:
                 yield self._log.read(rows.offsets[index], rows.sizes[index])

@@ -47,17 +47,16 @@ def back_up(source: Path, destination: Path, progress: Progress | None) -> None:
 def _copy(source: Path, draft: Path) -> None:
     """Copy what `CURRENT` names, and begin again where a writer replaced some of it meanwhile."""
     for _ in range(ATTEMPTS):
-        current, last, failure = read_current(source / CURRENT_FILE), 0, None
+        current = read_current(source / CURRENT_FILE)
+        # A writer removes what it replaces only after `CURRENT` has ceased to name it.
         try:
             last = _copy_named(source, draft, current)
-        except (DamageError, FileNotFoundError) as error:
-            failure = error
-        # A writer removes what it replaces only after `CURRENT` has ceased to name it.
-        if read_current(source / CURRENT_FILE) == current:
-            if failure is not None:
-                raise failure
-            write_current(draft, replace(current, last=max(last, current.last)))
-            return
+            if read_current(source / CURRENT_FILE) == current:
+                write_current(draft, replace(current, last=max(last, current.last)))
+                return
+        except (DamageError, FileNotFoundError):
+            if read_current(source / CURRENT_FILE) == current:
+                raise
         for entry in draft.iterdir():
             remove_tree(entry)
     raise StoreError(f"{source} changed {ATTEMPTS} times while it was copied: back it up when less is written")

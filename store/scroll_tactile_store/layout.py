@@ -20,6 +20,7 @@ OLDER = {1: ("0.15 or before", "0.15"), 2: ("0.16 to 0.18", "0.18")}  # by which
 CURRENT_FILE = "CURRENT"
 LOG = "log-"
 CHECKPOINTS = "checkpoints"
+CHECKPOINT = f"{CHECKPOINTS}/"  # begins the paths of checkpoints, as LOG those of logs
 PARTIAL, NEW, DAMAGED = ".partial", ".new", ".damaged"
 LOCK_FILE, HOLDER_FILE = "lock", "holder.json"
 LEGACY_FILE = "journal.sqlite"  # of releases 0.x
@@ -167,20 +168,18 @@ def is_number(stem: str) -> bool:
     return stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS
 
 
-def log_numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
-    """Return the numbers of the logs in a store's folder, ascending; unfinished: of half written ones, too."""
-    return sorted(set(_numbered(folder, LOG, NEW if unfinished else "").values()))
+def numbers(folder: Path, begin: str, end: str = "") -> list[int]:
+    """Return the numbers of the logs (begin: LOG) or checkpoints (CHECKPOINT) in a store's folder, ascending.
+
+    end: of drafts of them, which count, too.
+    """
+    return sorted(set(_numbered(folder, begin, end).values()))
 
 
-def numbers(folder: Path, *, unfinished: bool = False) -> list[int]:
-    """Return the numbers of the checkpoints in a store's folder, as `log_numbers` those of logs."""
-    return sorted(set(_numbered(folder / CHECKPOINTS, "", PARTIAL if unfinished else "").values()))
-
-
-def _numbered(parent: Path, prefix: str, suffix: str) -> dict[Path, int]:
-    names = (path.name for path in parent.glob(f"{prefix}*"))
-    stems = {name: name.removeprefix(prefix).removesuffix(suffix) for name in names}
-    return {parent / name: int(stem) for name, stem in stems.items() if is_number(stem)}
+def _numbered(folder: Path, begin: str, end: str) -> dict[Path, int]:
+    names = {path: path.relative_to(folder).as_posix() for path in folder.glob(f"{begin}*")}
+    stems = {path: name.removeprefix(begin).removesuffix(end) for path, name in names.items()}
+    return {path: int(stem) for path, stem in stems.items() if is_number(stem)}
 
 
 def holds_store(folder: Path) -> bool:
@@ -206,23 +205,22 @@ def holds_store(folder: Path) -> bool:
                 "recordings, or keep that release to read it"
             )
         # The first log is made before `CURRENT`: a writer may have died in between.
-        logs = [log_path(folder, number).name for number in log_numbers(folder)]
-        traces = [name for name in logs if name != log_path(folder, 1).name or _has_batches(folder / name)]
-        traces += [CHECKPOINTS] if numbers(folder) else []
-        traces += [name for name in names if DAMAGED in name]
+        logs, first = [log_path(folder, number) for number in numbers(folder, LOG)], log_path(folder, 1)
+        traces = [log.name for log in logs if log != first or _has_batches(log)]
+        traces += [name for name in names if DAMAGED in name] + [CHECKPOINTS] * any(numbers(folder, CHECKPOINT))
         foreign = [name for name in names if not name.startswith(OURS) and name not in (LOCK_FILE, CHECKPOINTS)]
         if os.path.lexists(folder / CURRENT_FILE):
             return True  # another process made it meanwhile
         if traces:
             raise DamageError(
-                f"{folder} has {' and '.join(sorted(traces))} but no {CURRENT_FILE}: put it back from a copy, or "
-                "repair the store (repair_store), which finds what it named",
+                f"{folder} has {' and '.join(traces)} but no {CURRENT_FILE}: put it back from a copy, or repair the "
+                "store (repair_store), which finds what it named",
                 path=folder / CURRENT_FILE,
             )
         if foreign:
             raise NotAStoreError(
-                f"{folder} holds no store but other things ({', '.join(foreign[:3])}"
-                f"{', …' if len(foreign) > 3 else ''}): nothing was written; choose an empty or a new folder"
+                f"{folder} holds no store but other things ({', '.join(foreign[:3])}…): nothing was written; choose an "
+                "empty or a new folder"
             )
         return False
 
@@ -243,12 +241,11 @@ def require_safe(folder: Path, *, written: bool = False) -> None:
     end. written: also for a file that is written in place and has another name, which that would change, too.
     """
     with reported(folder, "looking at what is there"):
-        for path in (*folder.glob("*"), *folder.glob(f"{CHECKPOINTS}/*")):
-            is_ours = path.name.startswith(OURS) or path.name == LOCK_FILE
-            is_file = path.parent == folder and is_ours
-            is_folder = (
-                path.name == CHECKPOINTS if path.parent == folder else is_number(path.name.removesuffix(PARTIAL))
-            )
+        for path in (*folder.glob("*"), *folder.glob(f"{CHECKPOINT}*")):
+            if path.parent == folder:
+                is_folder, is_file = path.name == CHECKPOINTS, path.name.startswith(OURS) or path.name == LOCK_FILE
+            else:
+                is_folder, is_file = is_number(path.name.removesuffix(PARTIAL)), False
             try:
                 status = path.lstat()
             except FileNotFoundError:  # another process may have written it and moved it
@@ -271,7 +268,7 @@ def require_safe(folder: Path, *, written: bool = False) -> None:
 def unnamed(folder: Path, current: Current) -> list[Path]:
     """Return the logs, checkpoints and drafts of these, which `current` does not name."""
     kept = {log_path(folder, current.log), *(checkpoint_path(folder, named.number) for named in current.checkpoints)}
-    found = {*_numbered(folder, LOG, NEW), *_numbered(folder / CHECKPOINTS, "", PARTIAL)} - kept
+    found = {*_numbered(folder, LOG, NEW), *_numbered(folder, CHECKPOINT, PARTIAL)} - kept
     return [*found, *folder.glob(CURRENT_FILE + NEW)]
 
 

@@ -283,17 +283,13 @@ class Log:
     def stage(self, kind: int, payload: bytes) -> Frame:
         """Add a frame to the batch that the next `commit` makes durable; `kind` is 2 or more, the caller's.
 
-        After an error the whole batch is not there.
+        Raises OSError; then, and when `commit` fails, `rollback` is the caller's to call.
         """
         if self._next == self.place:
             self._settle()  # a batch that could not be taken back
-        try:
-            frame = self._pack(kind, payload)
-            if len(self._staged) > LARGEST_STAGED:
-                self._write()
-        except BaseException:
-            self.rollback()
-            raise
+        frame = self._pack(kind, payload)
+        if len(self._staged) > LARGEST_STAGED:
+            self._write()
         return frame
 
     def _pack(self, kind: int, payload: bytes) -> Frame:
@@ -306,17 +302,15 @@ class Log:
         """Write what is staged, with one call, and zeros behind it where the file ends."""
         begin, end = self._written, self._written + len(self._staged)
         self._settled = False  # until it is committed
-        ahead = end
-        if end > self._allocated:
-            ahead = -(-end // AHEAD) * AHEAD
+        zeros = bytes(-end % AHEAD) if end > self._allocated else b""
         try:
-            self._put(begin, self._staged + bytes(ahead - end) if ahead > end else self._staged)
+            self._put(begin, self._staged + zeros if zeros else self._staged)
         except OSError as error:
-            if ahead == end or error.errno not in NO_ROOM:
+            if not zeros or error.errno not in NO_ROOM:
                 raise
+            zeros = b""
             self._put(begin, self._staged)
-            ahead = end
-        self._allocated = max(self._allocated, ahead)
+        self._allocated = max(self._allocated, end + len(zeros))
         self._written, self._staged = end, bytearray()
 
     def _put(self, offset: int, data: bytearray) -> None:
@@ -330,18 +324,13 @@ class Log:
         """Make the staged frames durable, all of them or none; without any it does nothing.
 
         seal: also where there are none. Such a batch proves damage of the one before it; what befalls the last batch
-        cannot be told from what a power cut leaves. Raises StoreFullError or another StoreError, and then the log is
-        as it was at the last commit.
+        cannot be told from what a power cut leaves. Raises OSError.
         """
         if self._next == self.place and not seal:
             return
-        try:
-            self._pack(COMMIT, b"")
-            self._write()
-            sync_open(self._descriptor, data_only=True)
-        except BaseException:
-            self.rollback()
-            raise
+        self._pack(COMMIT, b"")
+        self._write()
+        sync_open(self._descriptor, data_only=True)
         self.place, self._settled = self._next, True
 
     def rollback(self) -> None:

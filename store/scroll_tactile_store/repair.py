@@ -13,9 +13,11 @@ from scroll_tactile_store.exceptions import DamageError, reported
 from scroll_tactile_store.files import store_folder, sync_folder
 from scroll_tactile_store.layout import (
     DAMAGED,
+    LOG,
+    NEW,
     Current,
-    log_numbers,
     log_path,
+    numbers,
     remove_unnamed,
     require_safe,
     write_current,
@@ -106,7 +108,7 @@ def _repair(survey: Survey) -> Repair:
         lost.append(f"nothing of {survey.path} can be read: the rows behind {newest}, if there were any, are lost")
     lost += [f"checkpoint {int(path.name)}: {damage}" for path, damage in survey.spoilt.items()]
 
-    number = 1 + max(log_numbers(folder, unfinished=True), default=0)
+    number = 1 + max(numbers(folder, LOG, NEW), default=0)
     compacted = 0 if stand_in is None else stand_in.last_sequence
     path = log_path(folder, number)
     identity = create_log(path, to_json("identity", survey.identity).encode(), _rows(survey, kept, compacted))
@@ -117,7 +119,7 @@ def _repair(survey: Survey) -> Repair:
             for each in (start, stand_in)
         ]
     current = Current(number, identity, *named, kept)
-    damaged = [*survey.spoilt, *(log_path(folder, other) for other in log_numbers(folder) if other != number)]
+    damaged = [*survey.spoilt, *(log_path(folder, other) for other in numbers(folder, LOG) if other != number)]
     aside = {each: _put_aside(each) for each in damaged if each.exists()}
     write_current(folder, current)
     remove_unnamed(folder, current)

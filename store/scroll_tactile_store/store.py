@@ -39,13 +39,16 @@ from scroll_tactile_store.exceptions import (
 from scroll_tactile_store.files import is_file, remove_tree, store_folder, sync_folder, tree_size
 from scroll_tactile_store.framing import LogPlace
 from scroll_tactile_store.layout import (
+    CHECKPOINT,
     CHECKPOINTS,
     CURRENT_FILE,
+    LOG,
+    NEW,
+    PARTIAL,
     Current,
     NamedCheckpoint,
     checkpoint_path,
     holds_store,
-    log_numbers,
     log_path,
     numbers,
     read_current,
@@ -301,15 +304,11 @@ class Store:
                 raise StoreError(f"nothing more can be appended to {self.path} in this batch: a row of it failed")
             sequence = self._rows.last + 1
             data = encode_row(sequence, kind, label, key, seconds, text, payload, len(payload))
-            try:
+            with self._undoing():
                 frame = self._log.stage(ROW, data)
                 self._rows.append(sequence, frame.offset, frame.size, key)
                 if not self._batching:
                     self._make_durable()
-            except BaseException:
-                self._failed = True
-                self._undo()
-                raise
         return Head(sequence, kind, label, key, float(seconds), from_json(text), len(payload))
 
     @contextmanager
@@ -328,13 +327,12 @@ class Store:
             with self._using("beginning a batch"):
                 self._batching, self._failed = True, False
             try:
-                yield
-                if self._failed:
-                    raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
-                self._make_durable()
-            except BaseException:
-                self._undo()
-                raise
+                with self._undoing():
+                    yield
+                    if self._failed:
+                        raise StoreError(f"nothing of this batch was kept in {self.path}: a row of it failed")
+                    with reported(self.path, "making a batch durable"):
+                        self._make_durable()
             finally:
                 self._batching = False
 
@@ -343,10 +341,16 @@ class Store:
         if not self._current.last and self._rows.last:
             self._note_last()  # without any row the log would look like a new one
 
-    def _undo(self) -> None:
-        """Take back what is not durable; what was committed before an interruption stays, and is known."""
-        self._rows.cut(self._log.place)
-        self._log.rollback()
+    @contextmanager
+    def _undoing(self) -> Iterator[None]:
+        """Where the block fails, take back what is not durable; what was committed before stays, and is known."""
+        try:
+            yield
+        except BaseException:
+            self._failed = True
+            self._rows.cut(self._log.place)
+            self._log.rollback()
+            raise
 
     def _refuse_in_batch(self, doing: str) -> None:
         """Raise StoreError in a batch of this thread, and wait for the end of another thread's."""
@@ -574,7 +578,7 @@ class Store:
 
     def _write(self, draft: CheckpointDraft, place: LogPlace, log: bytes, table: np.ndarray) -> NamedCheckpoint:
         """Write a draft, with which rows are where in a log."""
-        number = 1 + max(numbers(self._folder, unfinished=True), default=0)
+        number = 1 + max(numbers(self._folder, CHECKPOINT, PARTIAL), default=0)
         draft = replace(draft, arrays={**draft.arrays, index_name(log): table})
         sha256 = write_checkpoint(self._folder, number, draft, self.identity)
         return NamedCheckpoint(number, draft.last_sequence, sha256, place)
@@ -651,7 +655,7 @@ class Store:
 
     def _compacted(self, drafts: list[CheckpointDraft]) -> Current:
         """Write a log in which rows have no arrays, and the checkpoints that stand for them; read all of it back."""
-        number = 1 + max(log_numbers(self._folder, unfinished=True), default=0)
+        number = 1 + max(numbers(self._folder, LOG, NEW), default=0)
         path = log_path(self._folder, number)
         try:
             header, last_sequence = to_json("identity", self.identity).encode(), drafts[0].last_sequence

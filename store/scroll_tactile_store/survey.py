@@ -15,14 +15,15 @@ from scroll_tactile_store.exceptions import DamageError, NotAStoreError, reporte
 from scroll_tactile_store.files import is_file, store_folder
 from scroll_tactile_store.framing import FRAME_BYTES, Frame
 from scroll_tactile_store.layout import (
+    CHECKPOINT,
     CHECKPOINTS,
     CURRENT_FILE,
     DAMAGED,
+    LOG,
     Current,
     NamedCheckpoint,
     checkpoint_path,
     holds_store,
-    log_numbers,
     log_path,
     numbers,
     read_current,
@@ -125,7 +126,7 @@ class Survey:
         self.current = current = self._found_current()
         self._end, self._is_torn = 0, False  # the last row so far; whether something behind it cannot be read
         self.compacted = 0 if current is None else current.compacted
-        self.path = log_path(folder, max(log_numbers(folder), default=1) if current is None else current.log)
+        self.path = log_path(folder, max(numbers(folder, LOG), default=1) if current is None else current.log)
         try:
             self._read_log()
             self.spoilt: dict[Path, str] = {}
@@ -267,7 +268,7 @@ class Survey:
     # Checkpoints.
 
     def _read_checkpoints(self) -> None:
-        named: dict[int, NamedCheckpoint | None] = dict.fromkeys(numbers(self.folder))
+        named: dict[int, NamedCheckpoint | None] = dict.fromkeys(numbers(self.folder, CHECKPOINT))
         if self.current is not None:
             named = {each.number: each for each in self.current.checkpoints}
         for done, (number, expected) in enumerate(sorted(named.items(), reverse=True)):

@@ -328,6 +328,7 @@ def test_a_reader_learns_that_what_it_read_was_taken_back(tmp_path, monkeypatch)
             broken.setattr(os, "ftruncate", fails)
             with pytest.raises(OSError, match="the disk"):
                 append(log, [b"not durable"])
+            log.rollback()
         assert rest(beside) == [*BATCHES, [b"not durable"]]
         append(log, [b"in its place"])
         assert not beside.has_place(beside.place)

@@ -11,17 +11,16 @@ import logging
 import os
 import sys
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from copy import copy
-from itertools import islice
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar
 
 from scroll_tactile_store import CompactedError, Head, ReadOnlyError, Record, Store, StoreClosedError, StoreError
 
-from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
+from scroll_tactile.errors import AnnotationError, DescriptionError, FineTuneError, InputError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.health.watch import WatchedRows, WatchRules
 from scroll_tactile.memory.axes import axis_memory
@@ -81,7 +80,6 @@ logger = logging.getLogger(__name__)
 Answer = TypeVar("Answer")
 
 CHECKPOINT_EVERY = 128  # rows between checkpoints: opening embeds so many again in half a second
-MOST_CHANGES = 1024  # that are remembered for those who follow
 # A checkpoint writes all materials, so many of them in the time that one touch takes to learn: it waits until as long
 # was spent on touches. With 100 000 materials and a row for each 16, writing took twice as long as learning.
 MATERIALS_PER_ROW = 8
@@ -94,22 +92,23 @@ class Ledger:
     they are read.
 
     lock: held by whoever reads or changes the memory. version: grows with each change of the observations. described:
-    grows with each change of a description. watched: the rows that health was last read from, by some rules; not there
-    while they are read. lost: grows where a change was cut short, whose rows may not be in the journal. saves: whether
-    checkpoints are written; the journal alone has every row, too.
+    grows with each change of a description. watched: the rows that health was last read from, by some rules. lost:
+    grows where a change was cut short, whose rows may not be in the journal. saves: whether checkpoints are written;
+    the journal alone has every row, too.
     """
 
     def __init__(self, empty: Memory, store: AnyStore, bare: bool) -> None:
         self.store = store
         self.lock = threading.RLock()
         self.version = self.described = self.lost = 0
-        self.saves = self.path is not None
+        self.saves = True
         self.watched: dict[WatchRules, WatchedRows] = {}
         self._empty, self._bare = empty, bare
         self._memory = load(empty, store)
         self._axes: dict[str, tuple[int, Memory]] = {}
-        self._changes: deque[Sequence[Changed] | None] = deque(maxlen=MOST_CHANGES)
-        self._saved, self._saved_weighings = self._memory.saved, dict(self._memory.weighings)
+        self._touched: dict[tuple[str, str], int] = {}  # (axis, label), of materials ("", name) → the last version
+        self._renewed = 0  # the last version in which anything may have changed
+        self._saved_weighings = dict(self._memory.weighings)
         self._closed = self._batching = False
         self._whole = True
 
@@ -129,6 +128,8 @@ class Ledger:
         return self._memory
 
     def _read_again(self) -> None:
+        if isinstance(self.store, Store):
+            self.store.state()  # a reader looks what there is now: what it saw last may be damaged, and mended since
         read = load(self._empty, self.store)
         read.retractions += self._memory.retractions + 1  # what was fitted to it may hold what is gone
         self._changed(None)
@@ -158,30 +159,29 @@ class Ledger:
         """Through which new touches are read; None where the skin is the one that learned."""
         return self.read(lambda memory, _: memory.correction)
 
-    def _changed(self, touches: Sequence[Changed] | None) -> None:
+    def _changed(self, touches: Iterable[Changed] | None) -> None:
         self.version += 1
-        self._changes.append(touches)
+        if touches is None:
+            self._renewed = self.version
+        for touch in touches or ():
+            for name in (("", touch.material), *touch.labels):
+                self._touched.pop(name, None)  # the last that were touched are the last in it
+                self._touched[name] = self.version
 
     def changed_since(self, version: int, axis: str = "") -> set[str] | None:
         """The materials, or labels on an axis, of touches that came or went since a version.
 
-        None where something else has changed, or it is too long ago.
+        None where something else has changed.
         """
-        found: set[str] = set()
-        if self.version - version > len(self._changes):
+        if version < self._renewed:
             return None
-        for touches in islice(reversed(self._changes), self.version - version):
-            if touches is None:
-                return None
-            labels = ((touch.material if not axis else dict(touch.labels).get(axis)) for touch in touches)
-            found |= {label for label in labels if label is not None}
-        return found
+        since = takewhile(lambda item: item[1] > version, reversed(self._touched.items()))
+        return {name for (of, name), _ in since if of == axis}
 
     def require_open(self) -> AnyStore:
         """The store. Raises StoreClosedError after `close`."""
         if self._closed:
-            where = "in RAM is closed: copy it before" if self.path is None else f"{self.path} is closed: open it again"
-            raise StoreClosedError(f"the memory {where}")
+            raise StoreClosedError(f"{self.store.path} is closed: open it again")
         return self.store
 
     def require_folder(self, doing: str) -> Store:
@@ -218,10 +218,6 @@ class Ledger:
         except StoreError as error:  # an earlier checkpoint's: otherwise the next commit would raise it
             logger.warning("%s: no checkpoint could be written: %s", self.store.path, error)
 
-    def _require_no_batch(self, what: str) -> None:
-        if self._batching:
-            raise InputError(f"{what} is a batch of its own: end the batch before it")
-
     def append(
         self,
         kind: str,
@@ -257,32 +253,30 @@ class Ledger:
         return head.sequence
 
     @contextmanager
-    def _together(self) -> Iterator[None]:
-        """Rows that are durable together, or not there."""
-        self._batching = True
-        try:
-            with self.store.batch():
-                yield
-        except BaseException:
-            self._whole = False
-            raise
-        finally:
-            self._batching = False
-
-    @contextmanager
-    def batch(self) -> Iterator[None]:
-        """As `TactileLearner.batch`."""
+    def batch(self, *, whole: bool = False) -> Iterator[None]:
+        """As `TactileLearner.batch`. whole: after an exception none of it is kept, nor can it be within another one."""
         with self.lock:
             self.require_write_mode()
+            if self._batching and whole:
+                raise InputError("this is a batch of its own: end the batch before it")
             if self._batching:
                 yield
                 return
-            raised: BaseException | None = None
-            with self._together():
-                try:
-                    yield
-                except BaseException as error:  # the store must not see it: it would undo the batch
-                    raised = error
+            begun, raised = self.memory.sequence, None
+            self._batching = True
+            try:
+                with self.store.batch():
+                    try:
+                        yield
+                    except BaseException as error:
+                        if whole:  # else the store must not see it: it would undo the batch
+                            raise
+                        raised = error
+            except BaseException:
+                self._whole = self._whole and self._memory.sequence == begun
+                raise
+            finally:
+                self._batching = False
             self.checkpoint_if_due()
             if raised is not None:
                 raise raised
@@ -305,9 +299,9 @@ class Ledger:
         with self.lock:
             self.require_write_mode()
             memory = self.memory
-            known = self._known(material, stream.key, annotation)
-            if known is None and stream.raw is not None:  # learned before the memory was adapted
-                known = self._known(material, stream.raw.key, annotation)
+            streams = (stream, stream.raw)  # of before the memory was adapted
+            rows = [self._known(material, of.key, annotation) for of in streams if of is not None]
+            known = next((row for row in rows if row is not None), None)
             if known is None:
                 # Checked before the row is in the journal: the next opening must be able to add every row.
                 memory.statistics.require_room(codes)
@@ -398,12 +392,10 @@ class Ledger:
         """As `TactileLearner.retract`."""
         with self.lock:
             store = self.require_open()
-            if (adaptation := adaptation_of(store, self.memory, receipt)) is not None:
+            if (adaptation := adaptation_of(self.memory, receipt)) is not None:
                 self._note(ADAPT, "", {RETRACTS: adaptation})  # the one before it counts again, if there is one
-                return
-            assert not isinstance(receipt, Adaptation)
-            self._retract([observation_of(store, self.memory, receipt)], "")
-            self.checkpoint_if_due()
+            else:
+                self._retract([observation_of(store, self.memory, receipt)], "")
 
     def forget(self, material: str | None, source: str | None) -> int:
         """As `TactileLearner.forget`."""
@@ -411,29 +403,24 @@ class Ledger:
             store, memory = self.require_open(), self.memory
             found = observations_to_forget(store, memory, material, source)
             self._retract([store.record(sequence) for sequence in found], material or "")
-            self.checkpoint_if_due()
         return len(found)
 
     def _retract(self, records: Sequence[Record], material: str) -> None:
         gone = {record.sequence: record for record in records}
         chosen = chosen_without(self.memory, self.store, gone)
         self.append(RETRACT, material, attributes={"sequences": spans(gone)}, gone=gone, chosen=chosen)
+        self.checkpoint_if_due()
 
     def relabel(self, receipt: Receipt | int, material: str) -> int:
         """As `TactileLearner.relabel`."""
-        with self.lock:
-            store = self.require_open()
-            self._require_no_batch("a relabelling")
-            record = observation_of(store, self.memory, receipt)
+        with self.batch(whole=True):
+            record = observation_of(self.store, self.memory, receipt)
             if record.label == material:
-                raise InputError(f"observation {record.sequence} of {store.path} is called {material!r} already")
+                raise InputError(f"observation {record.sequence} of {self.store.path} is called {material!r} already")
             known = self._known(material, record.key, annotation_of(record.attributes))
-            with self._together():
-                self._retract([record], "")
-                kept: Any = {"attributes": record.attributes, "arrays": record.arrays, "time": record.time}
-                sequence = self.append(OBSERVE, material, record.key, **kept) if known is None else known
-            self.checkpoint_if_due()
-            return sequence
+            self._retract([record], "")
+            kept: Any = {"attributes": record.attributes, "arrays": record.arrays, "time": record.time}
+            return self.append(OBSERVE, material, record.key, **kept) if known is None else known
 
     def merge(
         self,
@@ -445,20 +432,24 @@ class Ledger:
 
         Raises ObservationError also where a refused row was compacted there, and cannot be left out.
         """
-        with self.lock:
-            store, memory = self.require_open(), self.memory
-            self._require_no_batch("a merge")
-            with _opened(other) as source:
-                merge = Merge(store, memory, source, rules)
-                sums = merge.sums()
-                with self._together():
-                    for done, row in enumerate(merge.rows(), start=1):
-                        self.append(**row, summed=sums is not None)
-                        progress("merging", done, merge.total)
-                    if sums is not None:
-                        memory.join(sums, exemplars=False)
-            self._changed(None)
-            self.checkpoint_if_due()
+        opened = nullcontext(other) if isinstance(other, RamStore) else MemoryStore.open(other, mode="read")
+        with self.lock, opened as source:
+            merge = Merge(self.require_open(), self.memory, source, rules)
+            sums = merge.sums()
+            with self.batch(whole=True):
+                try:
+                    for quantity in merge.quantities:
+                        self.declare(quantity)
+                    for material, constituents in merge.descriptions.items():
+                        self.describe(material, constituents)
+                except (AnnotationError, DescriptionError) as error:
+                    raise merge.refusing(error) from None
+                for done, row in enumerate(merge.rows(), start=1):
+                    self.append(**row, summed=sums is not None)
+                    progress("merging", done, merge.total)
+                if sums is not None:
+                    self.memory.join(sums, exemplars=False)
+                self._changed(None)
         return Merged(merge.added, merge.shared, len(merge.descriptions)), merge.refused
 
     def compact(self, keep: int) -> Compacted:
@@ -476,7 +467,7 @@ class Ledger:
                 arrays, attributes = kept.to_arrays(last_sequence, exemplar_candidates(kept, store))
                 self._whole = False
                 store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
-                self._saved, self._saved_weighings = memory.sequence, {}  # it has none
+                memory.saved, self._saved_weighings = memory.sequence, {}  # it has none
                 memory.note_compaction(last_sequence)
                 self._whole = True
                 give_back_scratch()
@@ -495,10 +486,10 @@ class Ledger:
             made = copy(memory)
             made.tuned, made.tuned_last_sequence = tuned, last_sequence
             arrays, attributes = made.to_arrays()
-            self._saved = -1  # where this is cut short it may be current already: closing writes the one before again
+            memory.saved = -1  # where this is cut short it may be current already: closing writes the one before again
             self.store.commit(arrays, last_sequence=memory.sequence, attributes=attributes)
-            memory.tuned, memory.tuned_last_sequence = tuned, last_sequence
-            self._note_saved()
+            memory.tuned, memory.tuned_last_sequence, memory.saved = tuned, last_sequence, memory.sequence
+            self._saved_weighings = dict(memory.weighings)
 
     def refresh(self) -> bool:
         """As `TactileLearner.refresh`."""
@@ -523,61 +514,48 @@ class Ledger:
 
     def checkpoint_if_due(self) -> None:
         """Write a checkpoint in a thread, where many rows came since the last."""
-        rows = max(CHECKPOINT_EVERY, self._memory.statistics.material_count // MATERIALS_PER_ROW)
-        if not self.saves or self._batching or self._memory.sequence - self._saved < rows:
+        memory = self._memory
+        rows = max(CHECKPOINT_EVERY, memory.statistics.material_count // MATERIALS_PER_ROW)
+        if not self.saves or self._batching or memory.sequence - memory.saved < rows:
             return
-        if not self._whole or self._memory.stale:  # half a change, or samples with what is gone: the journal has it all
+        if not self._whole or memory.stale:  # half a change, or samples with what is gone: the journal has it all
             return
-        arrays, attributes = self._memory.to_arrays()
         try:
-            self.store.commit_later(arrays, last_sequence=self._memory.sequence, attributes=attributes)
+            self._write_checkpoint(later=True)
         except StoreError as error:
             # The journal has it all; only the next opening has more to replay.
             logger.warning("%s: no checkpoint could be written: %s", self.store.path, error)
-        self._note_saved()
-        del arrays
         give_back_scratch()
 
     def save(self) -> None:
         """Write a checkpoint, if rows came since the last."""
-        if self._memory.sequence > self._saved or self._memory.weighings != self._saved_weighings:
+        if self._memory.sequence > self._memory.saved or self._memory.weighings != self._saved_weighings:
             self._pass_over_failures()
             self._write_checkpoint()
 
-    def _write_checkpoint(self) -> None:
-        arrays, attributes = self._memory.to_arrays()
-        self.store.commit(arrays, last_sequence=self._memory.sequence, attributes=attributes)
-        self._note_saved()
-
-    def _note_saved(self) -> None:
-        self._saved, self._saved_weighings = self._memory.sequence, dict(self._memory.weighings)
+    def _write_checkpoint(self, *, later: bool = False) -> None:
+        memory = self._memory
+        arrays, attributes = memory.to_arrays()
+        memory.saved, self._saved_weighings = memory.sequence, dict(memory.weighings)
+        commit = self.store.commit_later if later else self.store.commit
+        commit(arrays, last_sequence=memory.sequence, attributes=attributes)
 
     def close(self, weighings: Mapping[str, str]) -> None:
         """As `TactileLearner.close`. weighings: see `Memory`."""
         with self.lock:
             if self._batching:
                 raise InputError("a memory cannot be closed in a batch: end it first")
-            store, closed, self._closed = self.store, self._closed, True
-            if closed:
+            if self._closed:
                 return
+            self._closed = True
             try:
                 # A change that was cut short is never saved: the journal holds all of it, or nothing.
-                if store.mode == "write" and self.saves and self._whole:
+                if self.store.mode == "write" and self.saves and self._whole:
                     self._memory.weighings |= weighings
                     self.save()
             finally:
-                store.close()
+                self.store.close()
                 give_back_scratch()
-
-
-@contextmanager
-def _opened(other: str | os.PathLike[str] | RamStore) -> Iterator[AnyStore]:
-    """Another memory, to be merged."""
-    if isinstance(other, RamStore):
-        yield other
-        return
-    with MemoryStore.open(other, mode="read") as source:
-        yield source
 
 
 def give_back_scratch() -> None:

@@ -6,17 +6,14 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pydantic import BaseModel
 from scroll_tactile_store import Head, Store
 from scroll_tactile_store.files import same_folder
 
-from scroll_tactile.errors import AnnotationError, DescriptionError, MismatchError, ObservationError
-from scroll_tactile.memory.descriptions import Description, require_units
+from scroll_tactile.errors import MismatchError, ObservationError
+from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.identity import EmbeddingIdentity, Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
-    DECLARE,
-    DESCRIBE,
     LABELS,
     MEMBER,
     MERGE,
@@ -25,13 +22,10 @@ from scroll_tactile.memory.touch_rows import (
     VALUES,
     active_rows,
     annotation_of,
-    declaration,
 )
 from scroll_tactile.persistence.observations import TouchRows, refusal, rows_with
-from scroll_tactile.persistence.packing import sums_without
 from scroll_tactile.persistence.ram_store import AnyStore
-from scroll_tactile.persistence.replaying import note
-from scroll_tactile.quantities import Quantity, require_declarable
+from scroll_tactile.persistence.replaying import load, note, refill
 from scroll_tactile.statistics.annotations import MOST_AXES
 
 __all__ = ["Choice", "Merge", "MergeRules"]
@@ -62,7 +56,8 @@ class Merge:
     ours, memory: our journal and what it holds. theirs: the journal of the other.
 
     shared: how many streams both observed, or the other has twice; they do not come in. refused: nor do touches that
-    have another name already, each with the reason. descriptions: material → the description that is taken over.
+    have another name already, each with the reason. quantities: theirs. descriptions: material → the description that
+    is taken over.
 
     Raises MismatchError where the two recipes differ, a quantity's unit or range, the annotation of a shared stream, or
     their descriptions and `descriptions` is "same"; ObservationError where a touch that must be left out was compacted;
@@ -80,11 +75,11 @@ class Merge:
         for head in self._heads:
             if head.sequence > self._compacted:
                 note(said, head)
-        self._quantities = self._missing_quantities(said.quantities)
+        self.quantities = list(said.quantities.values())
         known, self.refused = self._there(incoming)
         self.shared = len(known)
         if self.refused and not rules.one_name:
-            raise self._refusing(self.refused[0][1])
+            raise self.refusing(self.refused[0][1])
         self._left_out = {*known, *(head.sequence for head, _ in self.refused)}
         self._require_able_to_leave_out([head for head in incoming if head.sequence in self._left_out])
         # A merge before the compaction checkpoint is a part of it.
@@ -113,14 +108,10 @@ class Merge:
     @property
     def total(self) -> int:
         """How many rows it appends."""
-        return len(self._quantities) + len(self.descriptions) + (self._compaction is not None) + len(self._rows)
+        return (self._compaction is not None) + len(self._rows)
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """The rows that it appends, each as the arguments of `Ledger`'s append."""
-        for quantity in self._quantities:
-            yield {"kind": DECLARE, "label": quantity.name, "attributes": declaration(quantity)}
-        for material, description in self.descriptions.items():
-            yield {"kind": DESCRIBE, "label": material, "attributes": {"constituents": description}}
         if (compaction := self._compaction) is not None:
             left_out = ("tuned", "corrections", "descriptions")  # these stay there, and descriptions come as rows
             attributes = {name: value for name, value in compaction.attributes.items() if not name.startswith(left_out)}
@@ -144,14 +135,18 @@ class Merge:
 
         Raises DamageError.
         """
-        if self._compaction is not None or len(self._left_out) > len(self._rows):
-            return None
         kept = self._memory.kept
-        if kept is not None and Identity.read(self._theirs).kept_touches != kept.capacity:
+        fewer = kept is not None and Identity.read(self._theirs).kept_touches != kept.capacity
+        if fewer or self._compaction is not None or len(self._left_out) > len(self._rows):
             return None
-        return sums_without(self._theirs, self._heads, self._memory, self._left_out)
+        sums = load(self._memory, self._theirs)
+        for sequence in self._left_out:
+            sums.retract(self._theirs.record(sequence))
+        refill(sums, self._theirs)
+        return sums
 
-    def _refusing(self, why: object) -> MismatchError:
+    def refusing(self, why: object) -> MismatchError:
+        """The error that says why the other memory cannot be merged."""
         return MismatchError(f"{self._theirs.path} cannot be merged into {self._ours.path}: {why}")
 
     def _require_same_making(self, whole: bool) -> None:
@@ -163,9 +158,9 @@ class Merge:
         for part in ("sensor", "embedding", "reading", "views", "grid"):
             own, incoming = (_without_configuration(getattr(identity, part)) for identity in (mine, other))
             if own != incoming:
-                raise self._refusing(
-                    f"their {part.removesuffix('s')}s differ. Here it is {_formatted(own)}, there "
-                    f"{_formatted(incoming)}. Merge memories of one sensor and one embedding"
+                raise self.refusing(
+                    f"their {part.removesuffix('s')}s differ. Here it is {own}, there {incoming}. Merge memories of "
+                    "one sensor and one embedding"
                 )
         for what, kept in (("exemplars", self._memory.exemplars), ("kept_touches", self._memory.kept)):
             if whole and kept is not None and getattr(mine, what) != getattr(other, what):
@@ -174,24 +169,13 @@ class Merge:
                     f"{getattr(mine, what)}, and the readings for the others are gone"
                 )
 
-    def _missing_quantities(self, theirs: Mapping[str, Quantity]) -> list[Quantity]:
-        """Their quantities that ours lacks."""
-        both = dict(self._memory.quantities)
-        for name, quantity in sorted(theirs.items()):
-            try:
-                require_declarable(both, quantity)
-            except AnnotationError as error:
-                raise self._refusing(error) from None
-            both[name] = quantity
-        return [quantity for name, quantity in both.items() if name not in self._memory.quantities]
-
     def _there(self, incoming: Sequence[Head]) -> tuple[set[int], list[tuple[Head, str]]]:
         """Their rows of touches that ours has under the same name, or an earlier row of theirs.
 
         Also those that are refused, each with the reason: these have other values or labels there, or by `one_name`
         another name.
         """
-        declared = self._memory.quantities | {quantity.name: quantity for quantity in self._quantities}
+        declared = {quantity.name: quantity for quantity in self.quantities} | self._memory.quantities
         came: dict[bytes, TouchRows] = {}
         known: set[int] = set()
         refused: list[tuple[Head, str]] = []
@@ -217,17 +201,13 @@ class Merge:
 
     def _require_able_to_leave_out(self, rows: Sequence[Head]) -> None:
         fixed = [head for head in rows if head.sequence <= self._compacted or head.kind == MEMBER]
-        if not fixed:
-            return
-        theirs, why = self._theirs.path, {head.sequence: why for head, why in self.refused}.get(fixed[0].sequence)
-        if why is not None:
-            more = f" (and {len(fixed) - 1} more of its touches)" if len(fixed) > 1 else ""
-            raise ObservationError(f"{why}{more}; {theirs} was compacted, and none of them can be left out")
-        raise ObservationError(
-            f"{len(fixed)} streams that both observed, such as one of {fixed[0].label!r}, cannot be left out: {theirs} "
-            f"was compacted, and their features given up there. Merge the other way round, if {self._ours.path} was "
-            "not compacted"
-        )
+        if fixed:
+            both = "both have it; merge the other way round, if ours was not compacted"
+            why = {head.sequence: why for head, why in self.refused}.get(fixed[0].sequence, both)
+            raise ObservationError(
+                f"{len(fixed)} touches, such as one of {fixed[0].label!r}, cannot be left out of "
+                f"{self._theirs.path}, which was compacted, and their features given up: {why}"
+            )
 
     def _chosen_descriptions(self, theirs: Mapping[str, Description]) -> dict[str, Description]:
         """Their descriptions that are taken over."""
@@ -241,23 +221,9 @@ class Merge:
                 f"such as {name!r}: here it is {ours[name]}, there {new[name]}. Choose with descriptions='ours' or "
                 "'theirs'"
             )
-        taken = {name: new[name] for name in new if self._rules.descriptions != "ours" or name not in ours}
-        for name, description in taken.items():
-            try:
-                require_units({**ours, **taken}, name, description)
-            except DescriptionError as error:
-                raise self._refusing(error) from None
-        return taken
+        return {name: new[name] for name in new if self._rules.descriptions != "ours" or name not in ours}
 
 
 def _without_configuration(part: Any) -> Any:
     """A part of an identity; an embedding's without its configuration, as its weights' file may have any name."""
     return part.model_copy(update={"configuration": None}) if isinstance(part, EmbeddingIdentity) else part
-
-
-def _formatted(part: Any) -> str:
-    if not isinstance(part, BaseModel):
-        return repr(part)
-    fields = ((name, getattr(part, name)) for name in type(part).model_fields)
-    shown = ((name, value[:12] if name == "fingerprint" else value) for name, value in fields)
-    return ", ".join(f"{name} {value!r}" for name, value in shown if value is not None)

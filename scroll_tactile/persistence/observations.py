@@ -15,12 +15,10 @@ from scroll_tactile_store import Head, Record
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
 from scroll_tactile.memory.touch_rows import (
-    ADAPT,
     DECLARE,
     MEMBER,
     MERGE,
     OBSERVE,
-    RETRACTS,
     SOURCE,
     active_rows,
     annotation_of,
@@ -72,7 +70,7 @@ def refusal(names: Sequence[str], material: str, clipped: bool = False) -> str |
     return f"the memory has this touch already, as {names[0]!r} and not as {material!r}: relabel one of them"
 
 
-def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> Record:
+def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation | int) -> Record:
     """The journal's row of an observation that can be retracted.
 
     Raises ObservationError where there is none, it was retracted before, or compacted.
@@ -89,7 +87,10 @@ def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> R
         )
     record = store.record(sequence)
     if record.kind != OBSERVE:
-        raise ObservationError(f"row {sequence} of {store.path} is no observation, but of kind {record.kind!r}")
+        raise ObservationError(
+            f"row {sequence} of {store.path} is no observation, and no adaptation that counts, but of kind "
+            f"{record.kind!r}"
+        )
     if isinstance(receipt, Receipt) and (receipt.material, receipt.key) != (record.label, record.key):
         raise ObservationError(
             f"the receipt is of another memory: it says that observation {sequence} is of {receipt.material!r} "
@@ -98,27 +99,20 @@ def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | int) -> R
     return record
 
 
-def adaptation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
+def adaptation_of(memory: Memory, receipt: Receipt | Adaptation | int) -> int | None:
     """The row of an adaptation that counts; None where the receipt is of anything else.
 
-    Raises ObservationError for an adaptation that was not kept, counts no more, or is one of another memory.
+    Raises ObservationError for an adaptation that counts no more, or is one of another memory.
     """
-    if isinstance(receipt, Adaptation) and receipt.sequence is None:
-        raise ObservationError("this adaptation was not kept: there is nothing to retract")
     sequence = receipt.sequence if isinstance(receipt, Adaptation) else receipt
-    if isinstance(sequence, bool) or not isinstance(sequence, int):
-        return None  # a receipt of an observation, or nothing at all: `observation_of` says what was expected
-    head = next(store.heads(sequence - 1), None) if 1 <= sequence <= store.last else None
-    if head is None or head.sequence != sequence or head.kind != ADAPT or RETRACTS in head.attributes:
-        if isinstance(receipt, Adaptation):
-            raise ObservationError(f"row {sequence} of {store.path} is no adaptation: it is one of another memory")
-        return None
-    if sequence not in memory.corrections:
+    if type(sequence) is int and sequence in memory.corrections:
+        return sequence
+    if isinstance(receipt, Adaptation):
         raise ObservationError(
-            f"row {sequence} of {store.path} is no adaptation that counts: it was retracted already, or "
-            f"{MOST_CORRECTIONS} came after it"
+            f"there is no adaptation that counts in row {sequence}: it was not kept, was retracted already, "
+            f"{MOST_CORRECTIONS} came after it, or it is one of another memory"
         )
-    return sequence
+    return None
 
 
 def observations_to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from itertools import takewhile
 from pathlib import Path
@@ -32,10 +33,8 @@ from scroll_tactile.memory.touch_rows import (
     RETRACTS,
     Changed,
     Codes,
-    active_rows,
     declared_by,
     only_readings,
-    retracted_by,
     unspanned,
 )
 from scroll_tactile.persistence.ram_store import AnyStore
@@ -64,21 +63,15 @@ LOAD_ATTEMPTS = 20  # of a reader, while a writer changes the store
 def load(empty: Memory, store: AnyStore) -> Memory:
     """The memory that a store holds: its newest checkpoint, then the journal's rows after it; made as the empty one."""
     for _ in range(LOAD_ATTEMPTS - 1):
-        newest = store.newest
-        try:
-            memory = _loaded(empty.empty_like(), store)
-        except CompactedError:  # a writer compacted it meanwhile
-            continue
-        # A checkpoint that came between the reads may hold a tuned model from before the rows that were read.
-        if store.newest == newest:
-            return memory
+        with suppress(CompactedError):  # a writer compacted it meanwhile
+            return _loaded(empty.empty_like(), store)
     return _loaded(empty.empty_like(), store)
 
 
 def _loaded(memory: Memory, store: AnyStore) -> Memory:
-    memory.compacted = store.compacted
-    # Where no checkpoint is sound, that of a compaction raises what is lost; without one the journal has every row.
     newest = store.latest()
+    memory.compacted = store.compacted  # behind `latest`, which may look again
+    # Where no checkpoint is sound, that of a compaction raises what is lost; without one the journal has every row.
     start = store.compaction() if newest is None else newest
     if start is not None:
         memory.fill(start, store.path)
@@ -168,24 +161,35 @@ def _join(memory: Memory, row: Record, path: Path) -> None:
 
 
 def apply_appended(memory: Memory, store: AnyStore, records: Sequence[Record]) -> list[Changed] | None:
-    """Apply rows that a writer appended, and take over its tuned model; returns the changes as `apply` does."""
+    """Take over the tuned model of a writer, and apply the rows that it appended; returns the changes as `apply`."""
+    newest = None if (number := store.newest) == memory.checkpoint else store.latest()
+    if newest is not None and newest.number == number:  # another may have come since, and rows behind these
+        memory.checkpoint = number
+        memory.take_tuned(MemoryFields.of(newest, memory.statistics.dimension, store.path))
     changed = [apply(memory, record, store) for record in records]
     refill(memory, store)
-    newest = store.latest() if store.newest != memory.checkpoint else None
-    if newest is not None and newest.last_sequence <= memory.sequence:
-        memory.checkpoint = newest.number
-        # Heads of all kinds are read: filtered ones skip damaged rows, and such a row may be a retraction.
-        behind = takewhile(lambda head: head.sequence <= memory.sequence, store.heads(newest.last_sequence))
-        gone = min(retracted_by(behind), default=None)
-        made = MemoryFields.of(newest, memory.statistics.dimension, store.path)
-        if gone is None or gone > made.tuned_last_sequence:
-            memory.take_tuned(made)
     return None if None in changed else [each for touches in changed for each in touches or ()]
 
 
 def refill(memory: Memory, store: AnyStore) -> None:
     """Choose sample and exemplars again after a retraction; does nothing if no retracted touch was among them."""
-    if memory.stale:
+    if not memory.stale:
+        return
+    try:
+        store.compaction()
+    except DamageError as damage:
+        # The statistics are complete without it, and a repair has them where a checkpoint is written behind it.
+        logger.warning(
+            "%s; no other touch can take the place of a retracted one: repair the memory (scroll-tactile memory "
+            "repair)",
+            damage,
+        )
+        heads, left = store.heads(memory.compacted), memory.empty_like()
+        gone = {(head.label, head.key) for head in heads if head.sequence in memory.retracted}
+        for sample, before in zip(left.samples, memory.samples, strict=True):
+            sample.update(item for item in before if item[:2] not in gone)
+        memory.take_chosen(left)
+    else:
         # Rows that a writer appended since this memory was read are left for the next `load`.
         memory.take_chosen(_chosen(memory, store, memory.sequence))
 
@@ -197,7 +201,6 @@ def chosen_without(memory: Memory, store: AnyStore, gone: Mapping[int, Record]) 
     """
     if not any(sample.holds(row.label, row.key) for sample in memory.samples for row in gone.values()):
         return None
-    store.compaction()  # raises where it is damaged: with the memory as it was, there is still a choice
     rest = copy(memory)
     rest.retracted = memory.retracted | gone.keys()
     return _chosen(rest, store, memory.sequence)
@@ -218,45 +221,17 @@ def _chosen(memory: Memory, store: AnyStore, last_sequence: int) -> Memory:
 
     Raises DamageError for a damaged row: without it other touches would be chosen.
     """
-    fresh = _compaction_samples(memory, store)
-    try:
-        heads = list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
-    except DamageError as damage:
-        raise DamageError(
-            f"{damage}. Without it the samples of touches cannot be chosen again after a retraction: repair the "
-            "memory (scroll-tactile memory repair)",
-            path=damage.path,
-            sequence=damage.sequence,
-        ) from damage
+    fresh = memory.empty_like()
+    require_compaction(memory, store)
+    if (compaction := store.compaction()) is not None:
+        fresh.fill(compaction, store.path)
+    heads = list(takewhile(lambda head: head.sequence <= last_sequence, store.heads(memory.compacted)))
     for head in heads:
         note(fresh, head)
         if head.kind == MERGE:
             _join(fresh, store.record(head.sequence), store.path)
     observed = [head for head in heads if head.kind == OBSERVE and head.sequence not in memory.retracted]
     fresh.choose(observed, store.record, memory)
-    return fresh
-
-
-def _compaction_samples(memory: Memory, store: AnyStore) -> Memory:
-    """A memory filled from the compaction checkpoint; an empty one if there is none."""
-    fresh = memory.empty_like()
-    require_compaction(memory, store)
-    try:
-        if (compaction := store.compaction()) is not None:
-            fresh.fill(compaction, store.path)
-    except DamageError as damage:
-        # The statistics are complete without it, and a repair has them where a checkpoint is written behind it.
-        logger.warning(
-            "%s; no other touch can take the place of a retracted one: repair the memory (scroll-tactile memory "
-            "repair)",
-            damage,
-        )
-        rows = active_rows(head for head in store.heads() if head.sequence <= memory.compacted)
-        # The memory is asked as well: a row that retracts one of them may have been lost to damage.
-        left = {(head.label, head.key) for head in rows if not memory.is_gone(head.sequence)}
-        fresh.quantities = dict(memory.quantities)
-        for sample, before in zip(fresh.samples, memory.samples, strict=True):
-            sample.update(item for item in before if item[:2] in left)
     return fresh
 
 
@@ -281,22 +256,19 @@ def exemplar_candidates(memory: Memory, store: AnyStore) -> list[Exemplar]:
 
     Raises CompactedError where the store was compacted since the memory was read, DamageError, StoreClosedError.
     """
-    wanted: dict[int, set[tuple[str, bytes]]] = {}
-    for material, key, source in memory.exemplars or ():
-        # The compaction checkpoint holds what was compacted.
-        wanted.setdefault(source if source > memory.compacted else 0, set()).add((material, key))
-    found: list[Exemplar] = []
-    for source, touches in wanted.items():
-        held = [one for one in _exemplars_in(memory, store, source) if (one.material, one.key) in touches]
-        if lost := len(touches) - len(held):
-            logger.warning("%s: the readings of %d candidates for exemplars were lost to damage", store.path, lost)
-        found += held
-    return sorted(found, key=lambda exemplar: (exemplar.material, exemplar.key))
+    require_compaction(memory, store)
+    wanted = list(memory.exemplars or ())
+    # The compaction checkpoint holds what was compacted.
+    sources = {source if source > memory.compacted else 0 for *_, source in wanted}
+    held = {(one.material, one.key): one for row in sources for one in _exemplars_in(memory, store, row)}
+    found = [held[material, key] for material, key, _ in wanted if (material, key) in held]
+    if lost := len(wanted) - len(found):
+        logger.warning("%s: the readings of %d candidates for exemplars were lost to damage", store.path, lost)
+    return found
 
 
 def _exemplars_in(memory: Memory, store: AnyStore, sequence: int) -> list[Exemplar]:
     """The exemplars that a row of the journal holds; 0: those of the compaction checkpoint."""
-    require_compaction(memory, store)
     row = store.record(sequence) if sequence else store.compaction()
     if isinstance(row, Record) and row.kind == OBSERVE:
         steps, codes = memory.codes(row)

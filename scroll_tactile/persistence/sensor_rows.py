@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import takewhile
+from functools import partial
+from itertools import islice, takewhile
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scroll_tactile_store import Head, StoreError
+from scroll_tactile_store import Head
 
 from scroll_tactile.errors import InputError, UnknownMaterialError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, from_text, has_numbers
@@ -49,56 +50,47 @@ def health_of(ledger: Ledger, channels: int, rules: WatchRules) -> Health:
     It goes on from the rows that were read last by the same rules. Two threads that ask at once read them both.
     """
     with ledger.lock:
-        ledger.require_open()
         _ = ledger.memory  # which may have lost rows, and says so as it is read
         watched = ledger.watched.pop(rules, None)
         if watched is None or watched.lost != ledger.lost:
             watched = WatchedRows(rules, channels, ledger.lost)
-    try:
-        while piece := _piece(ledger, watched):
-            for row in piece:
-                watched.take(row)
-    except StoreError:  # of a damaged row: those before it need not be read again
-        _keep(ledger, watched)
-        raise
-    with ledger.lock:
-        store = ledger.require_open()
-        found = watched.health(lambda row: next((head.time for head in store.heads(row - 1)), None))
-        _keep(ledger, watched)  # from here on another thread may take it further
-        return found
+    while True:
+        with ledger.lock:
+            store = ledger.require_open()
+            if not (piece := _piece(store, ledger.memory, watched)):
+                found = watched.health(partial(_time_of, store))
+                ledger.watched[rules] = watched  # from here on another thread may take it further
+                while len(ledger.watched) > MOST_WATCHED:
+                    del ledger.watched[next(iter(ledger.watched))]
+                return found
+        for row in piece:
+            watched.take(row)
 
 
-def _keep(ledger: Ledger, watched: WatchedRows) -> None:
-    """Go on from these rows at the next question by the same rules; those by the last few rules are kept."""
-    with ledger.lock:
-        ledger.watched[watched.rules] = watched
-        while len(ledger.watched) > MOST_WATCHED:
-            del ledger.watched[next(iter(ledger.watched))]
+def _time_of(store: AnyStore, row: int) -> float | None:
+    return next((head.time for head in store.heads(row - 1)), None)
 
 
-def _piece(ledger: Ledger, watched: WatchedRows) -> list[WatchedRow]:
+def _piece(store: AnyStore, memory: Memory, watched: WatchedRows) -> list[WatchedRow]:
     """The next rows to be taken, none at the end, and after an alarm; those retracted meanwhile are taken back."""
-    with ledger.lock:
-        store, memory, rules = ledger.require_open(), ledger.memory, watched.rules
-        if memory.sequence > watched.known:
-            new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
-            for gone in sorted(retracted_by(new), reverse=True):
-                watched.take_back(gone)
-            watched.known = memory.sequence
-        rows: list[WatchedRow] = []
-        if watched.watch.alarmed is not None:
-            return rows
-        for head in _heads(store, memory, rules.until, watched.last):
-            source = cast("str | None", head.attributes.get(SOURCE))
-            counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
-            if counts and (rules.source is None or is_from(source, rules.source)):
-                numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
-                rows.append(WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers))
-            else:
-                rows.append(WatchedRow(head.sequence))
-            if len(rows) == PIECE:
-                break
-        return rows
+    rules = watched.rules
+    if memory.sequence > watched.known:
+        new = [head for head in store.heads(watched.known, kind=RETRACT) if head.sequence <= memory.sequence]
+        for gone in sorted(retracted_by(new), reverse=True):
+            watched.take_back(gone)
+        watched.known = memory.sequence
+    if watched.watch.alarmed is not None:
+        return []
+
+    def row(head: Head) -> WatchedRow:
+        source = cast("str | None", head.attributes.get(SOURCE))
+        counts = head.kind in (OBSERVE, SENSE) and not memory.is_gone(head.sequence)
+        if not counts or not (rules.source is None or is_from(source, rules.source)):
+            return WatchedRow(head.sequence)
+        numbers = from_text(head.attributes.get(CHANNELS), watched.watch.channels)
+        return WatchedRow(head.sequence, head.label, cast(int, head.attributes["columns"]), numbers)
+
+    return [row(head) for head in islice(_heads(store, memory, rules.until, watched.last), PIECE)]
 
 
 def _heads(store: AnyStore, memory: Memory, until: int | None, after: int = 0) -> Iterator[Head]:

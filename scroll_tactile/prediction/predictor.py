@@ -139,8 +139,9 @@ class Predictor:
         """All that the memory knows at this moment, to be pickled; its touches are compacted there."""
         with self.ledger.lock:
             store, memory = self.ledger.store, self.ledger.memory
-            kept = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
-            held = RamStore.compacted_to(self.recipe, sound_rows(store.heads, logger.warning), memory.sequence, kept)
+            arrays, attributes = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
+            held = RamStore(self.recipe, sound_rows(store.heads, logger.warning))
+            held.compact(arrays, last_sequence=memory.sequence, attributes=attributes)
             return {"store": held, "recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:

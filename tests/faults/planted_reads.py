@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 from scroll_tactile_store import backup, checkpoint_files, layout, log, repair, rows
 from scroll_tactile_store.records import Checkpoint
@@ -170,9 +171,10 @@ def _nothing_there(*_: Any) -> Any:
     return set(), []
 
 
-@bug("a packed memory is counted twice", merge, "sums_without")
-def _nothing_left_out(sums: Any, source: Any, newest: Any, memory: Any, left_out: Any) -> Any:
-    return sums(source, newest, memory, set())
+@bug("a packed memory is counted twice", merge.Merge, "sums")
+def _nothing_left_out(sums: Any, self: Any) -> Any:
+    with mock.patch.object(self, "_left_out", set()):
+        return sums(self)
 
 
 @bug("a description is lost in a merge", merge.Merge, "_chosen_descriptions")

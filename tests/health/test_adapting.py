@@ -271,7 +271,7 @@ def test_no_more_than_some_are_kept_to_come_back_to(path: Path) -> None:
         rows = [learner._ledger.adapt(skin) for skin in skins]
     with TactileLearner.open(path) as learner:
         assert list(learner.memory.corrections) == rows[-16:]
-        with pytest.raises(errors.ObservationError, match="16 came after it"):
+        with pytest.raises(errors.ObservationError, match="no adaptation that counts"):
             learner.retract(rows[3])
         learner.retract(rows[-1])
         assert correction(learner) == skins[-2].to_text()

@@ -7,24 +7,14 @@ another name is refused in learning from files, by one process or a fleet; `obse
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import takewhile
 from typing import cast
 
 from scroll_tactile_store import Head, Record
 
 from scroll_tactile.errors import InputError, ObservationError, UnknownMaterialError
+from scroll_tactile.memory import touch_rows as kinds
 from scroll_tactile.memory.state import MOST_CORRECTIONS, Memory
-from scroll_tactile.memory.touch_rows import (
-    DECLARE,
-    MEMBER,
-    MERGE,
-    OBSERVE,
-    SOURCE,
-    active_rows,
-    annotation_of,
-    declared_by,
-    retracted_by,
-)
+from scroll_tactile.memory.touch_rows import active_rows, annotation_of, declared_by, retracted_by
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.results import Adaptation, Observation, Receipt
 from scroll_tactile.signals.ranges import CURE
@@ -33,13 +23,13 @@ from scroll_tactile.statistics.annotations import Annotation
 __all__ = [
     "TouchRows",
     "adaptation_of",
-    "compaction_point",
+    "compaction_end",
     "is_from",
     "observation_of",
     "observations",
-    "observations_to_forget",
     "refusal",
     "rows_with",
+    "to_forget",
 ]
 
 TouchRows = dict[str, tuple[int, Annotation]]
@@ -49,8 +39,8 @@ TouchRows = dict[str, tuple[int, Annotation]]
 def rows_with(store: AnyStore, memory: Memory, key: bytes) -> TouchRows:
     """The rows of observations that count and have readings with this hash; of each name the first."""
     found: TouchRows = {}
-    for head in takewhile(lambda head: head.sequence <= memory.sequence, store.with_key(key)):
-        if head.kind in (OBSERVE, MEMBER) and not memory.is_gone(head.sequence):
+    for head in store.with_key(key):
+        if head.kind in (kinds.OBSERVE, kinds.MEMBER) and not memory.is_gone(head.sequence):
             found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
     return found
 
@@ -86,7 +76,7 @@ def observation_of(store: AnyStore, memory: Memory, receipt: Receipt | Adaptatio
             "and their features given up"
         )
     record = store.record(sequence)
-    if record.kind != OBSERVE:
+    if record.kind != kinds.OBSERVE:
         raise ObservationError(
             f"row {sequence} of {store.path} is no observation, and no adaptation that counts, but of kind "
             f"{record.kind!r}"
@@ -115,7 +105,7 @@ def adaptation_of(memory: Memory, receipt: Receipt | Adaptation | int) -> int | 
     return None
 
 
-def observations_to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:
+def to_forget(store: AnyStore, memory: Memory, material: str | None, source: str | None) -> list[int]:
     """The sequences of all observations of a material, or from a source: a file, or all in a folder or address.
 
     Raises UnknownMaterialError for a material never observed, ObservationError where a source has none, and where some
@@ -128,13 +118,13 @@ def observations_to_forget(store: AnyStore, memory: Memory, material: str | None
     mine = [
         head
         for head in active_rows(store.heads())
-        if head.kind != MERGE and (is_from(_source(head), source) if material is None else head.label == material)
+        if head.kind != kinds.MERGE and (is_from(_source(head), source) if material is None else head.label == material)
     ]
     if not mine:
         raise ObservationError(
             f"no observation of {store.path} comes from {source!r}; observations() lists their sources"
         )
-    if gone := [head for head in mine if head.kind == MEMBER or head.sequence <= memory.compacted]:
+    if gone := [head for head in mine if head.kind == kinds.MEMBER or head.sequence <= memory.compacted]:
         what = f"what comes from {source!r}" if material is None else f"{material!r}"
         raise ObservationError(
             f"{what} cannot be forgotten: {len(gone)} of its {len(mine)} observations in {store.path} were compacted, "
@@ -145,7 +135,7 @@ def observations_to_forget(store: AnyStore, memory: Memory, material: str | None
 
 
 def _source(head: Head) -> str | None:
-    return cast("str | None", head.attributes.get(SOURCE))
+    return cast("str | None", head.attributes.get(kinds.SOURCE))
 
 
 def is_from(recorded: str | None, source: str | None) -> bool:
@@ -160,11 +150,11 @@ def observations(store: AnyStore) -> list[Observation]:
     """All observations of a journal, in order, and the state of each."""
     heads, compacted = list(store.heads()), store.compacted
     retracted = retracted_by(heads)
-    quantities = {head.label: declared_by(head) for head in heads if head.kind == DECLARE}
+    quantities = {head.label: declared_by(head) for head in heads if head.kind == kinds.DECLARE}
 
     def observation(head: Head) -> Observation:
         annotation = annotation_of(head.attributes)
-        gone = head.sequence <= compacted or head.kind == MEMBER
+        gone = head.sequence <= compacted or head.kind == kinds.MEMBER
         return Observation(
             sequence=head.sequence,
             material=head.label,
@@ -176,15 +166,14 @@ def observations(store: AnyStore) -> list[Observation]:
             labels=dict(annotation.labels),
         )
 
-    return [observation(head) for head in heads if head.kind in (OBSERVE, MEMBER)]
+    return [observation(head) for head in heads if head.kind in (kinds.OBSERVE, kinds.MEMBER)]
 
 
-def compaction_point(store: AnyStore, memory: Memory, keep: int) -> int:
+def compaction_end(store: AnyStore, memory: Memory, keep: int) -> int:
     """The last row to be compacted, so that the newest `keep` observations can still be retracted."""
     if isinstance(keep, bool) or not isinstance(keep, int) or keep < 0:
         raise InputError(f"expected keep as a whole number of 0 or more; came {keep!r}")
-    if keep == 0:
-        return store.last
-    kept = store.heads(memory.compacted, kind=OBSERVE)
-    sequences = [head.sequence for head in kept if head.sequence not in memory.retracted]
-    return memory.compacted if len(sequences) <= keep else sequences[-keep] - 1
+    kept = [
+        head.sequence for head in store.heads(memory.compacted, kind=kinds.OBSERVE) if not memory.is_gone(head.sequence)
+    ]
+    return [*kept, store.last + 1][-keep - 1] - 1 if len(kept) > keep or not keep else memory.compacted

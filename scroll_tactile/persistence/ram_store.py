@@ -5,11 +5,10 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 from scroll_tactile_store import Checkpoint, CompactedError, Head, Record, Store
 
@@ -20,13 +19,14 @@ from scroll_tactile.recipe import Recipe
 __all__ = ["AnyStore", "RamStore"]
 
 Held = TypeVar("Held", Record, Checkpoint)
+Told = Mapping[str, Any] | None  # attributes
 
 
 class RamStore:
     """Rows and checkpoints in RAM; they go with the process. Methods do and raise what those of `Store` do.
 
     recipe: of the memory. heads: rows to begin with, which have no arrays any more. last: the last row that counts;
-    rows behind it were taken back, and are overwritten.
+    rows behind it were taken back, and are overwritten: a shallow copy stays as it is.
     """
 
     mode: ClassVar[Literal["write", "read"]] = "write"
@@ -41,21 +41,10 @@ class RamStore:
         for head in heads:
             self._take(Record(**vars(head) | {"arrays": {}}))
 
-    def copy(self) -> Self:
-        """One that changes independently; what lies in the rows is shared."""
-        made = copy(self)
-        made._rows, made._with_key = dict(self._rows), {key: list(own) for key, own in self._with_key.items()}
-        return made
-
     @cached_property
     def identity(self) -> Mapping[str, Any]:
         """What the memory was made with, which may compute a fingerprint: only merging and packing ask for it."""
         return Identity.of(self._recipe).to_json()
-
-    @property
-    def newest(self) -> int | None:
-        """The number of the newest checkpoint."""
-        return None if self._checkpoints[0] is None else self._checkpoints[0].number
 
     @property
     def compacted(self) -> int:
@@ -63,14 +52,7 @@ class RamStore:
         return 0 if self._checkpoints[1] is None else self._checkpoints[1].last_sequence
 
     def append(
-        self,
-        kind: str,
-        label: str,
-        key: bytes,
-        *,
-        attributes: Mapping[str, Any] | None = None,
-        arrays: Arrays | None = None,
-        time: float | None = None,
+        self, kind: str, label: str, key: bytes, *, attributes: Told = None, arrays: Any = None, time: Any = None
     ) -> Head:
         """Add a row."""
         moment = clock.time() if time is None else time
@@ -120,11 +102,10 @@ class RamStore:
         """The checkpoint that stands for compacted rows."""
         return None if self._checkpoints[1] is None else _fresh(self._checkpoints[1])
 
-    def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Mapping[str, Any] | None = None) -> int:
+    def commit(self, arrays: Arrays, *, last_sequence: int, attributes: Told = None) -> int:
         """Keep a checkpoint in place of the one before: after a change that is cut short rows behind it are read."""
-        made = Checkpoint((self.newest or 0) + 1, last_sequence, attributes or {}, arrays)
-        self._checkpoints = made, self._checkpoints[1]
-        return made.number
+        self._checkpoints = Checkpoint(1, last_sequence, attributes or {}, arrays), self._checkpoints[1]
+        return 1
 
     commit_later = commit
 
@@ -132,17 +113,11 @@ class RamStore:
         """Nothing waits."""
 
     def compact(
-        self,
-        arrays: Arrays,
-        *,
-        last_sequence: int,
-        attributes: Mapping[str, Any] | None = None,
-        newest: tuple[Arrays, Any] | None = None,
+        self, arrays: Arrays, *, last_sequence: int, attributes: Told = None, newest: tuple[Arrays, Any] | None = None
     ) -> None:
         """Have a checkpoint stand for the rows up to one, which give up their arrays."""
-        number = (self.newest or 0) + 1
-        kept = Checkpoint(number, last_sequence, attributes or {}, arrays)
-        last = kept if newest is None else Checkpoint(number + 1, self.last, newest[1], newest[0])
+        kept = Checkpoint(1, last_sequence, attributes or {}, arrays)
+        last = kept if newest is None else Checkpoint(1, self.last, newest[1], newest[0])
         self._checkpoints = last, kept  # at once; nobody reads the arrays of rows behind which it stands any more
         self._rows = {n: replace(row, arrays={}) if n <= last_sequence else row for n, row in self._rows.items()}
         self.last = max(self.last, last_sequence)

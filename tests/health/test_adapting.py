@@ -216,7 +216,7 @@ def test_another_robots_adaptation_stays_with_it(path: Path, tmp_path: Path) -> 
     with TactileLearner.open(tmp_path / "empty", sensor=PAD, **HOW) as learner:
         learner.merge(tmp_path / "small.stm")
         assert (learner.digest(), correction(learner)) == (digest, None)
-        with pytest.raises(errors.InputError, match="no numbers of the channels"):
+        with pytest.raises(errors.InputError, match="too few numbers of the channels"):
             learner.adapt(five())
 
 

@@ -7,6 +7,7 @@ another name is refused in learning from files, by one process or a fleet; `obse
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import takewhile
 from typing import cast
 
 from scroll_tactile_store import Head, Record
@@ -39,7 +40,7 @@ TouchRows = dict[str, tuple[int, Annotation]]
 def rows_with(store: AnyStore, memory: Memory, key: bytes) -> TouchRows:
     """The rows of observations that count and have readings with this hash; of each name the first."""
     found: TouchRows = {}
-    for head in store.with_key(key):
+    for head in takewhile(lambda head: head.sequence <= memory.sequence, store.with_key(key)):
         if head.kind in (kinds.OBSERVE, kinds.MEMBER) and not memory.is_gone(head.sequence):
             found.setdefault(head.label, (head.sequence, annotation_of(head.attributes)))
     return found

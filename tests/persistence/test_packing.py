@@ -15,14 +15,13 @@ from scroll_tactile.errors import MismatchError
 from scroll_tactile.memory.gate import MemoryStore, check_memory
 
 
-def packed(folder, observed, name="p", described=(), pack=None, **settings):
-    """A packed memory that observed these touches."""
-    learner, _ = filled(folder / f"{name}.memory", observed, **settings)
-    with learner:
-        for material, constituents in dict(described).items():
-            learner.describe(material, constituents)
-        learner.pack(folder / name, **pack or {})
-    return folder / name
+def packed(folder, observed, pack=None, cotton=()):
+    """A packed memory that observed these touches. cotton: materials that are described as that."""
+    with filled(folder / "p.memory", observed)[0] as learner:
+        for material in cotton:
+            learner.describe(material, {"cotton": 1.0})
+        learner.pack(folder / "p", **pack or {})
+    return folder / "p"
 
 
 class TestMerging:
@@ -62,7 +61,7 @@ class TestMerging:
 class TestReading:
     @pytest.mark.parametrize("pack", [{}, {"readings": False}])
     def test_it_is_opened_to_read_and_left_as_it_is(self, tmp_path, pack):
-        file = packed(tmp_path, OBSERVED, described={"a": {"cotton": 1.0}}, pack=pack)
+        file = packed(tmp_path, OBSERVED, pack, cotton=["a"])
         before = file.read_bytes()
         with TactileLearner.open(file, mode="read") as learner:
             if pack.get("readings", True):
@@ -110,8 +109,7 @@ class TestDamage:
         inside = ranges(file)
         within = [begin + int(draw.integers(size)) for begin, size in inside for _ in range(1 if pack else 2)]
         outside = [*range(0, 30, 9), *range(len(whole) - 60, len(whole), 17), *(begin - 30 for begin, _ in inside)]
-        places = [*within, *outside, *draw.integers(0, len(whole), size=3).tolist()]
-        for place in places:
+        for place in [*within, *outside, *draw.integers(0, len(whole), size=3).tolist()]:
             flipped = bytearray(whole)
             flipped[place] ^= 1 << int(draw.integers(8))
             file.write_bytes(bytes(flipped))

@@ -55,10 +55,14 @@ def test_it_is_packed_and_merged_as_one_with_a_path(tmp_path):
     assert learner.merge(learner).shared == 11
 
 
-def test_a_merge_that_is_cut_short_never_began(tmp_path):
-    learner, other = fed(OBSERVED[:4]), fed(OBSERVED[4:])
+def test_a_merge_that_is_cut_short_never_began_and_rows_behind_a_checkpoint_alone_are_embedded_again(monkeypatch):
+    monkeypatch.setattr("scroll_tactile.persistence.ledger.CHECKPOINT_EVERY", 3)
+    learner, other, embedded = fed(OBSERVED[:4]), fed(OBSERVED[4:]), []
     with pytest.raises(KeyboardInterrupt):
         learner.merge(other, progress=lambda what, done, of: done < 3 or interrupt())
+    empty, encode = learner._ledger._empty, learner._ledger._empty.encode
+    monkeypatch.setattr(empty, "encode", lambda readings: embedded.append(len(readings)) or encode(readings))
+    assert learner.memory.sequence == 4 and len(embedded) == 1
     assert held(learner) == held(fed(OBSERVED[:4])) and len(learner.observations()) == 4
 
 

@@ -151,9 +151,7 @@ class TestRefused:
                     learner.reembed(SMALL)
             assert ours.digest() == fed(OBSERVED).digest()
 
-    def test_without_a_path_and_in_a_batch(self, path):
-        with pytest.raises(InputError, match="without a path"):
-            fed(OBSERVED).reembed()
+    def test_in_a_batch(self, path):
         learner, _ = filled(path)
         with learner, learner.batch(), pytest.raises(InputError, match="in a batch"):
             learner.reembed()

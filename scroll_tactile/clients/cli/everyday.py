@@ -132,7 +132,7 @@ def _one_touch(learner: TactileLearner, file: str, options: SourceOptions) -> So
 
     found = list(source_touches(learner, file, options, named=False))
     if isinstance(found[0], Refused):
-        raise InputError(found[0].why, argument=found[0].argument)
+        raise found[0].error()
     if len(found) > 1:
         why = next(str(fact) for fact in found[0].facts if fact.then == "cut")
         text = f"expected one touch; these are {len(found)}, for `scroll-tactile learn`. {why}"
@@ -217,7 +217,7 @@ def _show_answer(found: Answered | Refused, as_json: bool) -> None:
     from scroll_tactile.clients.learning.sources import Refused
 
     if isinstance(found, Refused):
-        raise InputError(found.why, argument=found.argument)
+        raise found.error()
     if as_json:
         say_json(_answer(found))
         return

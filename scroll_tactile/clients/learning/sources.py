@@ -218,6 +218,11 @@ class Refused:
         """What an error refuses."""
         return cls(source, str(error).removeprefix(f"{source}: "), getattr(error, "argument", None))
 
+    def error(self) -> InputError:
+        """The error of a command that has this source alone."""
+        why = self.why if self.source in self.why else f"{self.source}: {self.why}"
+        return InputError(why, argument=self.argument)
+
 
 @dataclass(frozen=True)
 class SourceTouch:

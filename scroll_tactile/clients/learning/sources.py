@@ -120,15 +120,15 @@ class SourceOptions:
 
     def by_names(self, sources: Sequence[str], sensor: Sensor) -> SourceOptions:
         """The options with the names of the sensor's columns, or else of those of the first source that can be read."""
-        if self.columns is not None or self.names or sensor.camera:
+        if self.columns is not None or self.names_of or sensor.camera:
             return self
         if sensor.columns:
             return replace(self, names=sensor.columns, names_of=f"sensor {sensor.name!r}")
+        where = {name: getattr(self, name) for name in ("topic", "field", "clock", "preset", "labels")}
         for address in [source for source in sources if not is_memory(source)][:_LOOKED]:
             with suppress(InputError, OSError):
-                where = {name: getattr(self, name) for name in ("topic", "field", "clock", "preset", "labels")}
                 names = next(iterate(address, **where)).names
-                return replace(self, names=names, names_of=address) if len(names) == sensor.channels else self
+                return replace(self, names=names if len(names) == sensor.channels else (), names_of=address)
         return self
 
     def recording(self, address: str, sensor: Sensor) -> tuple[Recording, list[Fact]]:
@@ -158,8 +158,11 @@ class SourceOptions:
             recording = resampled(recording, sensor.rate, recording.breaks(sensor))
         return recording, facts
 
-    def touches_in(self, recording: Recording, learner: TactileLearner) -> tuple[Touch, ...]:
-        """The touches in a recording, each in one piece by its times; raises what `recordings.touches` raises."""
+    def touches_in(self, recording: Recording, learner: TactileLearner) -> tuple[Touch | Refused, ...]:
+        """The touches in a recording, each in one piece by its times, and those whose pieces are too short.
+
+        Raises what `recordings.touches` raises.
+        """
         if self.intervals is not None:
             found = touches(recording, self.intervals)
         elif self.cut == "contact":
@@ -168,20 +171,20 @@ class SourceOptions:
             whole = self.cut == "none" or (self.cut is None and not recording.episodes)
             found = touches(recording, "whole" if whole else "episodes", self.by)
         breaks = [] if self.rate == "keep" else recording.breaks(learner.sensor)
-        return tuple(piece for touch in found for piece in _pieces(touch, breaks, learner.sensor)) if breaks else found
+        return tuple(piece for touch in found for piece in _pieces(touch, breaks, learner.sensor))
 
 
-def _pieces(touch: Touch, breaks: Sequence[int], sensor: Sensor) -> Iterator[Touch]:
-    """A touch, or those parts of it between breaks that are long enough. Raises InputError where none is."""
+def _pieces(touch: Touch, breaks: Sequence[int], sensor: Sensor) -> Iterator[Touch | Refused]:
+    """A touch, or those parts of it between breaks that are long enough; it is refused where none is."""
     inside = [at for at in breaks if touch.begin < at < touch.end]
     parts = list(pairwise([touch.begin, *inside, touch.end]))
     long = [part for part in parts if not inside or part[1] - part[0] >= max(2, SHORTEST * sensor.rate)]
     if not long:
-        raise InputError(
-            f"{touch.name} has {len(parts)} parts, by gaps in its times and steps back, none of {SHORTEST:g} s: give "
-            "another clock=",
-            argument="clock",
+        why = (
+            f"gaps in its times, or steps back, leave {len(parts)} parts of it, none of {SHORTEST:g} s: give another "
+            "clock=, or take it in one, rate='keep'"
         )
+        yield Refused(stored_source(f"{touch.source}[{touch.begin}:{touch.end}]"), why, "clock rate")
     for begin, end in long:
         own = slice(begin - touch.begin, end - touch.begin)
         yield replace(touch, begin=begin, end=end, readings=touch.readings[own], times=touch.times[own])
@@ -254,6 +257,9 @@ def source_touches(
         yield Refused.by(error, address)
         return
     for touch in found:
+        if isinstance(touch, Refused):
+            yield touch
+            continue
         source = _source(recording, touch, options)
         try:
             material = options.material if options.material is not None else touch.material

@@ -92,16 +92,16 @@ class UniformRandom:
 
 class _Pooled:
     def __init__(self, capacity: int, ratio: int, means: Mapping[str, IntArray]) -> None:
-        self._pool, self._means = ExemplarSample(capacity, ratio=ratio), means
+        self._pool, self._capacity, self._means = ExemplarSample(ratio * capacity), capacity, means
         self._felt: list[Exemplar] = []
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:
         self._pool.add(material, key, len(self._felt))
-        self._felt.append(Exemplar(material, key, {}, code, Scale("window", 1)))
+        self._felt.append(Exemplar(material, key, np.zeros((1, 1), np.float32), code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
         held = [self._felt[place] for *_, place in self._pool]
-        ranked = rank(held, self._pool.exemplars, lambda material, _: self._means[material])
+        ranked = rank(held, self._capacity, lambda material, _: self._means[material])
         return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
 

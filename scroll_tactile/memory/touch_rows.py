@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,22 +10,21 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, BaseModel, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from scroll_tactile_store import Checkpoint, DamageError, Head
 
-from scroll_tactile.errors import InputError, MismatchError, StreamError
+from scroll_tactile.errors import MismatchError, StreamError
 from scroll_tactile.quantities import MOST_QUANTITIES, MOST_STEPS, Quantity
 from scroll_tactile.settings import require_source
 from scroll_tactile.signals.stream import Stream
 from scroll_tactile.signals.windows import Scale
-from scroll_tactile.statistics.annotations import MOST_AXES, NO_ANNOTATION, Annotation
-from scroll_tactile.statistics.fields import Arrays, Name, Unexpected, first_wrong
+from scroll_tactile.statistics.annotations import MOST_AXES, Annotation
+from scroll_tactile.statistics.fields import Arrays, Name, first_wrong
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH
 
 __all__ = [
     "ADAPT",
     "CHANNELS",
-    "CODES",
     "CORRECTION",
     "DECLARE",
     "DESCRIBE",
@@ -32,10 +32,7 @@ __all__ = [
     "LABELS",
     "MEMBER",
     "MERGE",
-    "MOST_BYTES",
     "OBSERVE",
-    "PACKED_SHAPE",
-    "PACKED_ZERO",
     "RETRACT",
     "RETRACTS",
     "SENSE",
@@ -52,10 +49,8 @@ __all__ = [
     "annotation_of",
     "declaration",
     "declared_by",
-    "only_readings",
     "pack_codes",
     "pack_readings",
-    "place_of",
     "refusing",
     "require_row",
     "retracted_by",
@@ -102,45 +97,31 @@ PACKED_SHAPE, PACKED_ZERO, PACKED_REST = "readings-shape", "readings-zero", "rea
 MANTISSA, LARGEST_EXPONENT = 24, 128  # bits of a float32's mantissa, and its largest exponent
 
 
-Whole = Annotated[int, Field(strict=True)]
-
-
 class RowFields(BaseModel):
-    """What the attributes of a row must be, where they are there; see the kinds above.
+    """What the attributes of a row must be, as far as somebody reads them before its arrays; see the kinds above.
 
     columns: of the touch. nbytes: of its readings, where the row has them.
     """
 
-    columns: Annotated[Whole, Field(ge=1, le=LONGEST_TOUCH)] | None = None
-    nbytes: Annotated[Whole, Field(ge=1, le=MOST_BYTES)] | None = None
+    model_config = ConfigDict(strict=True)
+
+    columns: Annotated[int, Field(ge=1, le=LONGEST_TOUCH)] | None = None
+    nbytes: int | None = None
     source: Annotated[str, AfterValidator(require_source)] | None = None
-    values: dict[Name, Annotated[Whole, Field(ge=0, le=MOST_STEPS)]] = Field({}, max_length=MOST_QUANTITIES)
+    values: dict[Name, Annotated[int, Field(ge=0, le=MOST_STEPS)]] = Field({}, max_length=MOST_QUANTITIES)
     labels: dict[Name, Name] = Field({}, max_length=MOST_AXES)
-    sequences: list[tuple[Whole, Whole]] | None = None
-    retracts: Whole | None = None
-    correction: str | None = None
-    constituents: dict[str, Any] | None = None
-
-
-def place_of(held: Head | Checkpoint) -> tuple[str, int | None]:
-    """What `refusing` calls a row or a checkpoint, and the sequence of a row."""
-    return (f"row {held.sequence}", held.sequence) if isinstance(held, Head) else (f"checkpoint {held.number}", None)
+    sequences: list[Annotated[list[int], Field(min_length=2, max_length=2)]] = []
 
 
 @contextmanager
-def refusing(path: Path, what: str, sequence: int | None = None) -> Iterator[None]:
-    """Name the place of what is found wrong there: as MismatchError what this version does not know, else DamageError.
-
-    what: such as "row 3". sequence: of a row.
-    """
+def refusing(path: Path, held: Head | Checkpoint | str) -> Iterator[None]:
+    """Raise what is found wrong in a row, a checkpoint or something else of a memory as DamageError that names it."""
+    sequence = held.sequence if isinstance(held, Head) else None
+    what = held if isinstance(held, str) else f"checkpoint {held.number}" if sequence is None else f"row {sequence}"
     try:
         yield
-    except MismatchError as error:
-        advice = "Open the memory with the version that wrote it, or a newer one"
-        raise MismatchError(f"{what} of {path} {error}. {advice}") from None
     except WRONG as error:
-        came = str(error) if isinstance(error, Unexpected | InputError) else f"{type(error).__name__}: {error!s:.200}"
-        came = first_wrong(error) if isinstance(error, ValidationError) else came
+        came = first_wrong(error) if isinstance(error, ValidationError) else f"{type(error).__name__}: {error!s:.200}"
         raise DamageError(
             f"{what} of {path} is not what is written there: {came}. It is damaged, or was made by another program: "
             "use none of this memory before you know who made it (scroll-tactile memory check)",
@@ -189,23 +170,18 @@ def _counts(readings: Readings) -> tuple[int, npt.NDArray[np.integer]] | None:
 
 
 def unpack_readings(arrays: Arrays) -> Readings | None:
-    """The readings that `pack_readings` packed, or that a compaction checkpoint has as they are; None without any."""
-    if "readings" in arrays:
-        return arrays["readings"]
+    """The readings that `pack_readings` packed; None where there are none. They take no more than a multiple of it."""
     if PACKED_REST in arrays:
-        readings: Readings = np.zeros(arrays[PACKED_SHAPE], np.float32)
-        readings.reshape(-1)[np.unpackbits(arrays[PACKED_ZERO], count=readings.size) == 0] = arrays[PACKED_REST]
-        return readings
+        shape, zero = arrays[PACKED_SHAPE].tolist(), np.unpackbits(arrays[PACKED_ZERO]) > 0
+        size = math.prod(shape)
+        readings: Readings = np.zeros(len(zero), np.float32)
+        readings[:size][~zero[:size]] = arrays[PACKED_REST]
+        return readings[:size].reshape(shape)
     for name, whole in arrays.items():
         if name.startswith(PACKED_WHOLE):
             power = int(name.removeprefix(PACKED_WHOLE))
             return np.ldexp(np.ascontiguousarray(np.moveaxis(whole, -1, 0)).astype(np.float32), power)
     return None
-
-
-def only_readings(arrays: Arrays) -> dict[str, npt.NDArray[Any]]:
-    """Of the arrays of a row, those that hold its readings."""
-    return {name: array for name, array in arrays.items() if name.startswith("readings")}
 
 
 def declaration(quantity: Quantity) -> dict[str, Any]:
@@ -227,10 +203,8 @@ def annotated(annotation: Annotation) -> dict[str, Any]:
 
 def annotation_of(attributes: Mapping[str, Any]) -> Annotation:
     """The annotation that `annotated` made attributes of."""
-    values, labels = (attributes.get(name, {}) for name in (VALUES, LABELS))
-    return (
-        Annotation(tuple(sorted(values.items())), tuple(sorted(labels.items()))) if values or labels else NO_ANNOTATION
-    )
+    values, labels = (tuple(sorted(attributes.get(name, {}).items())) for name in (VALUES, LABELS))
+    return Annotation(values, labels)
 
 
 def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:
@@ -240,8 +214,8 @@ def pack_codes(codes: Codes) -> dict[str, npt.NDArray[Any]]:
 
 def unpack_codes(arrays: Arrays) -> Codes:
     """The codes that `pack_codes` packed; none where the row has readings alone."""
-    numbers = {name: int(name.removeprefix(CODES)) for name in arrays if name.startswith(CODES)}
-    return {Scale.numbered(number): arrays[name] for name, number in numbers.items()}
+    named = [name for name in arrays if name.startswith(CODES)]
+    return {Scale.numbered(int(name.removeprefix(CODES))): arrays[name] for name in named}
 
 
 def row_codes(arrays: Arrays, encode: Encode | None) -> Codes:

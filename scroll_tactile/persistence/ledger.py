@@ -477,7 +477,7 @@ class Ledger:
                 self._whole = False
                 store.compact(arrays, last_sequence=last_sequence, attributes=attributes, newest=newest)
                 self._saved, self._saved_weighings = memory.sequence, {}  # it has none
-                memory.note_compaction(last_sequence)
+                memory.compacted = last_sequence
                 self._whole = True
                 give_back_scratch()
             return Compacted(memory.compacted, before, sum(store.size().values()))

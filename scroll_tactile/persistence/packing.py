@@ -43,7 +43,7 @@ def pack_memory(
     with_rows = rows and readings and not memory.compacted and len(heads) == len(found)
     identity: dict[str, Any] = Identity.read(store).to_json()
     packed = copy(memory)
-    packed.tuned, packed.tuned_last_sequence, packed.retracted, packed.excluded = None, 0, set(), set()
+    packed.tuned, packed.tuned_last_sequence, packed.retracted = None, 0, set()
     packed.corrections = {}  # they are of this unit; what was read through them is in the touches
     if not readings:
         identity |= {"exemplars": 0, "kept_touches": 0}

@@ -32,10 +32,11 @@ from scroll_tactile.memory.touch_rows import (
     RETRACTS,
     Changed,
     Codes,
+    Readings,
     active_rows,
     declared_by,
-    only_readings,
     retracted_by,
+    unpack_readings,
     unspanned,
 )
 from scroll_tactile.persistence.ram_store import AnyStore
@@ -136,7 +137,7 @@ def note(memory: Memory, row: Head) -> None:
 
 def _retract(memory: Memory, row: Record, store: AnyStore, known: Mapping[int, Record]) -> list[Changed]:
     gone = unspanned(row.attributes["sequences"])
-    for sequence in sorted({sequence for sequence in gone if sequence <= memory.compacted} - memory.excluded):
+    for sequence in sorted({sequence for sequence in gone if sequence <= memory.compacted} - memory.retracted):
         logger.warning(  # a repair made the compaction checkpoint: `compact` would have left it out
             "%s: observation %d was retracted by row %d, but still counts: its features were lost to damage. Only a "
             "copy from before the damage can leave it out",
@@ -300,7 +301,7 @@ def _exemplars_in(memory: Memory, store: AnyStore, sequence: int) -> list[Exempl
     row = store.record(sequence) if sequence else store.compaction()
     if isinstance(row, Record) and row.kind == OBSERVE:
         steps, codes = memory.codes(row)
-        readings, stages = only_readings(row.arrays), memory.plan.scored_stages(steps)
+        readings, stages = cast(Readings, unpack_readings(row.arrays)), memory.plan.scored_stages(steps)
         return [Exemplar.of(row.label, row.key, readings, stages, codes)]
     kept = None if row is None else MemoryFields.of(row, memory.statistics.dimension, store.path).exemplars
     return [] if kept is None else kept.exemplars()

@@ -27,7 +27,7 @@ from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
 from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory, sound_rows
-from scroll_tactile.memory.identity import FingerprintCheck, Identity
+from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
 from scroll_tactile.memory.tuned import Tuned
@@ -112,7 +112,7 @@ class Predictor:
         """Of the memory in a folder. Raises as `TactileLearner.open`."""
         store, identity, recipe = open_memory(path, request, mode)
         try:
-            check = FingerprintCheck(identity, store.path) if request.embedding is None else None
+            check = partial(identity.require_embedding, store.path) if request.embedding is None else None
             return cls._of(recipe, _extractor(recipe, check), store, identity.embedding.configuration is not None)
         except BaseException:
             store.close()
@@ -421,8 +421,10 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))
 
 
-def _extractor(recipe: Recipe, check: FingerprintCheck | None = None) -> FeatureExtractor:
-    return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, check)
+def _extractor(recipe: Recipe, check: Callable[[Embedding], None] | None = None) -> FeatureExtractor:
+    made = FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan)
+    made.check = check
+    return made
 
 
 def nothing_known(seconds: float) -> Prediction:

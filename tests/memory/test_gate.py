@@ -94,13 +94,8 @@ def spoilt(name, change):
     return checkpoint(lambda _, arrays: arrays.update({name: change(arrays[name])}))
 
 
-def identified(field, value, part=""):
-    def put(path):
-        known = get_identity(path)
-        (known[part] if part else known)[field] = value
-        set_identity(path, known)
-
-    return put
+def identified(field, value):
+    return lambda path: set_identity(path, get_identity(path) | {field: value})
 
 
 def table(make, values_by_name):
@@ -112,7 +107,6 @@ def table(make, values_by_name):
 
 ROWS = {
     "no attributes": row(attributes={}),
-    "columns of others": said(columns=59),
     "bytes in words": said(nbytes="a"),
     "bytes of others": said(nbytes=488),
     "bytes of none": row({}),
@@ -120,9 +114,7 @@ ROWS = {
     "not finite": row(pack_readings(np.full((60, 2), np.nan, np.float32))),
     "out of range": row(pack_readings(np.full((60, 2), 1.5, np.float32))),
     "another touch's key": row(key=validate(stream(OTHER[0][1]), PAD).key),
-    "a short key": row(key=b"abc"),
     "no name": row(label=""),
-    "a long name": row(label="x" * 10**6),
     "an escape for a name": row(label="\x1b]0;pwned\x07\x1b[2J"),
     "an escape for a source": said(source="\x1b[2J"),
     "a large shape": row(PACKED | {"readings-shape": np.array([2**40, 2])}),
@@ -130,55 +122,36 @@ ROWS = {
     "no rest": row({name: one for name, one in PACKED.items() if name != "readings-rest"}),
     **table(lambda name, value: said(**{name: value}), {"values": [[], {"force": 1.5}], "labels": [[], {"slip": 3}]}),
 }
-SPANS = [None, "x", [[1]], [[1, 10**12]], [[1, 99]], [[0, 1]], [[2, 1]], [[3, 4], [1, 2]]]
+SPANS = ["x", [[1]], [[1, 10**12]], [[1, 10**12], [10**12, 1]]]
 ROWS |= {f"retracts {one}": row({}, kind="retract", label="", key=b"", attributes={"sequences": one}) for one in SPANS}
-ROWS |= {
-    f"describes {one}": row({}, kind="describe", label="a", key=b"", attributes={"constituents": one})
-    for one in ("x", [], {"wool": "x"}, {"wool": 2.0}, {"": 1.0})
-}
-ROWS |= {
-    f"declares {label!r} {one}"[:60]: row({}, kind="declare", label=label, key=b"", attributes=QUANTITY | one)
-    for label, one in [
-        ("", {}),
-        ("\x1b[2J", {}),
-        *(("speed", one) for one in ({"unit": 3}, {"low": 1.0}, {"low": "x"})),
-    ]
-}
 CHECKPOINTS = table(
     spoilt,
     {
         "statistics-observations": [lambda a: a.astype(float), lambda a: a[:-1]],
-        "statistics-sums-15": [lambda a: a[:, :-1], lambda a: a.astype(np.int32), lambda _: None],
-        "statistics-codes-15": [lambda a: a[:-1]],
+        "statistics-sums-15": [lambda a: a[:, :-1], lambda _: None],
         "sample-keys": [lambda a: a[:, :3]],
-        "sample-rows": [lambda a: a[:, :-1], lambda a: a.astype(np.int64)],
         "kept-levels": [lambda a: a.astype(np.int16)],
-        "exemplars-sources": [lambda a: a.astype(float)],
         "targets-axes-0-statistics-sums-15": [lambda a: a[:, :-1], lambda _: None],
     },
 ) | table(
     lambda name, value: checkpoint(lambda attributes, _: attributes.update({name: value})),
     {
         "statistics": [None, {"materials": ["a", "b", "\n"]}, {"materials": ["a"]}],
-        "sample": [None, {"materials": ["a"], "annotations": []}],
-        "descriptions": [[], {"a": {"wool": "x"}}],
+        "descriptions": [[]],
         "quantities": [[], {"force": 3}],
         "targets": [{}],
-        "weighings": [[]],
         "tuned": [{}],
     },
 )
 IDENTITIES = table(
     identified,
     {"sensor": ["x", {"name": "pad"}], "embedding": [{}], "grid": [{}, {"bits": True, "scales": [15]}]}
-    | {"exemplars": [-1, 10**30], "kept_touches": [True], "views": [1], "reading": [None]},
-) | table(
-    partial(identified, part="sensor"), {"channels": [-1, 10**400], "rate": [None], "low": [1e308], "layout": [[1e308]]}
+    | {"exemplars": [-1], "kept_touches": [True], "views": [1], "reading": [None]},
 )
 FORGED = {
     "row [0-9]+ of .* is not what is written there": ROWS,
     "checkpoint 1 of .* is not what is written there": CHECKPOINTS,
-    "identity|range": IDENTITIES,
+    "the identity of .* is not what is written there": IDENTITIES,
 }
 CASES = [pytest.param(do, match, id=name) for match, cases in FORGED.items() for name, do in cases.items()]
 
@@ -205,16 +178,9 @@ def test_a_sound_memory_has_nothing_that_is_found_and_a_forged_row_that_fits_is_
         assert learner.materials["silk"] == 1
 
 
-@pytest.mark.parametrize(
-    ("do", "said"),
-    [
-        (row({}, kind="exec", label="", key=b""), "of kind 'exec'"),
-        (row(pack_readings(TOUCH.readings) | {"dreams": np.zeros(3)}), r"arrays \['dreams'\], which this version"),
-    ],
-)
-def test_what_a_later_version_writes_is_told_from_damage(path, do, said):
-    do(path)
-    with pytest.raises(MismatchError, match=said):
+def test_a_row_of_a_later_version_is_told_from_damage(path):
+    row({}, kind="exec", label="", key=b"")(path)
+    with pytest.raises(MismatchError, match=r"of kind 'exec'.*newer"):
         opened(path)
 
 

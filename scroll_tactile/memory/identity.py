@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 from scroll_tactile_store import Store
 
@@ -126,12 +124,8 @@ class Identity(_Kept):
         if "sensor" not in store.identity:
             raise MismatchError(f"{store.path} is a store, but holds no memory of touch. Take another path")
         with refusing(store.path, "the identity"):
-            return cls.from_json(store.identity)
-
-    @classmethod
-    def from_json(cls, fields: Mapping[str, Any]) -> Self:
-        """The identity of fields that `to_json` gave: of JSON's types, none converted."""
-        return cls.model_validate_json(json.dumps(dict(fields)), strict=True)
+            # Of JSON's types, none converted.
+            return cls.model_validate_json(json.dumps(dict(store.identity)), strict=True)
 
     def to_json(self) -> dict[str, Any]:
         """Its fields in JSON's types, as a store keeps them."""
@@ -226,21 +220,17 @@ class AbsentEmbedding:
         self._identity.require_embedding(self._path, made)
         return made
 
-    def embed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+    def embed(self, *image: Any) -> Any:
         """As the embedding does. Raises EmbeddingMismatchError where only its user can make it."""
-        return self._made.embed(image)
+        return self._made.embed(*image)
 
-    def embed_windows(
-        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]]
-    ) -> Mapping[int, npt.NDArray[np.floating]]:
+    def embed_windows(self, *windows: Any) -> Any:
         """As `embed`."""
-        return embed_windows(self._made, image, windows)
+        return embed_windows(self._made, *windows)
 
-    def embed_competing(
-        self, image: npt.NDArray[np.float32], windows: Mapping[int, Sequence[int]], width: int
-    ) -> tuple[Mapping[int, npt.NDArray[np.floating]], npt.NDArray[np.floating]]:
+    def embed_competing(self, *windows: Any) -> Any:
         """As `embed`."""
-        return embed_competing(self._made, image, windows, width)
+        return embed_competing(self._made, *windows)
 
 
 def absent_embedding(path: Path) -> AbsentEmbedding:

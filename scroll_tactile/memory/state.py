@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scroll_tactile_store import Checkpoint, Head, Record
 
+from scroll_tactile.errors import MismatchError
 from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.descriptions import Description
 from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarFields, ExemplarSample
@@ -23,7 +24,7 @@ from scroll_tactile.memory.touch_rows import (
     annotation_of,
     declaration,
     refusing,
-    row_codes,
+    unpack_codes,
     unpack_readings,
 )
 from scroll_tactile.memory.tuned import Tuned
@@ -32,7 +33,7 @@ from scroll_tactile.recipe import Recipe
 from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.levels import LevelArray, levels_of
-from scroll_tactile.statistics.annotations import TargetFields, TargetSums
+from scroll_tactile.statistics.annotations import NO_ANNOTATION, TargetFields, TargetSums
 from scroll_tactile.statistics.fields import Bytes, Ints, Must, Name, decode, encode
 from scroll_tactile.statistics.sample import Sample, SampledTouch, SampleFields, TouchFields, TouchSample
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH, Statistics, StatisticsFields
@@ -251,14 +252,39 @@ class Memory:
         """An empty memory of this recipe."""
         return Memory(self.recipe, self.encode)
 
+    def of_axis(self, axis: str) -> Memory:
+        """What was learned by the labels on an axis: its statistics follow it; samples are as they are now.
+
+        Empty where no touch has a label on the axis. It has no exemplars, descriptions or f*.
+        """
+        view = self.empty_like()
+        view.exemplars, view.sequence, view.retractions = None, self.sequence, self.retractions
+        view.statistics = self.targets.axes.get(axis, view.statistics)
+        for _, key, touch in self.sample:
+            if (label := touch.annotation.label(axis)) is not None:
+                view.sample.add(label, key, replace(touch, annotation=NO_ANNOTATION))
+        for _, key, kept in self.kept or ():
+            if view.kept is not None and (label := kept.annotation.label(axis)) is not None:
+                view.kept.add(label, key, replace(kept, material=label, annotation=NO_ANNOTATION))
+        return view
+
     def is_gone(self, sequence: int) -> bool:
         """Whether this observation was retracted, as far as the memory itself knows."""
         return sequence in self.retracted
 
     def codes(self, record: Record) -> tuple[int, Codes]:
-        """The columns of an observation, and its rows of codes by scale."""
-        columns = cast(int, record.attributes["columns"])
-        return columns, row_codes(record.arrays, self.encode)
+        """The columns of an observation, and its rows of codes by scale.
+
+        Raises MismatchError for readings alone that this memory cannot embed.
+        """
+        if not (codes := unpack_codes(record.arrays)):
+            if self.encode is None:
+                raise MismatchError(
+                    "a row of the journal holds readings alone, and they can be embedded only by the embedding that "
+                    "made the memory: open it with TactileLearner.open(path, embedding=...)"
+                )
+            codes = self.encode(cast(Readings, unpack_readings(record.arrays)))
+        return cast(int, record.attributes["columns"]), codes
 
     def _sampled(self, row: Head, columns: int, codes: Codes) -> SampledTouch:
         return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation_of(row.attributes))

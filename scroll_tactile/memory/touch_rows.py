@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from scroll_tactile_store import Checkpoint, DamageError, Head
 
-from scroll_tactile.errors import MismatchError, StreamError
+from scroll_tactile.errors import StreamError
 from scroll_tactile.quantities import MOST_QUANTITIES, MOST_STEPS, Quantity
 from scroll_tactile.settings import require_source
 from scroll_tactile.signals.stream import Stream
@@ -54,7 +54,6 @@ __all__ = [
     "refusing",
     "require_row",
     "retracted_by",
-    "row_codes",
     "spans",
     "unpack_codes",
     "unpack_readings",
@@ -116,8 +115,8 @@ class RowFields(BaseModel):
 @contextmanager
 def refusing(path: Path, held: Head | Checkpoint | str) -> Iterator[None]:
     """Raise what is found wrong in a row, a checkpoint or something else of a memory as DamageError that names it."""
-    sequence = held.sequence if isinstance(held, Head) else None
-    what = held if isinstance(held, str) else f"checkpoint {held.number}" if sequence is None else f"row {sequence}"
+    what = held if isinstance(held, str) else f"row {held.sequence}" if isinstance(held, Head) else "checkpoint "
+    what += str(held.number) if isinstance(held, Checkpoint) else ""
     try:
         yield
     except WRONG as error:
@@ -126,7 +125,7 @@ def refusing(path: Path, held: Head | Checkpoint | str) -> Iterator[None]:
             f"{what} of {path} is not what is written there: {came}. It is damaged, or was made by another program: "
             "use none of this memory before you know who made it (scroll-tactile memory check)",
             path=path,
-            sequence=sequence,
+            sequence=held.sequence if isinstance(held, Head) else None,
         ) from error
 
 
@@ -216,22 +215,6 @@ def unpack_codes(arrays: Arrays) -> Codes:
     """The codes that `pack_codes` packed; none where the row has readings alone."""
     named = [name for name in arrays if name.startswith(CODES)]
     return {Scale.numbered(int(name.removeprefix(CODES))): arrays[name] for name in named}
-
-
-def row_codes(arrays: Arrays, encode: Encode | None) -> Codes:
-    """The rows of codes that a touch added, by scale, from the arrays of its journal row.
-
-    encode: embeds readings where the row has nothing else; None raises MismatchError there.
-    """
-    if codes := unpack_codes(arrays):
-        return codes
-    readings = unpack_readings(arrays)
-    if readings is None or encode is None:
-        raise MismatchError(
-            "a row of the journal holds readings alone, and they can be embedded only by the embedding that made the "
-            "memory: open it with TactileLearner.open(path, embedding=...)"
-        )
-    return encode(readings)
 
 
 def retracted_by(rows: Iterable[Head]) -> set[int]:

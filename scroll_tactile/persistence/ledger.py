@@ -24,7 +24,6 @@ from scroll_tactile_store import CompactedError, Head, ReadOnlyError, Record, St
 from scroll_tactile.errors import AnnotationError, FineTuneError, InputError
 from scroll_tactile.health.channel_numbers import MOST_CHANNELS, channel_numbers, to_text
 from scroll_tactile.health.watch import WatchedRows, WatchRules
-from scroll_tactile.memory.axes import axis_memory
 from scroll_tactile.memory.descriptions import Description, require_units
 from scroll_tactile.memory.gate import MemoryStore
 from scroll_tactile.memory.state import Memory
@@ -141,7 +140,7 @@ class Ledger:
             return memory
         version, found = self._axes.get(axis, (-1, memory))
         if version != self.version:
-            self._axes[axis] = self.version, (found := axis_memory(memory, axis))
+            self._axes[axis] = self.version, (found := memory.of_axis(axis))
         return found
 
     def read(self, what: Callable[[Memory, AnyStore], Answer]) -> Answer:

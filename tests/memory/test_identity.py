@@ -5,6 +5,7 @@ import json
 import pickle
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -166,7 +167,7 @@ def test_whether_whole_touches_are_read_is_known_without_the_embedding(tmp_path,
     made = Identity.of(Recipe.of(PAD, embedding))
     assert made.views == views
     assert made.to_json()["views"] == list(views)
-    assert Identity.from_json(made.to_json()) == made
+    assert Identity.read(SimpleNamespace(path=tmp_path, identity=made.to_json())) == made
     absent = AbsentEmbedding(made, tmp_path)
     assert absent.capabilities.reads_whole_touches == bool(views)
     assert window_plan(PAD, absent) == window_plan(PAD, embedding)

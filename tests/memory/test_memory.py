@@ -5,11 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
+from scroll_tactile_store import Record
 from scroll_tactile_store.encoding import encode_payload
+from touches import PAD, SMALL
 
 from examples.paper.readers import biotac_slide
 from scroll_tactile.errors import MismatchError
-from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, row_codes, unpack_codes, unpack_readings
+from scroll_tactile.memory.state import Memory
+from scroll_tactile.memory.touch_rows import pack_codes, pack_readings, unpack_codes, unpack_readings
+from scroll_tactile.recipe import Recipe
 from scroll_tactile.signals.windows import Scale
 
 SHAPES = st.one_of(
@@ -70,6 +74,6 @@ def test_codes_come_back():
 
 
 def test_readings_alone_need_their_embedding():
-    arrays = pack_readings(np.ones((20, 2), np.float32))
+    row = Record(1, "observe", "a", b"", 0.0, {"columns": 20}, 0, pack_readings(np.ones((20, 2), np.float32)))
     with pytest.raises(MismatchError, match="by the embedding that made the memory"):
-        row_codes(arrays, None)
+        Memory(Recipe.of(PAD, SMALL)).codes(row)

@@ -26,12 +26,13 @@ from scroll_tactile.clients.cli.terminal import progress_bar
 from scroll_tactile.finetune.fine_tune import fine_tune
 from scroll_tactile.finetune.network import TunedReader
 from scroll_tactile.learner import TactileLearner
-from scroll_tactile.memory.exemplars import Exemplar, ExemplarSample, herd, quotas, rank
+from scroll_tactile.memory.exemplars import Exemplar, herd, quotas, rank
 from scroll_tactile.persistence.replaying import exemplar_candidates
 from scroll_tactile.prediction.features import FeatureExtractor
 from scroll_tactile.signals.image import tactile_image
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.grid import mean_code
+from scroll_tactile.statistics.sample import Sample
 
 __all__ = ["Choice", "Chooser", "LiveHerding", "UniformRandom", "buffers", "compare", "mean_gap", "run_buffers"]
 
@@ -92,7 +93,7 @@ class UniformRandom:
 
 class _Pooled:
     def __init__(self, capacity: int, ratio: int, means: Mapping[str, IntArray]) -> None:
-        self._pool, self._capacity, self._means = ExemplarSample(ratio * capacity), capacity, means
+        self._pool, self._capacity, self._means = Sample[int](ratio * capacity), capacity, means
         self._felt: list[Exemplar] = []
 
     def add(self, material: str, key: bytes, code: Codes, mean: IntArray) -> None:

@@ -129,7 +129,9 @@ def fine_tune(
         seconds=time.perf_counter() - begun,
         digest=tuned.digest(),
     )
-    return replace(tuned, report=Tuned.described(report)), report
+    return replace(
+        tuned, report={k: told for k, told in vars(report).items() if k not in ("seconds", "digest")}
+    ), report
 
 
 def fine_tune_memory(

@@ -22,15 +22,7 @@ from scroll_tactile.statistics.grid import BITS
 from scroll_tactile.statistics.sample import Sample, SampledTouch, Stages, TouchFields
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH
 
-__all__ = [
-    "CANDIDATES",
-    "Exemplar",
-    "ExemplarFields",
-    "ExemplarSample",
-    "herd",
-    "quotas",
-    "rank",
-]
+__all__ = ["CANDIDATES", "Exemplar", "ExemplarFields", "herd", "quotas", "rank"]
 
 # Kept for each place in the buffer. With 3 the gap to the class mean is at most 1.08 times that of herding from every
 # touch (BioTac and RoboSkin, five folds, 5 to 20 exemplars a material); with 2 it reaches 1.24, with 4 it is 1.06.
@@ -112,10 +104,34 @@ class HeldFields:
 
 @dataclass
 class ExemplarFields(TouchFields):
-    """What a store keeps of an `ExemplarSample`. sources: rows, (n,). held: their touches, where no row has them."""
+    """What a store keeps of the candidates for the buffer, a sample of rows of the journal.
+
+    sources: the row in which the readings of each lie; 0 or a compacted row: the compaction checkpoint, (n,). held:
+    their touches, where no row has them.
+    """
 
     sources: Annotated[Ints, Must("int64", "n", 0)]
     held: HeldFields | None = None
+
+    @classmethod
+    def of(cls, sample: Sample[int], candidates: Sequence[Exemplar] | None = None) -> Self:
+        """What is kept; candidates: with their readings, for what leaves the rows of the journal behind."""
+        if candidates is None:
+            return cls(*sample.named(), np.array(list(sample.items()), np.int64))
+        readings = [candidate.readings for candidate in candidates]
+        held = HeldFields(
+            np.array([len(touch) for touch in readings], np.int64),
+            np.array([int(candidate.scale) for candidate in candidates], np.int64),
+            np.stack([candidate.code for candidate in candidates]) if readings else np.zeros((0, 0), np.int32),
+            np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
+        )
+        names, keys = [one.material for one in candidates], key_rows([one.key for one in candidates])
+        return cls(names, [], keys, np.zeros(len(names), np.int64), held)
+
+    def rows(self, source: int) -> list[tuple[str, bytes, int]]:
+        """The sample as it was, of which one of fewer keeps the first. source: the row of those with readings."""
+        sources = self.sources.tolist() if self.held is None else [source] * len(self.materials)
+        return [(name, key, row) for (name, key, _), row in zip(self.named(), sources, strict=True)]
 
     def exemplars(self) -> list[Exemplar]:
         """The exemplars that came with their readings."""
@@ -125,36 +141,6 @@ class ExemplarFields(TouchFields):
         scales = [Scale.numbered(number) for number in self.held.scales.tolist()]
         own = zip(self.named(), parts, self.held.codes, scales, strict=False)
         return [Exemplar(name, key, readings, code, scale) for (name, key, _), readings, code, scale in own]
-
-
-class ExemplarSample(Sample[int]):
-    """The candidates for the buffer: a function of the set of streams observed (see `Sample`).
-
-    Of each it has the row of the journal in which its readings lie; 0 or a compacted row: the compaction checkpoint.
-    """
-
-    def to_fields(self, candidates: Sequence[Exemplar] | None = None) -> ExemplarFields:
-        """What a store keeps; candidates: with their readings, for what leaves the rows of the journal behind."""
-        if candidates is None:
-            return ExemplarFields(*self.named(), np.array(list(self.items()), np.int64))
-        readings = [candidate.readings for candidate in candidates]
-        held = HeldFields(
-            np.array([len(touch) for touch in readings], np.int64),
-            np.array([int(candidate.scale) for candidate in candidates], np.int64),
-            np.stack([candidate.code for candidate in candidates]) if readings else np.zeros((0, 0), np.int32),
-            np.concatenate(readings) if readings else np.zeros((0, 0), np.float32),
-        )
-        names, keys = [one.material for one in candidates], key_rows([one.key for one in candidates])
-        return ExemplarFields(names, [], keys, np.zeros(len(names), np.int64), held)
-
-    def fill(self, kept: ExemplarFields, source: int) -> Self:
-        """Take in what `to_fields` gave. source: the row of those that come with their readings.
-
-        A sample of fewer keeps the first; one of more lacks what was dropped before.
-        """
-        sources = kept.sources.tolist() if kept.held is None else [source] * len(kept.materials)
-        self.update((*each[:2], row) for each, row in zip(kept.named(), sources, strict=True))
-        return self
 
 
 def rank(candidates: Iterable[Exemplar], count: int, means: Callable[[str, Scale], Ints]) -> dict[str, list[Exemplar]]:

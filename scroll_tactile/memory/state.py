@@ -15,7 +15,7 @@ from scroll_tactile_store import Checkpoint, Head, Record
 from scroll_tactile.errors import MismatchError
 from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.descriptions import Description
-from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarFields, ExemplarSample
+from scroll_tactile.memory.exemplars import CANDIDATES, Exemplar, ExemplarFields
 from scroll_tactile.memory.touch_rows import (
     Changed,
     Codes,
@@ -30,7 +30,6 @@ from scroll_tactile.memory.touch_rows import (
 from scroll_tactile.memory.tuned import Tuned
 from scroll_tactile.quantities import Quantity
 from scroll_tactile.recipe import Recipe
-from scroll_tactile.sensors import Sensor
 from scroll_tactile.signals.correction import Correction
 from scroll_tactile.signals.levels import LevelArray, levels_of
 from scroll_tactile.statistics.annotations import NO_ANNOTATION, TargetFields, TargetSums
@@ -38,54 +37,36 @@ from scroll_tactile.statistics.fields import Bytes, Ints, Must, Name, decode, en
 from scroll_tactile.statistics.sample import Sample, SampledTouch, SampleFields, TouchFields, TouchSample
 from scroll_tactile.statistics.statistics import LONGEST_TOUCH, Statistics, StatisticsFields
 
-__all__ = ["MOST_CORRECTIONS", "KeptTouches", "Memory", "MemoryFields"]
+__all__ = ["MOST_CORRECTIONS", "KeptFields", "Memory", "MemoryFields"]
 
 LONGEST_KEPT = 2.0  # times the usual length: what is kept of a touch
 T = TypeVar("T", SampledTouch, KeptTouch)
 MOST_CORRECTIONS = 16  # that a memory can come back to, one retraction after another
 
 
-class KeptTouches(Sample[KeptTouch]):
-    """Kept touches: a bounded sample of what was observed, as levels, to compare others with (see `matching.matcher`).
-
-    A function of the set of touches observed: at most `capacity` of a sensor's.
-    """
-
-    def __init__(self, sensor: Sensor, capacity: int) -> None:
-        super().__init__(capacity)
-        self.sensor = sensor
-
-    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
-        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most twice the usual length."""
-        return levels_of(readings[: max(2, round(LONGEST_KEPT * self.sensor.readings))], self.sensor)
-
-    def touches(self) -> list[KeptTouch]:
-        """All of them, by material and key."""
-        return list(self.items())
-
-    def to_fields(self) -> KeptFields:
-        """What a store keeps of them."""
-        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in self.items())])
-        columns = np.array([touch.levels.shape[1] for touch in self.items()], dtype=np.int64)
-        return KeptFields(*self.named(), columns, levels)
-
-    def fill(self, kept: KeptFields) -> None:
-        """Take in what `to_fields` gave."""
-        channels = self.sensor.channels
-        parts = np.split(kept.levels, np.cumsum(kept.columns * channels)[:-1])
-        for (material, key, annotation), levels in zip(kept.named(), parts, strict=False):
-            self.add(material, key, KeptTouch(material, key, levels.reshape(channels, -1), annotation))
-
-
 @dataclass
 class KeptFields(TouchFields):
-    """What a store keeps of `KeptTouches`.
+    """What a store keeps of kept touches.
 
     columns: the length of each touch, (n,). levels: of each touch, channel by channel, (Σ columns · channels,).
     """
 
     columns: Annotated[Ints, Must("int64", "n", 1, LONGEST_TOUCH)]
     levels: Annotated[Bytes, Must("uint8", "*")]
+
+    @classmethod
+    def of(cls, kept: Sample[KeptTouch]) -> Self:
+        """The fields of kept touches."""
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept.items())])
+        return cls(*kept.named(), np.array([touch.levels.shape[1] for touch in kept.items()], dtype=np.int64), levels)
+
+    def touches(self, channels: int) -> list[tuple[str, bytes, KeptTouch]]:
+        """The kept touches that these fields were made of, of a sensor of so many channels."""
+        parts = np.split(self.levels, np.cumsum(self.columns * channels)[:-1])
+        return [
+            (material, key, KeptTouch(material, key, levels.reshape(channels, -1), annotation))
+            for (material, key, annotation), levels in zip(self.named(), parts, strict=False)
+        ]
 
 
 @dataclass
@@ -132,7 +113,7 @@ class Memory:
 
     - statistics: exact sums by scale. targets: those of values and labels.
     - sample: the touches that readouts are calibrated on.
-    - kept: touches to match with; None where the recipe keeps none.
+    - kept: touches as levels, to compare others with (see `matching.matcher`); None where the recipe keeps none.
     - exemplars: the candidates for the buffer, and where their readings lie; None where the recipe has no buffer.
     - descriptions: material → what it is made of; the material need not have been observed.
     - quantities: those that touches can carry, by name.
@@ -158,8 +139,8 @@ class Memory:
         self.statistics = Statistics(recipe.embedding.dimension, self.plan.scales)
         self.targets = TargetSums(recipe.embedding.dimension, self.plan.scales)
         self.sample = TouchSample()
-        self.kept = KeptTouches(recipe.sensor, recipe.kept_touches) if recipe.kept_touches else None
-        self.exemplars = ExemplarSample(CANDIDATES * recipe.exemplars) if recipe.exemplars else None
+        self.kept: Sample[KeptTouch] | None = Sample(recipe.kept_touches) if recipe.kept_touches else None
+        self.exemplars: Sample[int] | None = Sample(CANDIDATES * recipe.exemplars) if recipe.exemplars else None
         self.tuned: Tuned | None = None
         self.tuned_last_sequence = 0
         self.retracted: set[int] = set()
@@ -290,8 +271,13 @@ class Memory:
         return SampledTouch.of(self.plan.scored_stages(columns), codes, annotation_of(row.attributes))
 
     def _levelled(self, row: Record) -> KeptTouch:
-        levels = cast(KeptTouches, self.kept).levels(cast(Readings, unpack_readings(row.arrays)))
+        levels = self.levels(cast(Readings, unpack_readings(row.arrays)))
         return KeptTouch(row.label, row.key, levels, annotation_of(row.attributes))
+
+    def levels(self, readings: npt.NDArray[np.floating]) -> LevelArray:
+        """What is kept of readings (T, C) in the sensor's unit: levels (C, T'), T' at most twice the usual length."""
+        sensor = self.recipe.sensor
+        return levels_of(readings[: max(2, round(LONGEST_KEPT * sensor.readings))], sensor)
 
     def take_chosen(self, other: Memory) -> None:
         """Take sample, kept touches and exemplars of a memory in place of its own."""
@@ -327,8 +313,8 @@ class Memory:
             MemoryFields(
                 statistics=self.statistics.to_fields(),
                 sample=self.sample.to_fields(self.statistics.dimension),
-                kept=None if self.kept is None else self.kept.to_fields(),
-                exemplars=None if self.exemplars is None else self.exemplars.to_fields(candidates),
+                kept=None if self.kept is None else KeptFields.of(self.kept),
+                exemplars=None if self.exemplars is None else ExemplarFields.of(self.exemplars, candidates),
                 targets=self.targets.to_fields(self.statistics.touches) if self.targets else None,
                 tuned=self.tuned,
                 # Rows behind a compaction checkpoint are replayed, and say themselves which of them were retracted.
@@ -356,9 +342,9 @@ class Memory:
                 self.targets = TargetSums.of(self.statistics, made.targets)
             self.sample = TouchSample.of(made.sample)
             if self.kept is not None and made.kept is not None:
-                self.kept.fill(made.kept)
+                self.kept.update(made.kept.touches(sensor.channels))
             if self.exemplars is not None and made.exemplars is not None:
-                self.exemplars.fill(made.exemplars, source)
+                self.exemplars.update(made.exemplars.rows(source))
             self.quantities = {name: Quantity(name=name, **fields) for name, fields in made.quantities.items()}
             self.corrections = {row: Correction.from_text(text, sensor) for row, text in made.corrections}
         self.retracted = {*made.retracted.tolist(), *made.excluded.tolist()}

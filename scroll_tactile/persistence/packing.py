@@ -12,7 +12,6 @@ from scroll_tactile_store import Head, Store
 from scroll_tactile_store.archive import write_archive
 from scroll_tactile_store.exceptions import reported
 
-from scroll_tactile.memory.exemplars import ExemplarSample
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import (
@@ -30,6 +29,7 @@ from scroll_tactile.memory.touch_rows import (
 )
 from scroll_tactile.persistence.ram_store import AnyStore
 from scroll_tactile.persistence.replaying import exemplar_candidates
+from scroll_tactile.statistics.sample import Sample
 
 __all__ = ["pack_memory", "sums_without"]
 
@@ -83,7 +83,7 @@ def _append(into: Store, store: AnyStore, head: Head, source: str | None, *, arr
     return into.append(head.kind, head.label, head.key, attributes=attributes, arrays=own, time=head.time)
 
 
-def _among(touches: Sequence[Head], memory: Memory) -> ExemplarSample | None:
+def _among(touches: Sequence[Head], memory: Memory) -> Sample[int] | None:
     """The exemplars among some touches, for a memory with the recipe of `memory`."""
     exemplars = memory.empty_like().exemplars
     if exemplars is not None:

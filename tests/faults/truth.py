@@ -112,7 +112,7 @@ class Truth:
 
     def typical(self, row: int, names: Sequence[str], streams: Sequence[Stream]) -> tuple[float, ...]:
         """How typical touches of one thing are of some materials."""
-        kept_touches = Memory(self._learner._predictor.recipe).kept
+        kept_touches = Memory(self._learner._predictor.recipe)
         if row not in self._conformal:
             kept = [
                 KeptTouch(name, key, kept_touches.levels(self.stream(key).readings))

@@ -17,7 +17,7 @@ from scroll_tactile import Kernels
 from scroll_tactile.memory.exemplars import (
     CANDIDATES,
     Exemplar,
-    ExemplarSample,
+    ExemplarFields,
     herd,
     quotas,
     rank,
@@ -25,6 +25,7 @@ from scroll_tactile.memory.exemplars import (
 from scroll_tactile.signals.windows import Scale
 from scroll_tactile.statistics.fields import encode
 from scroll_tactile.statistics.grid import mean_code
+from scroll_tactile.statistics.sample import Sample
 
 few = settings(max_examples=60, deadline=None)
 LARGEST = 2**20
@@ -118,7 +119,7 @@ def exemplar(material, number, scale=40):
 
 def sample_of(streams, capacity=9):
     """A sample in which row 1000 + number has a stream's readings."""
-    sample = ExemplarSample(capacity)
+    sample = Sample(capacity)
     for material, number in streams:
         key, before = bytes([number]), state(sample)
         wanted = sample.wants(material, key)
@@ -128,7 +129,7 @@ def sample_of(streams, capacity=9):
 
 
 def state(sample):
-    arrays, told = encode(sample.to_fields())
+    arrays, told = encode(ExemplarFields.of(sample))
     return {name: (array.shape, array.tobytes()) for name, array in arrays.items()}, told
 
 
@@ -159,7 +160,8 @@ def test_any_order_split_merge_or_restart_keeps_what_the_definition_says(ours, t
 @few
 @given(streams, streams, st.integers(1, 6), st.integers(1, 6))
 def test_a_restarted_sample_goes_on_and_one_of_fewer_is_the_beginning_of_it(ours, theirs, before, after):
-    restarted = ExemplarSample(min(before, after)).fill(sample_of(ours, before).to_fields(), 0)
+    restarted = Sample(min(before, after))
+    restarted.update(ExemplarFields.of(sample_of(ours, before)).rows(0))
     for material, number in theirs:
         restarted.add(material, bytes([number]), 1000 + number)
     assert state(restarted) == state(sample_of(ours + theirs, min(before, after)))
@@ -169,12 +171,12 @@ def test_a_restarted_sample_goes_on_and_one_of_fewer_is_the_beginning_of_it(ours
 @given(streams)
 def test_a_compaction_checkpoint_gives_exemplars_back_and_says_that_it_has_them(observed):
     kept = [exemplar(*stream) for stream in sorted(set(observed))]
-    fields = ExemplarSample(99).to_fields(kept)
+    fields = ExemplarFields.of(Sample(99), kept)
     again = fields.exemplars()
     assert [(e.material, e.key, e.readings.tobytes(), e.readings.shape, e.code.tolist(), e.scale) for e in again] == [
         (e.material, e.key, e.readings.tobytes(), e.readings.shape, e.code.tolist(), e.scale) for e in kept
     ]
-    assert all(source == 0 for *_, source in ExemplarSample(99).fill(fields, 0))
+    assert all(source == 0 for *_, source in fields.rows(0))
 
 
 def test_an_exemplars_code_is_the_last_of_its_own_at_its_widest_scale():

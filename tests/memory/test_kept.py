@@ -2,20 +2,20 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scroll_tactile_store import Store
-from touches import OBSERVED, PAD, Windowed, fed, filled, held, kept_of, require_same, stream
+from touches import OBSERVED, PAD, SMALL, Windowed, fed, filled, held, kept_of, require_same, stream
 
 from scroll_tactile import Kernels, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
 from scroll_tactile.matching.kept_arrays import KeptTouch
 from scroll_tactile.memory.identity import Identity
-from scroll_tactile.memory.state import KeptFields, KeptTouches
-from scroll_tactile.recipe import default_kept_touches
+from scroll_tactile.memory.state import KeptFields, Memory
+from scroll_tactile.recipe import Recipe, default_kept_touches
 from scroll_tactile.sensors import BIOTAC, GELSIGHT
 from scroll_tactile.signals.levels import levels_of
+from scroll_tactile.statistics.annotations import Annotation
 from scroll_tactile.statistics.fields import decode, encode
+from scroll_tactile.statistics.sample import Sample
 
 FEW = 5
 SPARE = [("d", (40 + i, 60)) for i in range(3)]
@@ -23,43 +23,23 @@ SPARE = [("d", (40 + i, 60)) for i in range(3)]
 
 def test_levels_are_those_of_the_readings_and_at_most_twice_as_long_as_is_usual():
     for readings in (2, 50, 100, 101, 5000):
-        levels = KeptTouches(PAD, 3).levels(stream((0, readings)))
+        levels = Memory(Recipe.of(PAD, SMALL)).levels(stream((0, readings)))
         assert levels.dtype == np.uint8
         assert np.array_equal(levels, levels_of(stream((0, readings))[:100], PAD))
     short = PAD.model_copy(update={"duration": 0.02})
-    assert KeptTouches(short, 3).levels(stream((0, 60))).shape == (2, 2)
+    assert Memory(Recipe.of(short, SMALL)).levels(stream((0, 60))).shape == (2, 2)
 
 
-@given(
-    st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 12), st.sampled_from([2, 30, 150])), max_size=30),
-    st.integers(1, 12),
-    st.randoms(use_true_random=False),
-)
-@settings(max_examples=60, deadline=None)
-def test_they_are_a_function_of_the_set_and_come_back_from_their_arrays(touches, capacity, rng):
-    def kept(order):
-        chosen = KeptTouches(PAD, capacity)
-        for material, seed, readings in order:
-            key, levels = bytes([seed, readings]) * 16, chosen.levels(stream((seed, readings)))
-            chosen.add(material, key, KeptTouch(material, key, levels))
-        return chosen
-
-    first = kept(touches)
-    shuffled = [*touches, *touches[:3]]
-    rng.shuffle(shuffled)
-    arrays, told = encode(first.to_fields())
-    materials = told["materials"]
-    for other in (kept(shuffled), KeptTouches(PAD, capacity)):
-        if not len(other):
-            other.fill(decode(KeptFields, arrays, told, {}))
-        again, names = encode(other.to_fields())
-        assert names == told
-        assert {name: array.tobytes() for name, array in again.items()} == {
-            name: array.tobytes() for name, array in arrays.items()
-        }
-    assert len(first) == min(capacity, len(set(touches)))
-    # Of as many materials as fit there is one at least.
-    assert len(set(materials)) == min(capacity, len({material for material, *_ in touches}))
+@pytest.mark.parametrize("lengths", [[], [2], [30, 2, 150, 1]])
+def test_they_come_back_from_their_arrays(lengths):
+    kept = Sample(9)
+    for i, columns in enumerate(lengths):
+        material, key, levels = "ab"[i % 2], bytes([i]) * 32, np.full((2, columns), i, np.uint8)
+        kept.add(material, key, KeptTouch(material, key, levels, Annotation(labels=(("slip", "n"),))))
+    again = decode(KeptFields, *encode(KeptFields.of(kept)), {}).touches(2)
+    assert [(one.material, one.key, one.levels.tolist(), one.annotation) for *_, one in again] == [
+        (one.material, one.key, one.levels.tolist(), one.annotation) for one in kept.items()
+    ]
 
 
 @pytest.mark.parametrize("theirs", [0, None])

@@ -64,7 +64,7 @@ def without(*places):
 def kept_of(learner):
     """The kept touches, to the byte; None of a memory that keeps none."""
     kept = learner.memory.kept
-    return None if kept is None else [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.items()]
+    return None if kept is None else [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
 
 
 def held(learner, *, exemplars=True):

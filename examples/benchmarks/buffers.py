@@ -101,8 +101,9 @@ class _Pooled:
         self._felt.append(Exemplar(material, key, np.zeros((1, 1), np.float32), code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
-        held = [self._felt[place] for *_, place in self._pool]
-        ranked = rank(held, self._capacity, lambda material, _: self._means[material])
+        ranked = rank(
+            [self._felt[at] for at in self._pool.touches()], self._capacity, lambda name, _: self._means[name]
+        )
         return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
 

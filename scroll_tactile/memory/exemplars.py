@@ -117,7 +117,7 @@ class ExemplarFields(TouchFields):
     def of(cls, sample: Sample[int], candidates: Sequence[Exemplar] | None = None) -> Self:
         """What is kept; candidates: with their readings, for what leaves the rows of the journal behind."""
         if candidates is None:
-            return cls(*sample.named(), np.array(list(sample.items()), np.int64))
+            return cls(*sample.named(), np.array(sample.touches(), np.int64))
         readings = [candidate.readings for candidate in candidates]
         held = HeldFields(
             np.array([len(touch) for touch in readings], np.int64),

@@ -8,7 +8,7 @@ must be stands beside the dataclasses that they fill, see `statistics.fields`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import chain, takewhile
@@ -42,7 +42,7 @@ from scroll_tactile.signals.stream import Stream
 from scroll_tactile.statistics.fields import Must, expect
 from scroll_tactile.statistics.grid import BITS
 
-__all__ = ["MemoryStore", "beside", "check_memory", "finish_interrupted", "open_memory", "sound_rows"]
+__all__ = ["MemoryStore", "beside", "check_memory", "finish_interrupted", "open_memory"]
 
 NAMED = (OBSERVE, MEMBER, DECLARE, DESCRIBE)  # rows whose label is a name; that of others may be empty
 FEWEST = 2**20  # rows that may be retracted at once, and as many as the log has bytes
@@ -170,9 +170,11 @@ def check_memory(path: str | os.PathLike[str]) -> list[str]:
             with _noted(found):
                 if (checkpoint := read()) is not None:
                     memory.empty_like().fill(checkpoint, store.path)
-        for row in sound_rows(lambda after: _rows(store, after), lambda damage: found.append(str(damage))):
-            if isinstance(row, Record) and row.kind == MERGE:
-                with _noted(found):
+        compacted = takewhile(lambda head: head.sequence <= store.compacted, Store.heads(store))
+        for row in chain(compacted, Store.records(store, store.compacted)):
+            with _noted(found):
+                store.sound(row)
+                if isinstance(row, Record) and row.kind == MERGE:
                     memory.empty_like().fill(row, store.path)
     return found
 
@@ -183,25 +185,3 @@ def _noted(found: list[str]) -> Iterator[None]:
         yield
     except (DamageError, EmbeddingError, MismatchError) as error:
         found.append(str(error))
-
-
-def _rows(store: MemoryStore, after: int) -> Iterator[Head]:
-    """The rows after one, with their arrays where these were not compacted."""
-    compacted = takewhile(lambda head: head.sequence <= store.compacted, store.heads(after))
-    return chain(compacted, store.records(max(after, store.compacted)))
-
-
-def sound_rows(read: Callable[[int], Iterator[Head]], tell: Callable[[DamageError], object]) -> Iterator[Head]:
-    """The rows of a journal without the damaged ones. read: reads those after one. tell: is called with each damage."""
-    after = 0
-    while True:
-        try:
-            for row in read(after):
-                yield row
-                after = row.sequence
-            return
-        except DamageError as damage:
-            tell(damage)
-            if damage.sequence is None or damage.sequence <= after:
-                return
-            after = damage.sequence

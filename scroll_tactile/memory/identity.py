@@ -43,10 +43,7 @@ OTHER: dict[str, tuple[type[MismatchError], str]] = {  # part of an identity →
     "views": OTHER_READING,
     "grid": (MismatchError, "Open it with the version that made it"),
     "exemplars": (MismatchError, "Readings that were not kept are gone: leave exemplars out"),
-    "kept_touches": (
-        MismatchError,
-        "Which touches are kept is a function of all that were observed: leave kept_touches out",
-    ),
+    "kept_touches": (MismatchError, "Touches that were not kept are gone: leave kept_touches out"),
 }
 
 
@@ -110,10 +107,8 @@ class Identity(_Kept):
         It may embed, for the fingerprint.
         """
         require_rest(recipe.embedding, recipe.sensor)
-        made, kept = EmbeddingIdentity.of(recipe.embedding), (recipe.exemplars, recipe.kept_touches)
-        return cls(
-            sensor=recipe.sensor, embedding=made, exemplars=kept[0], kept_touches=kept[1], **_parts_of(recipe.plan)
-        )
+        parts = _parts_of(recipe.plan) | {"exemplars": recipe.exemplars, "kept_touches": recipe.kept_touches}
+        return cls(sensor=recipe.sensor, embedding=EmbeddingIdentity.of(recipe.embedding), **parts)
 
     @classmethod
     def read(cls, store: Any) -> Self:

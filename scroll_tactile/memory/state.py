@@ -57,8 +57,8 @@ class KeptFields(TouchFields):
     @classmethod
     def of(cls, kept: Sample[KeptTouch]) -> Self:
         """The fields of kept touches."""
-        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept.items())])
-        return cls(*kept.named(), np.array([touch.levels.shape[1] for touch in kept.items()], dtype=np.int64), levels)
+        levels = np.concatenate([np.zeros(0, np.uint8), *(touch.levels.ravel() for touch in kept.touches())])
+        return cls(*kept.named(), np.array([touch.levels.shape[1] for touch in kept.touches()], dtype=np.int64), levels)
 
     def touches(self, channels: int) -> list[tuple[str, bytes, KeptTouch]]:
         """The kept touches that these fields were made of, of a sensor of so many channels."""
@@ -201,8 +201,7 @@ class Memory:
         self.retracted.add(row.sequence)
         self.retractions += 1
         self.weighings.clear()
-        if any(sample.holds(material, key) for sample in self.samples):
-            self.stale = True
+        self.stale |= any(sample.holds(material, key) for sample in self.samples)
         if row.sequence <= self.tuned_last_sequence:
             self.tuned = None
         return Changed(material, annotation.labels)
@@ -261,8 +260,8 @@ class Memory:
         if not (codes := unpack_codes(record.arrays)):
             if self.encode is None:
                 raise MismatchError(
-                    "a row of the journal holds readings alone, and they can be embedded only by the embedding that "
-                    "made the memory: open it with TactileLearner.open(path, embedding=...)"
+                    "a row holds readings alone, which can be embedded only by the embedding that made the memory: "
+                    "open it with TactileLearner.open(path, embedding=...)"
                 )
             codes = self.encode(cast(Readings, unpack_readings(record.arrays)))
         return cast(int, record.attributes["columns"]), codes

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -190,8 +191,7 @@ def declaration(quantity: Quantity) -> dict[str, Any]:
 
 def declared_by(row: Head) -> Quantity:
     """The quantity that a row declares. Raises InputError for what is none."""
-    fields: dict[str, Any] = {name: row.attributes.get(name) for name in ("unit", "low", "high", "resolution")}
-    return Quantity(name=row.label, **fields)
+    return Quantity(name=row.label, **cast(dict[str, Any], row.attributes))
 
 
 def annotated(annotation: Annotation) -> dict[str, Any]:
@@ -231,13 +231,9 @@ def active_rows(rows: Iterable[Head]) -> list[Head]:
 
 def spans(sequences: Iterable[int]) -> list[list[int]]:
     """Whole numbers as [first, last] pairs of those that follow each other: 1, 2, 3, 7 → [[1, 3], [7, 7]]."""
-    pairs: list[list[int]] = []
-    for sequence in sorted(sequences):
-        if pairs and pairs[-1][1] == sequence - 1:
-            pairs[-1][1] = sequence
-        else:
-            pairs.append([sequence, sequence])
-    return pairs
+    ordered = sorted(sequences)
+    edges = [i for i in range(1, len(ordered)) if ordered[i] > ordered[i - 1] + 1]
+    return [[ordered[first], ordered[last - 1]] for first, last in pairwise([0, *edges, len(ordered)]) if last]
 
 
 def unspanned(pairs: Any) -> list[int]:

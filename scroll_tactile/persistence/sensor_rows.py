@@ -156,7 +156,7 @@ def adapt_to(
             raise UnknownMaterialError(f"expected touches of materials that were observed; never were {unknown[:5]}")
         own = {of.key for touch in touches for of in (touch, corrected_stream(touch, memory.correction))}
         out = own if until is None else own | {head.key for head in store.heads(until)}
-        kept = [] if memory.kept is None else [each.levels for each in memory.kept.items() if each.key not in out]
+        kept = [] if memory.kept is None else [each.levels for each in memory.kept.touches() if each.key not in out]
         reference = _reference(_heads(store, memory, until), memory, sensor.channels, own)
     _require_known(reference, sorted(set(touches.values())), store)
     at_ends = [((levels == 0) | (levels == LEVELS - 1)).mean(axis=1) for levels in kept]  # of levels (n, T)

@@ -81,15 +81,15 @@ class WindowCache:
 class FeatureExtractor:
     """Makes features of touches, by a sensor, an embedding and a plan of windows; it learns nothing.
 
-    check: raises EmbeddingMismatchError where the embedding, which was made from the memory's configuration, is not the
-    one that made the memory; it is called once.
+    check: raises EmbeddingMismatchError where an embedding is not the one that made the memory; it is called once.
 
     Raises InputError for an embedding of frames with a sensor that is no camera, or a resting image of another shape.
     """
 
-    def __init__(self, sensor: Sensor, embedding: protocol.Embedding, plan: WindowPlan) -> None:
-        self.sensor, self.embedding, self._plan = sensor, embedding, plan
-        self.check: Callable[[protocol.Embedding], None] | None = None
+    def __init__(
+        self, sensor: Sensor, embedding: protocol.Embedding, plan: WindowPlan, check: Callable[..., None] | None = None
+    ) -> None:
+        self.sensor, self.embedding, self._plan, self.check = sensor, embedding, plan, check
         protocol.require_rest(embedding, sensor)
         self._rest: Rest = protocol.capabilities_of(embedding).rest
 

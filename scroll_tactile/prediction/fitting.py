@@ -83,7 +83,7 @@ class Draft:
         views = [view for view in plan.views if view in tasks]
         bare = Model(kind, plan, names, stages, views, statistics.longest, HeldOut(kind, [], {}, []))
         least = max(1, min(statistics.fifth_percentile_length, statistics.longest))
-        kept = list(memory.kept.items()) if memory.kept is not None and views else []
+        kept = memory.kept.touches() if memory.kept is not None and views else []
         return cls(bare, tasks, sample, kept, before, least, list(statistics.materials.values()))
 
     def fit(self) -> Model:

@@ -281,7 +281,7 @@ class Model:
             readouts[scale] = own
         matcher = self.matcher
         if matcher is not None and memory.kept is not None:
-            if not (kept := list(memory.kept.items())):
+            if not (kept := memory.kept.touches()):
                 return None
             matcher = matcher.followed(kept)
         there = {(material, key) for material, key, _ in self.held_out.sample}

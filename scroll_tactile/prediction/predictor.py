@@ -26,7 +26,7 @@ from scroll_tactile.embeddings.protocol import Embedding, capabilities_of
 from scroll_tactile.embeddings.registry import configuration_of
 from scroll_tactile.errors import AnnotationError, InputError
 from scroll_tactile.memory.descriptions import require_constituents
-from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory, sound_rows
+from scroll_tactile.memory.gate import MemoryStore, finish_interrupted, open_memory
 from scroll_tactile.memory.identity import Identity
 from scroll_tactile.memory.state import Memory
 from scroll_tactile.memory.touch_rows import Codes
@@ -121,8 +121,7 @@ class Predictor:
     @classmethod
     def of_snapshot(cls, state: Mapping[str, Any]) -> Self:
         """Of the memory that `snapshot` described, in memory only."""
-        recipe: Recipe = state["recipe"]
-        return cls._of(recipe, _extractor(recipe, state["check"]), state["store"])
+        return cls._of(state["recipe"], _extractor(state["recipe"], state["check"]), state["store"])
 
     @classmethod
     def _of(cls, recipe: Recipe, extractor: FeatureExtractor, store: AnyStore, known: bool | None = None) -> Self:
@@ -140,7 +139,7 @@ class Predictor:
         with self.ledger.lock:
             store, memory = self.ledger.store, self.ledger.memory
             kept = memory.to_arrays(memory.sequence, exemplar_candidates(memory, store))
-            held = RamStore.compacted_to(self.recipe, sound_rows(store.heads, logger.warning), memory.sequence, kept)
+            held = RamStore.compacted_to(self.recipe, store.heads(), memory.sequence, kept)
             return {"store": held, "recipe": self.recipe, "check": self.extractor.check}
 
     def of_axis(self, axis: str) -> Predictor:
@@ -421,10 +420,8 @@ def _reembedding(store: Store, embedding: Embedding | None) -> Reembedding:
     return Reembedding(store, recipe, lambda readings: extractor.learned(Stream(recipe.sensor, readings)))
 
 
-def _extractor(recipe: Recipe, check: Callable[[Embedding], None] | None = None) -> FeatureExtractor:
-    made = FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan)
-    made.check = check
-    return made
+def _extractor(recipe: Recipe, check: Callable[..., None] | None = None) -> FeatureExtractor:
+    return FeatureExtractor(recipe.sensor, recipe.embedding, recipe.plan, check)
 
 
 def nothing_known(seconds: float) -> Prediction:

@@ -24,7 +24,6 @@ import scroll_tactile.memory.state
 from faults.model import Operation, Pairs, State, Touch
 from scroll_tactile import Kernels, Quantity, TactileLearner
 from scroll_tactile.errors import InputError, MismatchError
-from scroll_tactile.memory.state import KeptFields
 from scroll_tactile.memory.touch_rows import annotated
 from scroll_tactile.persistence.merge import MergeRules
 from scroll_tactile.statistics.annotations import Annotation
@@ -180,7 +179,7 @@ def samples(learner: TactileLearner) -> dict[str, Any]:
     pool = hashlib.sha256()
     for name, key, touch in memory.sample:
         pool.update(repr((name, key, touch.rows.tobytes(), touch.pairs.tobytes(), touch.annotation)).encode())
-    arrays, told = ({}, None) if memory.kept is None else encode(KeptFields.of(memory.kept))
+    arrays, told = ({}, None) if memory.kept is None else encode(scroll_tactile.memory.state.KeptFields.of(memory.kept))
     kept = hashlib.sha256(repr(told).encode())
     for name in sorted(arrays):
         kept.update(repr((name, arrays[name].shape)).encode() + arrays[name].tobytes())

@@ -89,7 +89,7 @@ def state(learner):
     """All that a memory without a path holds, to the byte."""
     memory, kept = learner.memory, learner.memory.kept
     pool = [(name, key, touch.rows.tobytes()) for name, key, touch in memory.sample]
-    kept_levels = [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.items()]
+    kept_levels = [(touch.material, touch.key, touch.levels.tobytes()) for touch in kept.touches()]
     return (
         learner.digest(),
         learner.materials,

@@ -111,7 +111,7 @@ def content(learner, asked=ASKED):
 
 def kept(learner):
     """The kept touches, each as its material and key, and a digest of their levels."""
-    touches = list(learner.memory.kept.items())
+    touches = learner.memory.kept.touches()
     levels = hashlib.sha256(b"".join(touch.levels.tobytes() for touch in touches)).hexdigest()
     return [[[touch.material, touch.key.hex()] for touch in touches], levels]
 

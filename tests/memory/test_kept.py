@@ -38,7 +38,7 @@ def test_they_come_back_from_their_arrays(lengths):
         kept.add(material, key, KeptTouch(material, key, levels, Annotation(labels=(("slip", "n"),))))
     again = decode(KeptFields, *encode(KeptFields.of(kept)), {}).touches(2)
     assert [(one.material, one.key, one.levels.tolist(), one.annotation) for *_, one in again] == [
-        (one.material, one.key, one.levels.tolist(), one.annotation) for one in kept.items()
+        (one.material, one.key, one.levels.tolist(), one.annotation) for one in kept.touches()
     ]
 
 

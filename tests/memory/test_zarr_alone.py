@@ -63,7 +63,7 @@ def test_the_sample_is_the_learners(made):
 
 def test_the_kept_touches_are_the_learners(made):
     learner, group, _ = made
-    own, sensor = list(learner.memory.kept.items()), learner.sensor
+    own, sensor = learner.memory.kept.touches(), learner.sensor
     ends = np.cumsum(group["kept-columns"][...] * sensor.channels)
     levels = np.split(group["kept-levels"][...], ends[:-1])
     assert keys(group, "kept-keys") == [touch.key for touch in own]

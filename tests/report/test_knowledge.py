@@ -65,7 +65,7 @@ def test_a_touch_left_out_is_judged_as_if_it_had_never_been_observed(learner):
 def grown(learner, touches, rule=None):
     model = learner.model()
     extractor = FeatureExtractor(SENSOR, learner.embedding, learner.plan)
-    streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.items()}
+    streams = {touch.key: stream_of(touch.levels, SENSOR) for touch in learner.memory.kept.touches()}
     held_out = [(touch, streams[touch.key]) for touch in held_out_touches(model, 0.05) if touch.key in touches]
     return model, growing(model, learner.memory, extractor, rule or decision_rule(model, 0.05), 0.05, held_out)
 

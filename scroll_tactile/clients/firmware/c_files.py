@@ -63,7 +63,7 @@ def write_firmware(judge: ExportedJudge, folder: str | os.PathLike[str], touches
 
 def kept_levels(judge: ExportedJudge, memory: Memory) -> list[LevelRows]:
     """The levels of the touches that a memory keeps, at most so many, to check what was exported by."""
-    kept = [] if memory.kept is None else list(memory.kept.items())
+    kept = [] if memory.kept is None else memory.kept.touches()
     return [judge.levels(stream_of(touch.levels, judge.sensor)) for touch in kept[:: len(kept) // MOST_CHECKED + 1]]
 
 

@@ -308,7 +308,7 @@ def _without(model: Model, memory: Memory, touch: HeldOutTouch) -> Model:
     for scale in codes:
         readouts[scale] = Task.of(statistics, scale, readouts[scale].reference, model.plan.shrinkage).solve()
     if matcher is not None and memory.kept is not None:
-        kept = [each for each in memory.kept.items() if (each.material, each.key) != touch[:2]]
+        kept = [each for each in memory.kept.touches() if (each.material, each.key) != touch[:2]]
         matcher = matcher.followed(kept) if kept else None
     return replace(model, readouts=readouts, matcher=matcher)
 
@@ -382,7 +382,7 @@ class MemoryFacts:
     @cached_property
     def kept(self) -> list[KeptTouch]:
         """The kept touches, in the order of observation where that is known."""
-        touches = list(self.memory.kept.items()) if self.memory.kept is not None else []
+        touches = self.memory.kept.touches() if self.memory.kept is not None else []
         place = {row.key: row.sequence for row in self.journal}
         return sorted(touches, key=lambda touch: (place.get(touch.key, 0), touch.material, touch.key))
 

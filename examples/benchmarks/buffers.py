@@ -101,9 +101,7 @@ class _Pooled:
         self._felt.append(Exemplar(material, key, np.zeros((1, 1), np.float32), code, Scale("window", 1)))
 
     def buffer(self) -> Buffer:
-        ranked = rank(
-            [self._felt[at] for at in self._pool.touches()], self._capacity, lambda name, _: self._means[name]
-        )
+        ranked = rank(map(self._felt.__getitem__, self._pool.touches()), self._capacity, lambda m, _: self._means[m])
         return {name: [exemplar.key for exemplar in chosen] for name, chosen in ranked.items()}
 
 

@@ -1,6 +1,5 @@
 """What a memory says of its making: it opens from its path alone, with nothing embedded before the first touch."""
 
-import copy
 import json
 import pickle
 import subprocess
@@ -108,37 +107,24 @@ def test_another_number_of_exemplars_than_it_was_made_with_is_refused(tmp_path):
         TactileLearner.open(tmp_path / "m", exemplars=7)
 
 
-class TestSnapshots:
-    def test_a_learner_pickles_into_another_process_and_inspecting_imports_no_torch(self, tmp_path):
-        with filled(tmp_path / "m", embedding=Kernels(dimension=64)) as learner:
-            (tmp_path / "learner").write_bytes(pickle.dumps(learner))
-            answer = repr(learner.predict(touch(9)))
-            digest = learner.digest()
-        code = (
-            "import pickle, sys, numpy as np; from scroll_tactile.clients.cli import application\n"
-            "try: application()(['inspect', sys.argv[1], '--json'])\n"
-            "except SystemExit: pass\n"
-            "print('torch' in sys.modules)\n"
-            "learner = pickle.loads(open(sys.argv[2], 'rb').read())\n"
-            "print(learner.digest()); print(learner.predict(np.random.default_rng(9).random((60, 2)))); print(learner)"
-        )
-        words = [sys.executable, "-c", code, str(tmp_path / "m"), str(tmp_path / "learner")]
-        output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
-        assert json.loads(output[0])["materials"] == {"a": 3, "b": 3}
-        assert output[1:4] == ["False", digest, answer]
-        assert output[4] == f"<TactileLearner in memory, a snapshot of {tmp_path / 'm'}, pad, 2 materials>"
-
-    def test_a_copy_knows_what_was_known_and_goes_its_own_way(self, tmp_path):
-        with filled(tmp_path / "m") as learner:
-            twin = copy.deepcopy(learner)
-            assert twin.path is None
-            assert (twin.digest(), twin.exemplars) == (learner.digest(), learner.exemplars)
-            twin.observe("c", touch(7))
-            assert learner.materials == {"a": 3, "b": 3}
-            learner.observe("c", touch(7))
-            assert twin.digest() == learner.digest()
-            twin.retract(twin.observations()[-1].sequence)
-            assert twin.materials == {"a": 3, "b": 3}
+def test_a_learner_pickles_into_another_process_and_inspecting_imports_no_torch(tmp_path):
+    with filled(tmp_path / "m", embedding=Kernels(dimension=64)) as learner:
+        (tmp_path / "learner").write_bytes(pickle.dumps(learner))
+        answer = repr(learner.predict(touch(9)))
+        digest = learner.digest()
+    code = (
+        "import pickle, sys, numpy as np; from scroll_tactile.clients.cli import application\n"
+        "try: application()(['inspect', sys.argv[1], '--json'])\n"
+        "except SystemExit: pass\n"
+        "print('torch' in sys.modules)\n"
+        "learner = pickle.loads(open(sys.argv[2], 'rb').read())\n"
+        "print(learner.digest()); print(learner.predict(np.random.default_rng(9).random((60, 2)))); print(learner)"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path / "m"), str(tmp_path / "learner")]
+    output = subprocess.run(words, capture_output=True, text=True, check=True, timeout=120).stdout.splitlines()
+    assert json.loads(output[0])["materials"] == {"a": 3, "b": 3}
+    assert output[1:4] == ["False", digest, answer]
+    assert output[4] == f"<TactileLearner in memory, a snapshot of {tmp_path / 'm'}, pad, 2 materials>"
 
 
 def test_merging_looks_at_the_making_and_not_at_its_configuration(tmp_path):

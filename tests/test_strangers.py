@@ -24,8 +24,6 @@ from pathlib import Path
 import forging
 import h5py
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import zarr
 from commands import run
@@ -237,7 +235,6 @@ MAGIC = b"\x89MCAP0\r\n"
 MESSAGE = struct.pack("<BBHI19f", 0, 1, 0, 19, *range(19))
 ATTACHMENT = bytes(16) + text(b"../outside/evil") + text(b"") + struct.pack("<Q", 4) + b"evil" + bytes(4)
 CHUNK = struct.pack("<QQQI", 0, 0, 2**30, 0) + text(b"zstd") + struct.pack("<Q", len(GIGABYTE)) + GIGABYTE
-TOWER = ["a/L0[10] data", *(f"MSG: a/L{i}\na/L{i + 1}[10] data" for i in range(12)), "MSG: a/L12\nint8 x"]
 
 
 def mcap(*parts, form="ros2msg", message=MESSAGE, records=()):
@@ -317,16 +314,8 @@ def robot_set(folder, change=None, **told):
     about = lerobot(folder / "set") / "meta/info.json"
     known = json.loads(about.read_text()) | told
     if change is not None:
-        known["features"]["observation.tactile.tip"]["shape"] = [1]
         change(folder / "set" / "data/chunk-000/file-000.parquet")
     about.write_text(json.dumps(known))
-
-
-def equal_rows(file):
-    """4.5·10^7 equal rows in some KB."""
-    batch = pa.record_batch({"observation.tactile.tip": np.zeros(10**6, "f4"), "timestamp": np.zeros(10**6, "f8")})
-    with pq.ParquetWriter(file, batch.schema, compression="zstd", use_dictionary=False) as writer:
-        [writer.write_batch(batch, row_group_size=10**9) for _ in range(45)]
 
 
 RECORDINGS = {
@@ -353,11 +342,9 @@ RECORDINGS = {
     "hdf5: deflated": hdf5(deflated),
     "mcap: zeros": mcap(records=[record(6, CHUNK)] * 3),
     "mcap: a message in a hole": sparse("x.mcap", MAGIC + struct.pack("<BQ", 5, 2**30)),
-    "msg: a tower": mcap(*TOWER),
     "yaml: aliases": bag(f"{ALIASES}\n  compression_mode: ''\n  relative_file_paths: *a9"),
     "bag: a header in a hole": sparse("x.bag", b"#ROSBAG V2.0\n" + struct.pack("<I", 10**9)),
     "db3: a view without end": view,
-    "lerobot: equal rows": partial(robot_set, change=equal_rows),
 }
 FIELDS = {"npy": {}, "zarr": {"field": "tactile"}, "hdf5": {"field": "tactile"}, "lerobot": {"field": "tip"}}
 

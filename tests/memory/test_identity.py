@@ -4,6 +4,7 @@ import json
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -88,23 +89,22 @@ def test_another_embedding_under_the_same_configuration_is_found_out_at_the_firs
         assert learner.materials == {}
 
 
-MADE = [make() for make in EMBEDDINGS.values()] + [
+MADE = [
+    *(make() for make in EMBEDDINGS.values()),
     Joined(Kernels(dimension=64), Maps(layout=(3,))),
     Vision(weights=None, seed=0),
+    Windowed(dimension=64),
 ]
 
 
 @pytest.mark.parametrize("embedding", MADE, ids=repr)
-def test_what_follows_from_readings_on_any_machine_is_known_without_making_it(embedding):
-    identity = Identity.of(Recipe.of(PAD, embedding))
-    assert identity.embedding.bare == capabilities_of(embedding).exact
-    assert AbsentEmbedding(identity, None).capabilities.exact == capabilities_of(embedding).exact
-
-
-def test_another_number_of_exemplars_than_it_was_made_with_is_refused(tmp_path):
-    filled(tmp_path / "m", exemplars=4).close()
-    with pytest.raises(MismatchError, match=r"exemplars 4 there, 7 here.*leave exemplars out"):
-        TactileLearner.open(tmp_path / "m", exemplars=7)
+def test_how_touches_are_read_is_known_without_making_the_embedding(tmp_path, embedding):
+    identity, plan = Identity.of(Recipe.of(PAD, embedding)), window_plan(PAD, embedding)
+    assert Identity.read(SimpleNamespace(path=tmp_path, identity=identity.to_json())) == identity
+    absent = AbsentEmbedding(identity, tmp_path)
+    own = isinstance(embedding, Windowed)  # which is an embedding of a user's, and not made again
+    assert identity.embedding.bare == absent.capabilities.exact == (capabilities_of(embedding).exact and not own)
+    assert replace(window_plan(PAD, absent), shrinkage=plan.shrinkage) == plan
 
 
 def test_a_learner_pickles_into_another_process_and_inspecting_imports_no_torch(tmp_path):
@@ -143,20 +143,6 @@ def prepare(path, embedding, change):
     identity = Identity.of(Recipe.of(PAD, embedding)).to_json()
     change(identity)
     Store.open(path, identity=identity).close()
-
-
-VIEWS = ("whole", "shape", "competing")
-
-
-@pytest.mark.parametrize(("embedding", "views"), [(Kernels(dimension=64), VIEWS), (Windowed(dimension=64), ())])
-def test_whether_whole_touches_are_read_is_known_without_the_embedding(tmp_path, embedding, views):
-    made = Identity.of(Recipe.of(PAD, embedding))
-    assert made.views == views
-    assert made.to_json()["views"] == list(views)
-    assert Identity.read(SimpleNamespace(path=tmp_path, identity=made.to_json())) == made
-    absent = AbsentEmbedding(made, tmp_path)
-    assert absent.capabilities.reads_whole_touches == bool(views)
-    assert window_plan(PAD, absent) == window_plan(PAD, embedding)
 
 
 def test_an_embedding_that_reads_other_parts_of_a_touch_is_refused(tmp_path):
